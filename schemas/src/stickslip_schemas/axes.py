@@ -1,0 +1,143 @@
+"""Axes of a parameter grid: a list, a linspace, or a seeded random or Sobol sample of a range.
+
+The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
+"""
+
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from stickslip_schemas.base import Document
+
+MAX_SAMPLES = 1_000_000
+"""The most samples that one job may ask for."""
+
+T = TypeVar("T")
+Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
+Seed = Annotated[int, Field(ge=0, lt=2**31, description="seed; 0 is as good a seed as any other")]
+
+
+class quantity:  # noqa: N801 - reads as an annotation
+    """Name a value's type in the JSON schema: `Annotated[float, quantity("Mu"), ...]`."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+def _quantity_name(parameter: Any) -> str:
+    for item in getattr(parameter, "__metadata__", ()):
+        if isinstance(item, quantity):
+            return item.name
+    return str(getattr(parameter, "__name__", ""))
+
+
+class _Axis(Document, Generic[T]):
+    @classmethod
+    def model_parametrized_name(cls, params: tuple[Any, ...]) -> str:
+        """Name `ListAxis[Mu]` in the JSON schema `ListAxisMu`: see `quantity`."""
+        return cls.__name__ + "".join(_quantity_name(item) for item in params)
+
+
+class ListAxis(_Axis[T], Generic[T]):
+    """The values themselves, all different."""
+
+    type: Literal["list"] = "list"
+    values: tuple[T, ...] = Field(max_length=MAX_SAMPLES)
+
+    @field_validator("values")
+    @classmethod
+    def _distinct(cls, values: tuple[T, ...]) -> tuple[T, ...]:
+        if not values:
+            raise ValueError("an axis needs at least one value")
+        seen: set[T] = set()
+        for value in values:
+            if value in seen:
+                raise ValueError(f"the values of an axis must be distinct, and {value!r} is there twice")
+            seen.add(value)
+        return values
+
+    @property
+    def num(self) -> int:
+        """Number of values."""
+        return len(self.values)
+
+
+class LinspaceAxis(_Axis[T], Generic[T]):
+    """`num` values from `start` to `stop`, both included."""
+
+    type: Literal["linspace"]
+    start: T
+    stop: T
+    num: Count
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        if self.num > 1 and self.start == self.stop:
+            raise ValueError("start and stop must differ when num is more than 1")
+        return self
+
+
+class _RangeAxis(_Axis[T], Generic[T]):
+    low: T
+    high: T
+    num: Count
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.low < self.high:  # type: ignore[operator]  # T is a float wherever this axis is used
+            raise ValueError(f"low must be less than high, and {self.low} is not less than {self.high}")
+        return self
+
+
+class RandomAxis(_RangeAxis[T], Generic[T]):
+    """`num` independent uniform values in [low, high)."""
+
+    type: Literal["random"]
+
+
+class SobolAxis(_RangeAxis[T], Generic[T]):
+    """`num` values of a scrambled Sobol sequence in [low, high)."""
+
+    type: Literal["sobol"]
+
+
+def _long_form(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return {"type": "list", "values": value}
+    if isinstance(value, int | float | str) and not isinstance(value, bool):
+        return {"type": "list", "values": [value]}
+    return value
+
+
+SHORTHAND = BeforeValidator(_long_form, json_schema_input_type=Any)
+"""Lets an axis be written in its short form."""
+
+AnyAxis = ListAxis[Any] | LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any]
+
+
+def axis_values(axis: AnyAxis, *, dimension: int = 0) -> list[Any]:
+    """Return the values of `axis` in order.
+
+    `dimension` keeps axes apart that are sampled together: it selects the dimension of the Sobol sequence and
+    the stream of the random generator.
+    """
+    if isinstance(axis, ListAxis):
+        return list(axis.values)
+    if isinstance(axis, LinspaceAxis):
+        return [float(value) for value in np.linspace(axis.start, axis.stop, axis.num)]
+    if isinstance(axis, SobolAxis):
+        unit = _sobol(axis.num, axis.seed, dimension)
+    else:
+        unit = np.random.Generator(np.random.PCG64([axis.seed, dimension])).random(axis.num)
+    return [float(axis.low + (axis.high - axis.low) * value) for value in unit]
+
+
+def _sobol(num: int, seed: int, dimension: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    from scipy.stats import qmc  # an extra: only who expands a spec needs it
+
+    exponent = max(0, int(num - 1).bit_length())
+    generator = np.random.Generator(np.random.PCG64(seed))
+    points = qmc.Sobol(dimension + 1, scramble=True, rng=generator).random_base2(exponent)
+    return np.asarray(points[:num, dimension])

@@ -1,0 +1,64 @@
+"""Chunks and shards as bytes [Zarr v3, sharding_indexed codec].
+
+A chunk is `zstd(level) -> crc32c`; a shard is its chunks one after the other, then the index: one (offset, length)
+pair of little-endian uint64 per chunk, then the index's own crc32c.
+"""
+
+from collections.abc import Sequence
+
+import google_crc32c
+import numpy as np
+from numcodecs.zstd import Zstd
+
+ZSTD_LEVEL = 3
+MISSING = 2**64 - 1
+"""Offset and length of a chunk that is not in the shard."""
+
+_CRC_BYTES = 4
+
+
+class CorruptChunkError(ValueError):
+    """A checksum does not hold."""
+
+
+def encode_chunk(data: bytes | np.ndarray) -> bytes:
+    """Return the encoded chunk of C-ordered little-endian `data`."""
+    return _with_crc(bytes(Zstd(level=ZSTD_LEVEL).encode(data)))
+
+
+def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:
+    """Return the decoded bytes of a chunk, into `out` where it is given; raise CorruptChunkError."""
+    return Zstd().decode(_without_crc(chunk, "chunk"), out)  # type: ignore[no-any-return]  # untyped library
+
+
+def encode_shard(chunks: Sequence[bytes | None]) -> bytes:
+    """Return the shard of encoded `chunks` in C order of the chunk grid; None is a chunk that is missing."""
+    index = np.full((len(chunks), 2), MISSING, dtype="<u8")
+    offset = 0
+    for position, chunk in enumerate(chunks):
+        if chunk is not None:
+            index[position] = offset, len(chunk)
+            offset += len(chunk)
+    return b"".join(chunk for chunk in chunks if chunk is not None) + _with_crc(index.tobytes())
+
+
+def shard_index_size(chunk_count: int) -> int:
+    """Return the size in bytes of the index at a shard's end."""
+    return 16 * chunk_count + _CRC_BYTES
+
+
+def decode_shard_index(data: bytes, chunk_count: int) -> np.ndarray:
+    """Return the index, (chunk_count, 2) uint64 of offset and length, from a shard's last bytes."""
+    index = _without_crc(data[-shard_index_size(chunk_count) :], "shard index")
+    return np.frombuffer(index, dtype="<u8").reshape(chunk_count, 2)
+
+
+def _with_crc(data: bytes) -> bytes:
+    return data + int(google_crc32c.value(data)).to_bytes(_CRC_BYTES, "little")
+
+
+def _without_crc(data: bytes, what: str) -> bytes:
+    payload, crc = data[:-_CRC_BYTES], data[-_CRC_BYTES:]
+    if len(data) < _CRC_BYTES or int(google_crc32c.value(payload)).to_bytes(_CRC_BYTES, "little") != crc:
+        raise CorruptChunkError(f"the crc32c of the {what} does not hold")
+    return payload

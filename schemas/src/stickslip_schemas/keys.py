@@ -1,0 +1,50 @@
+"""Content keys: SHA-256 of the canonical JSON of exactly what a result depends on."""
+
+import hashlib
+import json
+import re
+from typing import Annotated, Any
+
+from pydantic import Field
+
+KEY_PATTERN = r"^[0-9a-f]{64}$"
+
+Sha256 = Annotated[str, Field(pattern=KEY_PATTERN, description="SHA-256, 64 lower-case hexadecimal digits")]
+
+
+def canonical_json(value: Any) -> str:
+    """Return the one JSON text of `value`: sorted keys, no spaces, shortest round-trip floats, -0.0 as 0.0.
+
+    NaN and infinities raise ValueError, for they have no JSON form.
+    """
+    return json.dumps(_normalised(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def content_key(purpose: str, value: Any) -> str:
+    """Return the SHA-256 of `value`, kept apart by `purpose` so that two kinds of thing never share a key."""
+    return sha256(f"stickslip/{purpose}\n{canonical_json(value)}".encode())
+
+
+def derived_seed(seed: int, purpose: str, value: Any) -> int:
+    """Return a seed in [0, 2**31) that depends on `seed` and on what it is for, never on a position in a grid."""
+    return int(content_key(f"seed/{purpose}", {"seed": seed, "for": value})[:15], 16) % 2**31
+
+
+def sha256(data: bytes) -> str:
+    """Return the SHA-256 of `data` in lower-case hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def is_sha256(text: str) -> bool:
+    """Tell whether `text` is a SHA-256 in lower-case hexadecimal."""
+    return re.match(KEY_PATTERN, text) is not None
+
+
+def _normalised(value: Any) -> Any:
+    if isinstance(value, float):
+        return value + 0.0  # -0.0 + 0.0 is 0.0
+    if isinstance(value, dict):
+        return {key: _normalised(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_normalised(item) for item in value]
+    return value

@@ -1,0 +1,117 @@
+"""What the coordinator answers to users."""
+
+from datetime import datetime
+from typing import Annotated, Any, Generic, TypeVar
+
+from pydantic import Field
+
+from stickslip_schemas.base import Document
+from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+
+T = TypeVar("T")
+
+
+class StageProgress(Document):
+    """Tasks of one stage. `cached` of the succeeded ones were done before the job came."""
+
+    counts: dict[TaskState, int]
+    cached: int
+    cpu_seconds: float = Field(description="measured, of the tasks that this job had to run [s]")
+
+
+class Eta(Document):
+    """Time that is left, from measured durations; `low` to `high` covers about 80 % of jobs [s]."""
+
+    seconds: float
+    low: float
+    high: float
+
+
+class Progress(Document):
+    """How far a job is."""
+
+    done: int = Field(description="tasks that are over, of all stages")
+    total: int
+    stages: dict[Stage, StageProgress]
+    eta: Eta | None = Field(description="null until there is a measurement to go by, and when nothing is left")
+
+
+class DatasetRef(Document):
+    """A dataset version."""
+
+    dataset: str
+    version: int
+    manifest: Sha256
+
+
+class Job(Document):
+    """A job."""
+
+    id: str
+    name: str | None
+    kind: str
+    state: JobState
+    reason: Reason | None
+    message: str
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    sample_count: int
+    rejected_count: int
+    progress: Progress
+    dataset: DatasetRef | None
+
+
+class JobDetail(Job):
+    """A job with what was asked for."""
+
+    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+
+
+class Validation(Document):
+    """What a job would be, without making it one."""
+
+    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec_digest: Sha256
+    sample_count: int
+    simulation_count: int
+    cached_count: int | None = Field(description="tasks whose results are there already; null: no worker known yet")
+    bytes_estimate: int = Field(description="size of the arrays before compression [bytes]")
+
+
+class Dataset(Document):
+    """A dataset: every version answers the same spec."""
+
+    id: str
+    name: str | None
+    kind: str
+    spec_digest: Sha256
+    versions: tuple["DatasetVersion", ...]
+
+
+class DatasetVersion(Document):
+    """A committed version."""
+
+    version: int
+    manifest: Sha256
+    created_at: datetime
+    sample_count: int
+    valid_count: int
+    bytes: int
+
+
+class Preview(Document):
+    """A picture of one sample."""
+
+    slot: int
+    labels: dict[str, Any]
+    href: str
+
+
+class Page(Document, Generic[T]):
+    """One page of a list, newest first; `next_page_token` is null on the last one."""
+
+    items: tuple[T, ...]
+    next_page_token: str | None

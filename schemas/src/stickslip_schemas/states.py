@@ -1,0 +1,82 @@
+"""States of jobs and tasks, and the reason codes of every ending."""
+
+from enum import StrEnum
+
+
+class JobState(StrEnum):
+    """Where a job is; `pausing` and `cancelling` last until the leased tasks have been given back."""
+
+    queued = "queued"
+    running = "running"
+    pausing = "pausing"
+    paused = "paused"
+    cancelling = "cancelling"
+    cancelled = "cancelled"
+    succeeded = "succeeded"
+    succeeded_with_rejects = "succeeded_with_rejects"
+    failed = "failed"
+
+    @property
+    def is_terminal(self) -> bool:
+        """True where the job will not change any more."""
+        return self in _TERMINAL_JOB_STATES
+
+
+_TERMINAL_JOB_STATES = {
+    JobState.cancelled,
+    JobState.succeeded,
+    JobState.succeeded_with_rejects,
+    JobState.failed,
+}
+
+
+class TaskState(StrEnum):
+    """Where a task is; `soft_failed` waits for another try, `rejected` is a result, not a fault."""
+
+    pending = "pending"
+    leased = "leased"
+    running = "running"
+    succeeded = "succeeded"
+    soft_failed = "soft_failed"
+    failed = "failed"
+    rejected = "rejected"
+    cancelled = "cancelled"
+
+    @property
+    def is_settled(self) -> bool:
+        """True where the task has a result that others may build on."""
+        return self in (TaskState.succeeded, TaskState.rejected)
+
+
+class Stage(StrEnum):
+    """What a task does, in the order of the data's way."""
+
+    simulate = "simulate"
+    render = "render"
+    pack = "pack"
+    publish = "publish"
+
+
+class Reason(StrEnum):
+    """Why a job or task ended, or why it waits."""
+
+    # Infrastructure: another try may succeed.
+    exec_timeout = "exec_timeout"
+    worker_lost = "worker_lost"
+    oom_killed = "oom_killed"
+    renderer_crash = "renderer_crash"
+    storage_error = "storage_error"
+    internal_error = "internal_error"
+    # The sample itself: deterministic, never retried.
+    solver_diverged = "solver_diverged"
+    out_of_frame = "out_of_frame"
+    invalid_sample = "invalid_sample"
+    # A job's own.
+    cancelled = "cancelled"
+    failed_tasks = "failed_tasks"
+    waiting_for_worker = "waiting_for_worker"
+
+    @property
+    def is_deterministic(self) -> bool:
+        """True where a second try gives the same answer, so that the sample is rejected and not retried."""
+        return self in (Reason.solver_diverged, Reason.out_of_frame, Reason.invalid_sample)

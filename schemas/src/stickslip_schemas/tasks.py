@@ -1,0 +1,225 @@
+"""What the stages are told to do and what they answer. Bulk data is named by digest and never travels here."""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, TypeAdapter, model_validator
+
+from stickslip_schemas.axes import Seed
+from stickslip_schemas.base import Document
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.jobs import ClothDragSpec, Material, Preset, Quality, RodHangSpec, Texture, Viewpoint
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.states import Reason
+
+# --- where bytes are ------------------------------------------------------------------------------------------
+
+
+class RecordRef(Document):
+    """One record of an artifact that holds several (`.npz`, first dimension = record)."""
+
+    digest: Sha256
+    row: int = Field(ge=0)
+
+
+class ChunkRef(Document):
+    """An encoded chunk: `length` bytes from `offset` of an artifact."""
+
+    digest: Sha256
+    offset: int = Field(ge=0)
+    length: int = Field(gt=0)
+
+
+class FileEntry(Document):
+    """A file of a dataset: its path inside the dataset, its digest and its size in bytes."""
+
+    path: str = Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$")
+    sha256: Sha256
+    size: int = Field(ge=0)
+
+
+# --- simulate -------------------------------------------------------------------------------------------------
+
+
+class RodSimulation(Document):
+    """A rod at rest: all that its shape depends on besides the sim_core build."""
+
+    kind: Literal["rod_hang"] = "rod_hang"
+    gamma: float
+    phi0: float
+    phi1: float
+    poisson: float
+    elements: int = 128
+    points: int = 150
+
+
+class ClothSimulation(Document):
+    """A cloth trajectory: all that it depends on besides the sim_core build."""
+
+    kind: Literal["cloth_drag"] = "cloth_drag"
+    scene: Literal["drop_and_drag"] = "drop_and_drag"
+    material: Material
+    mu: float
+    preset: Preset
+    mesh: int
+    frames: int = 300
+    seed: Seed
+
+
+Simulation = Annotated[RodSimulation | ClothSimulation, Field(discriminator="kind")]
+
+
+class SimulateTask(Document):
+    """Make one trajectory."""
+
+    stage: Literal["simulate"] = "simulate"
+    simulation: Simulation
+
+
+class SimulateOutput(Document):
+    """A trajectory in the store, and the labels that the solver gives."""
+
+    stage: Literal["simulate"] = "simulate"
+    record: RecordRef
+    labels: dict[str, Any]
+
+
+# --- render ---------------------------------------------------------------------------------------------------
+
+
+class RodRender(Document):
+    """How a rod is seen: all that its views depend on besides its trajectory and the renderer's build."""
+
+    kind: Literal["rod_hang"] = "rod_hang"
+    rig: str
+    rig_digest: Sha256
+    quality: Quality
+    color_seed: Seed
+    radius: float = Field(default=0.008, gt=0, lt=0.1, description="radius over length")
+
+
+class ClothRender(Document):
+    """How a cloth is seen: all that its clip depends on besides its trajectory and the renderer's build."""
+
+    kind: Literal["cloth_drag"] = "cloth_drag"
+    texture: Texture
+    viewpoint: Viewpoint
+    frames: int
+    quality: Quality
+    light_seed: Seed
+
+
+Render = Annotated[RodRender | ClothRender, Field(discriminator="kind")]
+
+
+class RenderTask(Document):
+    """Make the pictures of one sample; `preview` asks for a small PNG besides."""
+
+    stage: Literal["render"] = "render"
+    render: Render
+    record: RecordRef
+    preview: bool = False
+
+
+class RenderOutput(Document):
+    """Encoded chunks by array name, the digest of the preview PNG if there is one, and labels (colour, ...)."""
+
+    stage: Literal["render"] = "render"
+    chunks: dict[str, ChunkRef]
+    preview: Sha256 | None = None
+    labels: dict[str, Any]
+
+
+# --- pack and publish -----------------------------------------------------------------------------------------
+
+
+class Rejection(Document):
+    """Why a slot is empty."""
+
+    slot: int = Field(ge=0)
+    sample_key: Sha256
+    reason: Reason
+    message: str
+    labels: dict[str, Any] = Field(description="the parameters of the sample")
+
+
+class PackSlot(Document):
+    """One slot of a shard: where its data lie, or that it was rejected."""
+
+    slot: int = Field(ge=0)
+    sample_key: Sha256
+    split: int
+    labels: dict[str, Any] = Field(description="parameters and what the stages added, by array name")
+    record: RecordRef | None = None
+    chunks: dict[str, ChunkRef] = Field(default_factory=dict)
+    rejection: Rejection | None = None
+
+    @property
+    def valid(self) -> bool:
+        """True where there is data."""
+        return self.rejection is None
+
+
+class PackTask(Document):
+    """Make the files of shard `shard` of every array."""
+
+    stage: Literal["pack"] = "pack"
+    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    shard: int = Field(ge=0)
+    slots: tuple[PackSlot, ...] = Field(min_length=1)
+
+
+class PackOutput(Document):
+    """The shard's files, in the store."""
+
+    stage: Literal["pack"] = "pack"
+    files: tuple[FileEntry, ...]
+
+
+class PublishTask(Document):
+    """Write the metadata and the manifest of a dataset version; its result is the commit."""
+
+    stage: Literal["publish"] = "publish"
+    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    dataset: str
+    version: int = Field(ge=1)
+    builds: Builds
+    files: tuple[FileEntry, ...] = Field(description="the files of all shards")
+    sample_keys: tuple[Sha256, ...] = Field(description="by slot")
+    rejections: tuple[Rejection, ...]
+
+
+class PublishOutput(Document):
+    """The manifest in the store: when the coordinator has it, the version exists."""
+
+    stage: Literal["publish"] = "publish"
+    manifest: Sha256
+    bytes: int = Field(ge=0, description="size of all files of the version")
+
+
+Task = Annotated[SimulateTask | RenderTask | PackTask | PublishTask, Field(discriminator="stage")]
+Output = Annotated[SimulateOutput | RenderOutput | PackOutput | PublishOutput, Field(discriminator="stage")]
+
+
+class TaskResult(Document):
+    """How a task ended."""
+
+    outcome: Literal["succeeded", "rejected", "failed"]
+    reason: Reason | None = None
+    message: str = ""
+    output: Output | None = None
+    cpu_seconds: float = Field(default=0.0, ge=0)
+    wall_seconds: float = Field(default=0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.outcome == "succeeded") != (self.output is not None):
+            raise ValueError("output is there exactly when the outcome is succeeded")
+        if (self.outcome == "succeeded") != (self.reason is None):
+            raise ValueError("reason is there exactly when the outcome is not succeeded")
+        if self.outcome == "rejected" and self.reason is not None and not self.reason.is_deterministic:
+            raise ValueError(f"a sample is rejected for a reason of its own, and {self.reason} is not one")
+        return self
+
+
+task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = TypeAdapter(Task)
+"""Validates and dumps a task of any stage."""

@@ -1,0 +1,99 @@
+"""What a dispatcher and the coordinator say to each other."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from stickslip_schemas.base import Document
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.states import Stage
+from stickslip_schemas.tasks import Task, TaskResult
+
+
+class WorkerRegistration(Document):
+    """A dispatcher presents itself. A second registration of a `name` takes the first one's leases away."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
+    builds: Builds
+    kinds: tuple[Literal["rod_hang", "cloth_drag"], ...] = Field(min_length=1)
+    slots: int = Field(ge=1, description="how many tasks it runs at once")
+    versions: dict[str, str] = Field(default_factory=dict, description="for people: sim_core, blender, ray, ...")
+
+
+class WorkerSession(Document):
+    """The coordinator's answer: who the dispatcher is, and how long a lease lasts without a heartbeat."""
+
+    worker_id: str
+    lease_seconds: float = Field(gt=0)
+
+
+class LeaseRequest(Document):
+    """Ask for at most so many tasks of each stage."""
+
+    worker_id: str
+    wanted: dict[Stage, int]
+
+
+class Lease(Document):
+    """A task on loan. `token` is its fencing token: a report with an older one is refused."""
+
+    task_id: str
+    token: int
+    attempt: int = Field(ge=1)
+    task: Task
+
+
+class LeaseBatch(Document):
+    """What was granted, and when it makes sense to ask again if it is nothing."""
+
+    leases: tuple[Lease, ...]
+    retry_after_seconds: float = Field(ge=0)
+
+
+class LeaseState(Document):
+    """A lease that the dispatcher believes to hold, and whether the task has been started."""
+
+    task_id: str
+    token: int
+    started: bool
+
+
+class Heartbeat(Document):
+    """Renew the leases."""
+
+    worker_id: str
+    leases: tuple[LeaseState, ...]
+
+
+class HeartbeatAnswer(Document):
+    """Which of the tasks to drop: cancelled by the user, or no longer the dispatcher's."""
+
+    drop: tuple[str, ...]
+
+
+class Report(Document):
+    """How one leased task ended; `released` gives it back untouched (a dispatcher that stops)."""
+
+    task_id: str
+    token: int
+    result: TaskResult | None = Field(description="null gives the lease back")
+
+
+class ReportBatch(Document):
+    """Reports of several tasks; each is judged by itself."""
+
+    worker_id: str
+    reports: tuple[Report, ...] = Field(min_length=1)
+
+
+class ReportVerdict(Document):
+    """`accepted`; `duplicate` (this very report was accepted before); `stale` (the lease was not the worker's)."""
+
+    task_id: str
+    verdict: Literal["accepted", "duplicate", "stale"]
+
+
+class ReportAnswer(Document):
+    """One verdict a report, in their order."""
+
+    verdicts: tuple[ReportVerdict, ...]
