@@ -1,0 +1,49 @@
+"""Chunks and shards: what is written is read, and no flipped bit goes unseen."""
+
+import numpy as np
+import pytest
+from stickslip_schemas.chunks import (
+    MISSING,
+    CorruptChunkError,
+    decode_chunk,
+    decode_shard_index,
+    encode_chunk,
+    encode_shard,
+    shard_index_size,
+)
+
+
+def test_chunk_round_trip() -> None:
+    data = np.random.default_rng(0).integers(0, 4, (4, 32, 32, 3), dtype=np.uint8)
+    out = np.empty_like(data)
+    decode_chunk(encode_chunk(data), out)
+    assert np.array_equal(out, data)
+    assert bytes(decode_chunk(encode_chunk(data.tobytes()))) == data.tobytes()
+
+
+def test_no_flipped_bit_goes_unseen() -> None:
+    rng = np.random.default_rng(1)
+    chunk = encode_chunk(rng.integers(0, 4, 5000, dtype=np.uint8))
+    for bit in rng.choice(8 * len(chunk), 500, replace=False):
+        flipped = bytearray(chunk)
+        flipped[bit // 8] ^= 1 << (bit % 8)
+        with pytest.raises(CorruptChunkError):
+            decode_chunk(bytes(flipped))
+
+
+def test_shard_index_points_at_the_chunks() -> None:
+    chunks = [b"one", None, b"three"]
+    shard = encode_shard(chunks)
+    index = decode_shard_index(shard[-shard_index_size(3) :], 3)
+    for (offset, length), chunk in zip(index, chunks, strict=True):
+        if chunk is None:
+            assert (offset, length) == (MISSING, MISSING)
+        else:
+            assert shard[int(offset) : int(offset + length)] == chunk
+
+
+def test_a_broken_index_is_refused() -> None:
+    shard = bytearray(encode_shard([b"one"]))
+    shard[-6] ^= 1
+    with pytest.raises(CorruptChunkError, match="shard index"):
+        decode_shard_index(bytes(shard), 1)

@@ -1,0 +1,129 @@
+"""Specs: what is taken, and that a bad one is answered with field, rule and value."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec, job_spec_adapter
+from stickslip_schemas.problems import FieldError, field_errors
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+RODS: dict[str, Any] = {
+    "kind": "rod_hang",
+    "axes": {
+        "gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": 4},
+        "phi0": [0.2, 6],
+        "phi1": 12,
+    },
+}
+CLOTH: dict[str, Any] = {
+    "kind": "cloth_drag",
+    "axes": {"material": ["royal-target"], "mu": [0.1, 0.2], "texture": "dots", "viewpoint": ["left"]},
+}
+
+
+def changed(document: dict[str, Any], pointer: str, value: Any) -> dict[str, Any]:
+    result = copy.deepcopy(document)
+    *parents, last = pointer.strip("/").split("/")
+    here = result
+    for part in parents:
+        here = here[part]
+    here[last] = value
+    return result
+
+
+def errors_of(document: Any) -> list[FieldError]:
+    with pytest.raises(ValidationError) as caught:
+        job_spec_adapter.validate_python(document)
+    return field_errors(caught.value, document)
+
+
+def test_short_and_long_forms_are_one_spec() -> None:
+    short = job_spec_adapter.validate_python(RODS)
+    long = job_spec_adapter.validate_python(job_spec_adapter.dump_python(short, mode="json"))
+    assert short == long
+    assert short.sample_count == 8
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "count"),
+    [
+        ("thesis-rods", RodHangSpec, 10_000),
+        ("thesis-cloth", ClothDragSpec, 3_840),
+        ("demo-rods", RodHangSpec, 48),
+        ("demo-cloth", ClothDragSpec, 4),
+        ("sampled-rods", RodHangSpec, 1_000),
+    ],
+)
+def test_examples_are_specs(name: str, kind: type, count: int) -> None:
+    spec = job_spec_adapter.validate_python(yaml.safe_load((EXAMPLES / f"{name}.yaml").read_text()))
+    assert isinstance(spec, kind)
+    assert spec.sample_count == count
+    assert spec.name == name
+
+
+@pytest.mark.parametrize(
+    ("document", "pointer", "rule", "value"),
+    [
+        (changed(CLOTH, "/axes/material", ["royal-target", "silk"]), "/axes/material/1", "white-swim-solid", '"silk"'),
+        (changed(CLOTH, "/axes/mu", [0.1, -0.1]), "/axes/mu/1", "greater than or equal to 0", "-0.1"),
+        (changed(CLOTH, "/axes/mu", -0.1), "/axes/mu", "greater than or equal to 0", "-0.1"),
+        (changed(CLOTH, "/axes/texture", "velvet"), "/axes/texture", "herringbone", '"velvet"'),
+        (changed(CLOTH, "/mesh", 3), "/mesh", "greater than or equal to 5", "3"),
+        (changed(RODS, "/axes/gamma", [float("nan")]), "/axes/gamma/0", "finite number", "NaN"),
+        (changed(RODS, "/axes/gamma", [float("inf")]), "/axes/gamma/0", "finite number", "Infinity"),
+        (changed(RODS, "/axes/gamma", ["7"]), "/axes/gamma/0", "valid number", '"7"'),
+        (changed(RODS, "/axes/phi0", []), "/axes/phi0", "at least one value", "[]"),
+        (changed(RODS, "/axes/phi0", [1, 2, 1.0]), "/axes/phi0", "1.0 is there twice", "[1, 2, 1.0]"),
+        (changed(RODS, "/axes/gamma/num", 10**12), "/axes/gamma/num", "less than or equal to 1000000", str(10**12)),
+        (changed(RODS, "/axes/gamma/num", 0), "/axes/gamma/num", "greater than or equal to 1", "0"),
+        (changed(RODS, "/axes/gamma/step", 2), "/axes/gamma/step", "not permitted", "2"),
+        (changed(RODS, "/axes/gamma/type", "cubic"), "/axes/gamma", "linspace", '"cubic"'),
+        (
+            changed(RODS, "/axes/phi1", {"type": "sobol", "low": 2, "high": 2, "num": 3}),
+            "/axes/phi1",
+            "low",
+            '"low": 2',
+        ),
+        (changed(RODS, "/poisson", -1), "/poisson", "greater than -1", "-1"),
+        (changed(RODS, "/colour", "red"), "/colour", "not permitted", '"red"'),
+        (changed(RODS, "/kind", "hair"), "", "rod_hang", '"hair"'),
+        (changed(RODS, "/splits", {"train": 0.5, "validation": 0, "test": 0}), "/splits", "add up to 0.5", "0.5"),
+        (changed(RODS, "/combine", "zip"), "", "one length", '"kind": "rod_hang"'),
+        ({"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1}}, "/axes/phi1", "required", ""),
+        ([], "", "valid dictionary", "[]"),
+    ],
+)
+def test_bad_specs_are_pointed_at(document: Any, pointer: str, rule: str, value: str) -> None:
+    (error,) = errors_of(document)
+    assert error.pointer == pointer
+    assert rule in error.rule
+    assert value in error.value
+
+
+def test_too_many_points_in_all_are_refused_without_being_made() -> None:
+    axis = {"type": "linspace", "start": 0, "stop": 1, "num": 10_000}
+    (error,) = errors_of({"kind": "rod_hang", "axes": {"gamma": axis, "phi0": axis, "phi1": axis}})
+    assert "at most 1000000 samples" in error.rule
+    assert "1000000000000" in error.rule
+
+
+def test_every_problem_is_told_at_once() -> None:
+    document = changed(changed(RODS, "/axes/gamma", -1), "/poisson", 2)
+    assert {error.pointer for error in errors_of(document)} == {"/axes/gamma", "/poisson"}
+
+
+def test_long_values_are_cut_and_errors_are_json() -> None:
+    (error,) = errors_of(changed(RODS, "/axes/gamma", {"type": "list", "values": ["x" * 10_000]}))
+    assert len(error.value) == 200
+    json.loads(error.model_dump_json())
+
+
+def test_schema_names_the_quantities() -> None:
+    definitions = job_spec_adapter.json_schema()["$defs"]
+    assert {"RodHangSpec", "ClothDragSpec", "RodAxes", "ClothAxes"} <= set(definitions)

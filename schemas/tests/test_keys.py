@@ -1,0 +1,155 @@
+"""Content keys: pinned, and sensitive to exactly what a result depends on."""
+
+import pytest
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.keys import canonical_json, content_key, derived_seed
+from stickslip_schemas.samples import Sample, dataset_id, pack_key, publish_key, samples
+from stickslip_schemas.tasks import RodRender
+
+BUILDS = Builds(sim_core="a" * 64, blender="b" * 64, packer="c" * 64)
+
+
+def one(
+    poisson: float = 0.5, seed: int = 0, builds: Builds = BUILDS, name: str | None = None, **more: object
+) -> Sample:
+    document = {
+        "kind": "rod_hang",
+        "name": name,
+        "axes": {"gamma": 100.0, "phi0": 1.0, "phi1": 6.0},
+        "poisson": poisson,
+        "seed": seed,
+        **more,
+    }
+    (sample,) = samples(job_spec_adapter.validate_python(document), builds)
+    return sample
+
+
+def test_canonical_json_is_one_text() -> None:
+    assert canonical_json({"b": [1, 2.0, -0.0], "a": "µ"}) == '{"a":"\\u00b5","b":[1,2.0,0.0]}'
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        canonical_json(float("nan"))
+
+
+def test_purposes_keep_keys_apart() -> None:
+    assert content_key("one", 1) != content_key("two", 1)
+
+
+def test_pinned_keys() -> None:
+    """Keys of finished work: if one of these changes, every dataset in the world would be made again."""
+    sample = one()
+    assert sample.simulation_key == PINNED["simulation"]
+    assert sample.split == PINNED["split"]
+    assert isinstance(sample.render, RodRender)
+    assert sample.render.color_seed == PINNED["color_seed"]
+    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": 100.0, "phi0": 1.0, "phi1": 6.0}})
+    assert spec.content_digest == PINNED["spec"]
+    (cloth,) = samples(
+        job_spec_adapter.validate_python(
+            {
+                "kind": "cloth_drag",
+                "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
+            }
+        ),
+        BUILDS,
+    )
+    assert cloth.simulation_key == PINNED["cloth_simulation"]
+    assert cloth.render_key == PINNED["cloth_render"]
+
+
+def test_simulation_depends_on_physics_and_sim_core_only() -> None:
+    key = one().simulation_key
+    assert one(poisson=0.3).simulation_key != key
+    assert one(builds=BUILDS.model_copy(update={"sim_core": "d" * 64})).simulation_key != key
+    assert one(builds=BUILDS.model_copy(update={"blender": "d" * 64})).simulation_key == key
+    assert one(seed=1, name="x", views=None, samples_per_shard=2).simulation_key == key
+
+
+def test_render_depends_on_simulation_look_and_renderer() -> None:
+    key = one().render_key
+    assert one(poisson=0.3).render_key != key
+    assert one(seed=1).render_key != key
+    assert one(quality="draft").render_key != key
+    assert one(builds=BUILDS.model_copy(update={"blender": "d" * 64})).render_key != key
+    assert one(name="x", samples_per_shard=2).render_key == key
+
+
+def test_a_name_is_no_content_and_a_build_makes_no_other_dataset() -> None:
+    def spec(**more: object) -> object:
+        return job_spec_adapter.validate_python(
+            {"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1, "phi1": 6}, **more}
+        )
+
+    assert dataset_id(spec(name="a")) == dataset_id(spec(name="b"))  # type: ignore[arg-type]
+    assert dataset_id(spec(seed=1)) != dataset_id(spec())  # type: ignore[arg-type]
+
+
+def test_neighbours_in_the_grid_change_no_sample() -> None:
+    """Extending a grid must find the old samples again: nothing of them depends on their slot."""
+    small = {"kind": "rod_hang", "axes": {"gamma": [100, 200], "phi0": 1, "phi1": 6}}
+    large = {"kind": "rod_hang", "axes": {"gamma": [50, 100, 200], "phi0": [0.5, 1], "phi1": 6}}
+    before = {sample.key: sample for sample in samples(job_spec_adapter.validate_python(small), BUILDS)}
+    after = {sample.key: sample for sample in samples(job_spec_adapter.validate_python(large), BUILDS)}
+    assert set(before) < set(after)
+    assert all(after[key].split == sample.split for key, sample in before.items())
+
+
+def test_pack_and_publish_keys_hold_what_they_are_made_of() -> None:
+    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": [1, 2], "phi0": 1, "phi1": 6}})
+    first, second = samples(spec, BUILDS)
+    key = pack_key(spec, 0, [first, second], BUILDS)
+    assert key != pack_key(spec, 0, [second, first], BUILDS)
+    assert key != pack_key(spec, 1, [first, second], BUILDS)
+    assert key != pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"packer": "d" * 64}))
+    assert publish_key(spec, [key], BUILDS) != publish_key(spec, [key, key], BUILDS)
+
+
+def test_renders_of_one_simulation_share_its_split() -> None:
+    spec = job_spec_adapter.validate_python(
+        {
+            "kind": "cloth_drag",
+            "axes": {
+                "material": ["royal-target", "gray-interlock"],
+                "mu": {"type": "linspace", "start": 0, "stop": 1.5, "num": 16},
+                "texture": ["dots", "checker", "plaid"],
+                "viewpoint": ["left", "right"],
+            },
+        }
+    )
+    split_of: dict[str, set[int]] = {}
+    for sample in samples(spec, BUILDS):
+        split_of.setdefault(sample.simulation_key, set()).add(sample.split)
+    assert len(split_of) == 32
+    assert all(len(splits) == 1 for splits in split_of.values())
+    assert {split for splits in split_of.values() for split in splits} == {0, 1, 2}
+
+
+def test_split_shares_come_out() -> None:
+    spec = job_spec_adapter.validate_python(
+        {
+            "kind": "rod_hang",
+            "axes": {"gamma": {"type": "linspace", "start": 0, "stop": 1, "num": 4000}, "phi0": 1, "phi1": 6},
+            "views": None,
+        }
+    )
+    counts = [0, 0, 0]
+    for sample in samples(spec, BUILDS):
+        counts[sample.split] += 1
+    # Binomial: five standard deviations of 4000 draws.
+    assert abs(counts[0] / 4000 - 0.8) < 5 * (0.8 * 0.2 / 4000) ** 0.5
+    assert abs(counts[2] / 4000 - 0.1) < 5 * (0.1 * 0.9 / 4000) ** 0.5
+
+
+def test_seed_zero_is_a_seed() -> None:
+    assert derived_seed(0, "color", 1) != derived_seed(1, "color", 1)
+    assert derived_seed(0, "color", 1) == derived_seed(0, "color", 1)
+
+
+PINNED: dict[str, object] = {
+    "simulation": "0d76b7c90598207274ab9510adbb58fa2d82fef780b8da497c232a2ac9247c2a",
+    "split": 0,
+    "color_seed": 1423131992,
+    "spec": "f9b8c3cfcafcc5fac6634f45c6f4652371cc8cd0843a906cd6364e98eabc7b32",
+    "cloth_simulation": "9fbc21cd005d23922f0a1d06e37add03dad9db04cce9e09bac72b323da410f45",
+    "cloth_render": "551152e82db1e9501dbfc5dd425ae69b8fe9fcd13207f63979a091b0dfe45e7d",
+}

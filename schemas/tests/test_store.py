@@ -1,0 +1,71 @@
+"""The store: artifacts whole or not at all, and never with other bytes than their name says."""
+
+import os
+from pathlib import Path
+
+import pytest
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.store import CorruptArtifactError, Store, write_durably
+
+
+def test_publish_and_read(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    digest = store.publish(b"0123456789")
+    assert digest == sha256(b"0123456789")
+    assert store.read(digest) == b"0123456789"
+    assert store.read(digest, offset=2, length=3) == b"234"
+
+
+def test_publishing_twice_keeps_the_first_file(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    digest = store.publish(b"data")
+    before = store.path(digest).stat().st_ino
+    assert store.publish(b"data") == digest
+    assert store.path(digest).stat().st_ino == before
+
+
+def test_changed_bytes_are_found(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    digest = store.publish(b"data")
+    store.path(digest).write_bytes(b"dato")
+    with pytest.raises(CorruptArtifactError, match=digest):
+        store.read(digest)
+    with pytest.raises(CorruptArtifactError, match="ends before"):
+        store.read(digest, offset=1, length=9)
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "", "A" * 64, "0" * 63])
+def test_a_path_is_a_digest_and_nothing_else(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="64 lower-case hexadecimal"):
+        Store(tmp_path).path(name)
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_space(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(OSError, match="No space"):
+        write_durably(tmp_path / "a" / "file", b"data")
+    assert list((tmp_path / "a").iterdir()) == []
+
+
+def test_link_is_the_same_file_and_can_be_repeated(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    digest = store.publish(b"shard")
+    target = store.dataset_path("ds-1", 1) / "views" / "c" / "0"
+    for _ in range(2):
+        store.link(digest, target)
+        assert target.read_bytes() == b"shard"
+        assert target.stat().st_ino == store.path(digest).stat().st_ino
+        assert [path.name for path in target.parent.iterdir()] == ["0"]
+
+
+def test_link_copies_where_it_cannot_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(source: Path, target: Path) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", no_links)
+    store = Store(tmp_path)
+    store.link(store.publish(b"shard"), tmp_path / "datasets" / "file")
+    assert (tmp_path / "datasets" / "file").read_bytes() == b"shard"
