@@ -1,0 +1,62 @@
+# make demo | test | check | bench | constraints | clean. Every target sets up what it needs; a second call is quick.
+
+PYTHON ?= python3.11
+PY = .venv/bin/python
+BLENDER_PY = .venv-blender/bin/python
+PIP_FLAGS = --quiet --disable-pip-version-check
+
+COMPONENTS = schemas sim_core workers services training
+PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
+CORE_SOURCES = $(wildcard sim_core/src/*) sim_core/CMakeLists.txt sim_core/pyproject.toml
+CPP_FILES = $(wildcard sim_core/src/*.hpp sim_core/src/*.cpp)
+
+.PHONY: setup demo test check bench constraints clean
+
+setup: .venv/core.stamp .venv-blender/setup.stamp
+
+.venv/setup.stamp: constraints.txt requirements.txt $(PYPROJECTS)
+	@tools/check_system.sh $(PYTHON)
+	@echo "setting up .venv (a few minutes the first time)"
+	@test -x $(PY) || $(PYTHON) -m venv .venv
+	@$(PY) -m pip install $(PIP_FLAGS) --requirement requirements.txt --constraint constraints.txt
+	@touch $@ .venv/core.stamp
+
+# The editable install builds the C++ core once: a changed source builds it again.
+.venv/core.stamp: .venv/setup.stamp $(CORE_SOURCES)
+	@echo "building sim_core"
+	@$(PY) -m pip install $(PIP_FLAGS) --no-deps --editable sim_core
+	@touch $@
+
+.venv-blender/setup.stamp: constraints-blender.txt requirements-blender.txt $(PYPROJECTS)
+	@tools/check_system.sh $(PYTHON)
+	@echo "setting up .venv-blender (a few minutes the first time)"
+	@test -x $(BLENDER_PY) || $(PYTHON) -m venv .venv-blender
+	@$(BLENDER_PY) -m pip install $(PIP_FLAGS) --requirement requirements-blender.txt --constraint constraints-blender.txt
+	@touch $@
+
+demo: setup
+	$(PY) examples/demo.py
+
+test: setup check
+	$(PY) -m pytest
+	$(BLENDER_PY) -m pytest workers/blender
+
+check: setup
+	$(PY) -m ruff format --check .
+	$(PY) -m ruff check .
+	$(PY) -m clang_format --dry-run --Werror $(CPP_FILES)
+	$(PY) -m mypy $(wildcard */src) sim_core/python workers/blender/src examples benchmarks
+	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
+
+bench: setup
+	@for script in benchmarks/*.py; do \
+	  echo "== $$script"; \
+	  case $$script in */render_*) $(BLENDER_PY) $$script ;; *) $(PY) $$script ;; esac || exit 1; \
+	done
+
+# Newest versions that the ranges of the components allow, tried in fresh environments.
+constraints:
+	tools/update_constraints.sh $(PYTHON)
+
+clean:
+	rm -rf .venv .venv-blender demo-out

@@ -1,0 +1,27 @@
+#!/bin/sh
+# Write constraints.txt and constraints-blender.txt anew: the newest versions that the components' ranges allow,
+# installed into fresh environments. Usage: update_constraints.sh PYTHON
+set -eu
+python=$1
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+# torch: one build for everybody; without a pin, a range takes the newest build with gigabytes of CUDA packages.
+# ray: the two environments must hold the very same version. numcodecs: the same, for byte-identical chunks.
+cat >"$work/pins.txt" <<PINS
+torch==2.13.0
+ray==2.60.0
+numcodecs==0.16.6
+PINS
+
+freeze() { # environment, requirements file, constraints file
+  "$python" -m venv "$work/$1"
+  "$work/$1/bin/python" -m pip install --quiet --disable-pip-version-check -r "$2" -c "$work/pins.txt"
+  {
+    echo "# Written by tools/update_constraints.sh (make constraints); do not edit."
+    "$work/$1/bin/python" -m pip freeze --exclude-editable | grep -v ' @ file:'
+  } >"$3"
+}
+
+freeze service requirements.txt constraints.txt
+freeze blender requirements-blender.txt constraints-blender.txt
