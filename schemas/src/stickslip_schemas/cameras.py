@@ -1,0 +1,182 @@
+"""Calibrated pinhole cameras, as data.
+
+A point X [scene units] lands on the pixel (u, v):
+
+    x = R X + t                      camera axes: x right, y down, z forward (as in OpenCV)
+    u = fx x_x / x_z + cx            x_z is the depth
+    v = fy x_y / x_z + cy
+
+Integer pixel coordinates are pixel centres: the image covers [-0.5, width - 0.5] x [-0.5, height - 0.5] and v grows
+downwards. A camera is nothing but a name and numbers, so its JSON form is what enters a content key.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
+
+from stickslip_schemas.base import Document
+
+__all__ = ["Camera", "Matrix3", "Vector3", "load_rig", "read_rigs", "rig_names"]
+
+Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows
+
+ROTATION_TOLERANCE = 1e-6  # of R R^T - 1: calibration files print six digits or more
+
+
+class Camera(Document):
+    """One calibrated view: intrinsics in pixels, extrinsics from the world to the camera."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
+    """The viewpoint's name, unique in its rig."""
+    width: Annotated[int, Field(ge=1, le=16384)]
+    """Image width [px]."""
+    height: Annotated[int, Field(ge=1, le=16384)]
+    """Image height [px]."""
+    fx: Annotated[FiniteFloat, Field(gt=0)]
+    """Focal length along a row [px]."""
+    fy: Annotated[FiniteFloat, Field(gt=0)]
+    """Focal length along a column [px]."""
+    cx: FiniteFloat
+    """Principal point, column [px]; (width - 1) / 2 is the middle of the image."""
+    cy: FiniteFloat
+    """Principal point, row [px]."""
+    rotation: Matrix3
+    """R, rows: the camera's x, y and z axes in world coordinates, shape (3, 3)."""
+    translation: Vector3
+    """t [scene units]: the world's origin in camera coordinates, shape (3,)."""
+
+    @field_validator("rotation")
+    @classmethod
+    def _is_rotation(cls, rotation: Matrix3) -> Matrix3:
+        R = np.asarray(rotation)
+        error = float(np.abs(R @ R.T - np.eye(3)).max())
+        if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            raise ValueError(
+                f"rotation must be orthonormal to {ROTATION_TOLERANCE:g} and right-handed; "
+                f"R R^T is off by {error:.2g}, det R = {np.linalg.det(R):.6g}"
+            )
+        return rotation
+
+    @classmethod
+    def looking_at(
+        cls,
+        target: Vector3,
+        *,
+        azimuth: float,
+        elevation: float,
+        distance: float,
+        name: str,
+        width: int,
+        height: int,
+        focal: float,
+    ) -> Self:
+        """Place a camera around a target, upright, the target in the middle of its image.
+
+        Azimuth is the camera's direction seen from the target, from +x towards +y [degree]; elevation is above the
+        horizon [degree], within (-90, 90); distance [scene units]; focal [px].
+        """
+        a, e = np.radians(azimuth), np.radians(elevation)
+        outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        right = np.array([-np.sin(a), np.cos(a), 0.0])
+        R = np.stack([right, np.cross(-outward, right), -outward])
+        t = -R @ (np.asarray(target) + distance * outward)
+        return cls(
+            name=name,
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=(width - 1) / 2,
+            cy=(height - 1) / 2,
+            rotation=tuple(map(tuple, R.tolist())),
+            translation=tuple(t.tolist()),
+        )
+
+    @property
+    def position(self) -> npt.NDArray[np.float64]:
+        """The camera's centre in the world, -R^T t [scene units], shape (3,)."""
+        center: npt.NDArray[np.float64] = -np.asarray(self.rotation).T @ np.asarray(self.translation)
+        return center
+
+    def project(self, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Project world points (..., 3) [scene units] to pixels (..., 2) and depths (...) [scene units].
+
+        A point that is not in front of the camera has no image: its pixel is NaN.
+        """
+        x = np.asarray(points, dtype=np.float64) @ np.asarray(self.rotation).T + np.asarray(self.translation)
+        depth = x[..., 2]
+        inverse = 1.0 / np.where(depth > 0.0, depth, np.nan)
+        u = self.fx * x[..., 0] * inverse + self.cx
+        v = self.fy * x[..., 1] * inverse + self.cy
+        return np.stack([u, v], axis=-1), depth
+
+    def overflow(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> float:
+        """Measure by how much balls of a radius [scene units] about points (..., 3) leave the frame [px].
+
+        The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's image is taken as a
+        disc, which is right to first order in its angular size. Infinite if a ball reaches behind the camera.
+        """
+        pixels, depth = self.project(points)
+        if not bool(np.all(depth > radius)):
+            return float("inf")
+        disc = radius / depth[..., None] * np.array([self.fx, self.fy])
+        low, high = -0.5 + margin, np.array([self.width, self.height]) - 0.5 - margin
+        return float(max((low - (pixels - disc)).max(), (pixels + disc - high).max()))
+
+    def in_frame(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> bool:
+        """Say whether balls of a radius [scene units] about points (..., 3) lie wholly in the frame."""
+        return self.overflow(points, radius, margin) <= 0.0
+
+
+class _Rig(Document):
+    about: str
+    unit: str
+    cameras: Annotated[tuple[Camera, ...], Field(min_length=1)]
+
+    @field_validator("cameras")
+    @classmethod
+    def _names_are_unique(cls, cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
+        names = [camera.name for camera in cameras]
+        if len(set(names)) != len(names):
+            raise ValueError(f"camera names must be unique in a rig; got {', '.join(names)}")
+        return cameras
+
+
+_RIGS: TypeAdapter[dict[str, _Rig]] = TypeAdapter(dict[str, _Rig])
+
+
+def _parse_rigs(text: str) -> dict[str, tuple[Camera, ...]]:
+    data: dict[str, Any] = tomllib.loads(text)
+    return {name: rig.cameras for name, rig in _RIGS.validate_python(data).items()}
+
+
+def read_rigs(path: str | Path) -> dict[str, tuple[Camera, ...]]:
+    """Read the rigs of a calibration file, laid out as this package's `cameras.toml`."""
+    return _parse_rigs(Path(path).read_text(encoding="utf-8"))
+
+
+@cache
+def _own_rigs() -> dict[str, tuple[Camera, ...]]:
+    return _parse_rigs(files("stickslip_schemas").joinpath("cameras.toml").read_text(encoding="utf-8"))
+
+
+def rig_names() -> tuple[str, ...]:
+    """Name the rigs that this package ships."""
+    return tuple(_own_rigs())
+
+
+def load_rig(name: str) -> tuple[Camera, ...]:
+    """Return the cameras of one of the shipped rigs, in the order in which their views are stored."""
+    rigs = _own_rigs()
+    if name not in rigs:
+        raise ValueError(f"rig must be one of {', '.join(rigs)}; got {name!r}")
+    return rigs[name]
