@@ -22,12 +22,22 @@ def canonical_json(value: Any) -> str:
 
 def content_key(purpose: str, value: Any) -> str:
     """Return the SHA-256 of `value`, kept apart by `purpose` so that two kinds of thing never share a key."""
-    return sha256(f"stickslip/{purpose}\n{canonical_json(value)}".encode())
+    return sha256(keyed_text(purpose, canonical_json(value)).encode())
+
+
+def keyed_text(purpose: str, canonical: str) -> str:
+    """Return the text whose SHA-256 is the content key of a value with the canonical JSON `canonical`."""
+    return f"stickslip/{purpose}\n{canonical}"
 
 
 def derived_seed(seed: int, purpose: str, value: Any) -> int:
     """Return a seed in [0, 2**31) that depends on `seed` and on what it is for, never on a position in a grid."""
-    return int(content_key(f"seed/{purpose}", {"seed": seed, "for": value})[:15], 16) % 2**31
+    return seed_of_key(content_key(f"seed/{purpose}", {"seed": seed, "for": value}))
+
+
+def seed_of_key(key: str) -> int:
+    """Return the seed in [0, 2**31) that a content key gives."""
+    return int(key[:15], 16) % 2**31
 
 
 def sha256(data: bytes) -> str:

@@ -1,16 +1,17 @@
 """From a spec to its samples: which simulation, which render and which split each of them is."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 from stickslip_schemas.axes import axis_values
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec, Splits
-from stickslip_schemas.keys import content_key, derived_seed
+from stickslip_schemas.keys import canonical_json, content_key, derived_seed, keyed_text, seed_of_key, sha256
 from stickslip_schemas.tasks import ClothRender, ClothSimulation, RodRender, RodSimulation
 
 SPLITS = ("train", "validation", "test")
@@ -35,6 +36,16 @@ class Sample:
         return self.render_key or self.simulation_key
 
 
+class Keyed(Protocol):
+    """What the key of a shard depends on, of each of its samples."""
+
+    @property
+    def key(self) -> str: ...
+
+    @property
+    def split(self) -> int: ...
+
+
 def simulation_key(simulation: RodSimulation | ClothSimulation, builds: Builds) -> str:
     """Return the content key of a trajectory: its physics and the sim_core build."""
     return content_key("simulate", {"simulation": simulation.model_dump(mode="json"), "build": builds.sim_core})
@@ -48,7 +59,7 @@ def render_key(render: RodRender | ClothRender, of_simulation: str, builds: Buil
     )
 
 
-def pack_key(spec: RodHangSpec | ClothDragSpec, shard: int, members: Sequence[Sample], builds: Builds) -> str:
+def pack_key(spec: RodHangSpec | ClothDragSpec, shard: int, members: Sequence[Keyed], builds: Builds) -> str:
     """Return the content key of a shard group: its slots' samples and splits, and the packer's build."""
     content = {
         "kind": spec.kind,
@@ -81,20 +92,103 @@ def grid(spec: RodHangSpec | ClothDragSpec) -> Iterator[dict[str, Any]]:
         yield dict(zip(spec.named_axes, point, strict=True))
 
 
+class KeyedPoint(NamedTuple):
+    """A sample as texts and keys, without its models: what a queue needs of a hundred thousand of them at once.
+
+    The texts are canonical JSON; `render_text` and `render_key` are None where nothing is rendered.
+    """
+
+    slot: int
+    labels: dict[str, Any]
+    labels_text: str
+    simulation_text: str
+    simulation_key: str
+    render_text: str | None
+    render_key: str | None
+    split: int
+
+    @property
+    def key(self) -> str:
+        """Key of everything the sample is made from."""
+        return self.render_key or self.simulation_key
+
+
+def keyed_points(spec: RodHangSpec | ClothDragSpec, builds: Builds) -> Iterator[KeyedPoint]:
+    """Yield what `samples` yields, with the very same keys, some ten times as fast.
+
+    The canonical JSON of one sample differs from that of the next in the values of the grid point alone, so it is
+    composed once, with holes, and the holes are filled in for each point.
+    """
+    names = list(spec.named_axes)
+    holes = {name: _hole(name) for name in names}
+    model, render_model = (_rod if isinstance(spec, RodHangSpec) else _cloth)(spec, _first_point(spec))  # type: ignore[arg-type]
+    simulation = _with_holes(model.model_dump(mode="json"), holes)
+    rendered = None
+    if render_model is not None:
+        seed_field = "color_seed" if isinstance(render_model, RodRender) else "light_seed"
+        rendered = _with_holes(render_model.model_dump(mode="json"), holes) | {seed_field: _hole("seed")}
+    labels_text = _template(holes)
+    simulation_text = _template(simulation)
+    simulation_keyed = _template({"simulation": simulation, "build": builds.sim_core}, "simulate")
+    split_seed = _template({"seed": spec.seed, "for": simulation}, "seed/split")
+    purpose = "color" if isinstance(spec, RodHangSpec) else "light"
+    render_seed = _template({"seed": spec.seed, "for": holes}, f"seed/{purpose}")
+    render_text = _template(rendered)
+    render_keyed = _template({"render": rendered, "simulation": _hole("simulation"), "build": builds.blender}, "render")
+    for slot, point in enumerate(grid(spec)):
+        texts = {name: _text(value) for name, value in point.items()}
+        key = sha256((simulation_keyed % texts).encode())
+        split = _split_at(spec.splits, _seed_of(split_seed % texts))
+        labels, physics = labels_text % texts, simulation_text % texts
+        if rendered is None:
+            yield KeyedPoint(slot, point, labels, physics, key, None, None, split)
+            continue
+        texts["seed"] = str(_seed_of(render_seed % texts))
+        texts["simulation"] = f'"{key}"'
+        look_key = sha256((render_keyed % texts).encode())
+        yield KeyedPoint(slot, point, labels, physics, key, render_text % texts, look_key, split)
+
+
 def samples(spec: RodHangSpec | ClothDragSpec, builds: Builds) -> Iterator[Sample]:
     """Yield the samples of `spec` as `builds` would make them."""
-    for slot, point in enumerate(grid(spec)):
-        simulation, render = _rod(spec, point) if isinstance(spec, RodHangSpec) else _cloth(spec, point)
-        key = simulation_key(simulation, builds)
+    for point in keyed_points(spec, builds):
+        simulation, render = _rod(spec, point.labels) if isinstance(spec, RodHangSpec) else _cloth(spec, point.labels)
         yield Sample(
-            slot=slot,
-            labels=point,
+            slot=point.slot,
+            labels=point.labels,
             simulation=simulation,
-            simulation_key=key,
+            simulation_key=point.simulation_key,
             render=render,
-            render_key=None if render is None else render_key(render, key, builds),
-            split=split_of(spec.splits, spec.seed, simulation),
+            render_key=point.render_key,
+            split=point.split,
         )
+
+
+def _hole(name: str) -> str:
+    return f"\x00{name}\x00"  # no value holds a NUL
+
+
+def _first_point(spec: RodHangSpec | ClothDragSpec) -> dict[str, Any]:
+    return next(grid(spec))
+
+
+def _with_holes(document: dict[str, Any], holes: dict[str, str]) -> dict[str, Any]:
+    return {name: holes.get(name, value) for name, value in document.items()}
+
+
+def _template(document: Any, purpose: str | None = None) -> str:
+    """Return the canonical JSON of `document` (what `content_key` hashes, with a purpose) as a %-format."""
+    text = canonical_json(document)
+    text = (text if purpose is None else keyed_text(purpose, text)).replace("%", "%%")
+    return re.sub(r'"\\u0000(\w+)\\u0000"', r"%(\1)s", text)
+
+
+def _text(value: Any) -> str:
+    return repr(value + 0.0) if isinstance(value, float) else canonical_json(value)
+
+
+def _seed_of(text: str) -> int:
+    return seed_of_key(sha256(text.encode()))
 
 
 def _rod(spec: RodHangSpec, point: dict[str, Any]) -> tuple[RodSimulation, RodRender | None]:
@@ -126,7 +220,11 @@ def _cloth(spec: ClothDragSpec, point: dict[str, Any]) -> tuple[ClothSimulation,
 
 def split_of(splits: Splits, seed: int, simulation: RodSimulation | ClothSimulation) -> int:
     """Return the number of the split of `simulation`: a hash of its physics, so no build or order moves it."""
-    position = derived_seed(seed, "split", simulation.model_dump(mode="json")) / 2**31
+    return _split_at(splits, derived_seed(seed, "split", simulation.model_dump(mode="json")))
+
+
+def _split_at(splits: Splits, seed: int) -> int:
+    position = seed / 2**31
     if position < splits.train:
         return 0
     return 1 if position < splits.train + splits.validation else 2
