@@ -31,6 +31,11 @@ def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndar
     return Zstd().decode(_without_crc(chunk, "chunk"), out)  # type: ignore[no-any-return]  # untyped library
 
 
+def check_chunk(chunk: bytes) -> None:
+    """Raise CorruptChunkError where the checksum of an encoded chunk does not hold; nothing is decoded."""
+    _without_crc(chunk, "chunk")
+
+
 def encode_shard(chunks: Sequence[bytes | None]) -> bytes:
     """Return the shard of encoded `chunks` in C order of the chunk grid; None is a chunk that is missing."""
     index = np.full((len(chunks), 2), MISSING, dtype="<u8")

@@ -1,0 +1,37 @@
+"""The kinds of things that these workers can make. A new kind is one more entry."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import TaskResult
+
+from stickslip_workers.stages.rods import CURVES, simulate_rods
+
+KindName = Literal["rod_hang", "cloth_drag"]
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """How one kind is simulated and packed."""
+
+    simulate: Callable[[Sequence[Any], Store], list[TaskResult]]
+    """From simulations to one result each, in their order."""
+    batch: int
+    """How many simulations one call is given at most."""
+    record_arrays: tuple[str, ...]
+    """The arrays of the dataset that come from the records of its simulations."""
+
+
+KINDS: dict[KindName, Kind] = {
+    # Small enough that a lost batch costs little: 512 rods are well below a second.
+    "rod_hang": Kind(simulate=simulate_rods, batch=512, record_arrays=CURVES),
+}
+
+
+def kind_of(name: KindName) -> Kind:
+    """Return the kind of this name, or raise ValueError."""
+    if name not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)} for this worker; got {name!r}")
+    return KINDS[name]

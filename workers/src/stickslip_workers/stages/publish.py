@@ -1,0 +1,83 @@
+"""Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
+
+import numpy as np
+from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.chunks import decode_chunk
+from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
+from stickslip_schemas.keys import canonical_json
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.samples import SPLITS, dataset_id
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask
+
+from stickslip_workers.stages.metadata import metadata_files
+
+
+def publish(task: PublishTask, store: Store) -> PublishOutput:
+    """Write what makes the shards a dataset. Doing it twice, or again after a crash, gives the same bytes."""
+    _check_complete(task, store)
+    files = list(task.files)
+    metadata = metadata_files(task.spec, dataset=task.dataset, version=task.version, sample_count=len(task.sample_keys))
+    for path, data in metadata.items():
+        files.append(FileEntry(path=path, sha256=store.publish(data), size=len(data)))
+    manifest = Manifest(
+        dataset=task.dataset,
+        version=task.version,
+        spec=task.spec,
+        spec_digest=task.spec.content_digest,
+        builds=task.builds,
+        cameras=_cameras(task.spec),
+        sample_count=len(task.sample_keys),
+        valid_count=len(task.sample_keys) - len(task.rejections),
+        split_counts=_split_counts(task, store),
+        rejections=task.rejections,
+        sample_keys=task.sample_keys,
+        files=tuple(sorted(files, key=lambda file: file.path)),
+    )
+    directory = store.dataset_path(task.dataset, task.version)
+    for file in manifest.files:
+        store.link(file.sha256, directory / file.path)
+    data = canonical_json(manifest.model_dump(mode="json")).encode()
+    digest = store.publish(data)
+    store.link(digest, directory / MANIFEST_NAME)
+    return PublishOutput(manifest=digest, bytes=manifest.size + len(data))
+
+
+def _check_complete(task: PublishTask, store: Store) -> None:
+    """Refuse a version that lacks a file: a Zarr reader would take it for fill values and say nothing."""
+    if task.dataset != dataset_id(task.spec):
+        raise ValueError(f"dataset must be the id of its spec, {dataset_id(task.spec)}; got {task.dataset!r}")
+    shards = -(-len(task.sample_keys) // task.spec.samples_per_shard)
+    expected = {array.shard_path(shard) for array in layout(task.spec) for shard in range(shards)}
+    given = {file.path for file in task.files}
+    if given != expected or len(task.files) != len(given):
+        odd = sorted(given ^ expected) or ["one path twice"]
+        raise ValueError(f"files must be those of {shards} shards; missing or unknown are {odd[:3]} and so on")
+    for file in task.files:
+        size = store.path(file.sha256).stat().st_size
+        if size != file.size:
+            raise OSError(f"artifact {file.sha256} of {file.path} must have {file.size} bytes; it has {size}")
+
+
+def _cameras(spec: RodHangSpec | ClothDragSpec) -> tuple[Camera, ...]:
+    return load_rig(spec.views) if isinstance(spec, RodHangSpec) and spec.views is not None else ()
+
+
+def _split_counts(task: PublishTask, store: Store) -> dict[str, int]:
+    """Count the valid samples of each split from what the shards say, and check it against the rejections."""
+    digests = {file.path: file.sha256 for file in task.files}
+    arrays = {array.name: array for array in layout(task.spec)}
+    count = len(task.sample_keys)
+
+    def column(name: str) -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
+        shards = range(-(-count // task.spec.samples_per_shard))
+        chunks = [bytes(decode_chunk(store.read(digests[arrays[name].shard_path(shard)]))) for shard in shards]
+        return np.frombuffer(b"".join(chunks), dtype=np.uint8)[:count]
+
+    valid = column("valid").astype(bool)
+    rejected = sorted(rejection.slot for rejection in task.rejections)
+    if np.flatnonzero(~valid).tolist() != rejected:
+        raise ValueError(f"rejections must be the slots that are not valid; got {rejected[:5]} and so on")
+    counts = np.bincount(column("split")[valid], minlength=len(SPLITS))
+    return {name: int(number) for name, number in zip(SPLITS, counts, strict=True)}

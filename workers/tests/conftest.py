@@ -1,0 +1,135 @@
+"""A made-up dataset of rods: its tasks, and what its arrays must hold."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.jobs import RodHangSpec
+from stickslip_schemas.layout import layout
+from stickslip_schemas.samples import dataset_id, samples
+from stickslip_schemas.states import Reason
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import (
+    ChunkRef,
+    FileEntry,
+    PackSlot,
+    PackTask,
+    PublishTask,
+    RecordRef,
+    Rejection,
+)
+from stickslip_workers.stages.pack import pack
+from stickslip_workers.stages.publish import publish
+from stickslip_workers.stages.records import encode_records
+
+BUILDS = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+
+
+@dataclass
+class Made:
+    """A dataset before it is packed: `arrays` is what every reader must give back."""
+
+    spec: RodHangSpec
+    store: Store
+    pack_tasks: list[PackTask]
+    arrays: dict[str, np.ndarray[Any, Any]]
+    rejections: tuple[Rejection, ...]
+    sample_keys: tuple[str, ...]
+    files: list[FileEntry] = field(default_factory=list)
+
+    @property
+    def publish_task(self) -> PublishTask:
+        """The task that ends it; packs first where that has not been done."""
+        if not self.files:
+            self.files = [file for task in self.pack_tasks for file in pack(task, self.store).files]
+        return PublishTask(
+            spec=self.spec,
+            dataset=dataset_id(self.spec),
+            version=1,
+            builds=BUILDS,
+            files=tuple(self.files),
+            sample_keys=self.sample_keys,
+            rejections=self.rejections,
+        )
+
+    def publish(self) -> Path:
+        """Pack and publish, and return the directory."""
+        publish(self.publish_task, self.store)
+        return self.store.dataset_path(dataset_id(self.spec), 1)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def make_dataset(store: Store) -> Callable[..., Made]:
+    """Make up a dataset: `make_dataset(count=7, per_shard=4, rejected=(2,), views=True)`."""
+
+    def make(*, count: int = 7, per_shard: int = 4, rejected: tuple[int, ...] = (2,), views: bool = True) -> Made:
+        rng = np.random.default_rng(count)
+        spec = RodHangSpec.model_validate(
+            {
+                "kind": "rod_hang",
+                "axes": {"gamma": list(np.linspace(1.0, 50.0, count)), "phi0": 2.0, "phi1": 5.0},
+                "samples_per_shard": per_shard,
+                "views": "rod-4" if views else None,
+            }
+        )
+        members = list(samples(spec, BUILDS))
+        arrays = {array.name: np.full((count, *array.shape), array.fill, dtype=array.dtype) for array in layout(spec)}
+        curves = {
+            name: rng.standard_normal((count, *arrays[name].shape[1:])).astype(np.float32)
+            for name in ("centerline", "curvature", "frame")
+        }
+        artifact = store.publish(encode_records(curves))
+        slots, rejections = [], []
+        for sample in members:
+            i = sample.slot
+            arrays["sample_key"][i] = np.frombuffer(bytes.fromhex(sample.key), dtype=np.uint8)
+            arrays["split"][i] = sample.split
+            for name in ("gamma", "phi0", "phi1"):
+                arrays[name][i] = sample.labels[name]
+            common = {"slot": i, "sample_key": sample.key, "labels": sample.labels}
+            if i in rejected:
+                rejections.append(Rejection(**common, reason=Reason.out_of_frame, message="made up"))
+                slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
+                continue
+            labels = {**sample.labels, "energy": float(rng.standard_normal()), "stable": True}
+            arrays["valid"][i] = True
+            arrays["energy"][i] = labels["energy"]
+            for name, values in curves.items():
+                arrays[name][i] = values[i]
+            chunks = {}
+            if views:
+                labels["color"] = [float(value) for value in rng.random(3)]
+                arrays["color"][i] = labels["color"]
+                picture = np.repeat(rng.integers(0, 255, (4, 224, 28, 3), dtype=np.uint8), 8, axis=2)
+                arrays["views"][i] = picture
+                chunk = encode_chunk(picture)
+                # Somewhere in a larger artifact, as a renderer may leave it.
+                digest = store.publish(b"#" * i + chunk + b"...")
+                chunks["views"] = ChunkRef(digest=digest, offset=i, length=len(chunk))
+            slots.append(
+                PackSlot(
+                    slot=i,
+                    sample_key=sample.key,
+                    split=sample.split,
+                    labels=labels,
+                    record=RecordRef(digest=artifact, row=i),
+                    chunks=chunks,
+                )
+            )
+        tasks = [
+            PackTask(spec=spec, shard=shard, slots=tuple(slots[first : first + per_shard]))
+            for shard, first in enumerate(range(0, count, per_shard))
+        ]
+        return Made(spec, store, tasks, arrays, tuple(rejections), tuple(sample.key for sample in members))
+
+    return make

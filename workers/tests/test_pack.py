@@ -1,0 +1,85 @@
+"""Pack: byte for byte what zarr-python writes, and nothing that is not sound goes in."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zarr
+from stickslip_schemas.layout import layout
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import ChunkRef, PackTask
+from stickslip_workers.stages.metadata import create_array
+from stickslip_workers.stages.pack import pack
+
+
+@pytest.mark.parametrize("views", [True, False])
+def test_files_are_those_of_zarr_python(make_dataset: Callable[..., Any], tmp_path: Path, views: bool) -> None:
+    made = make_dataset(count=7, per_shard=4, rejected=(2,), views=views)
+    packed = {
+        file.path: made.store.read(file.sha256) for task in made.pack_tasks for file in pack(task, made.store).files
+    }
+    group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
+    for array in layout(made.spec):
+        # A rejected sample has no chunk in the shard, but a chunk of labels is always there.
+        with zarr.config.set({"array.write_empty_chunks": not array.per_sample}):
+            target = create_array(group, array, sample_count=7, samples_per_shard=4)
+            target[:] = made.arrays[array.name]  # type: ignore[index]
+    written = {
+        path.relative_to(tmp_path / "zarr").as_posix(): path.read_bytes()
+        for path in (tmp_path / "zarr").rglob("*")
+        if path.is_file() and path.name != "zarr.json"
+    }
+    assert packed.keys() == written.keys()
+    assert [path for path in packed if packed[path] != written[path]] == []
+
+
+def test_packing_again_gives_the_same_files(make_dataset: Callable[..., Any]) -> None:
+    made = make_dataset()
+    assert [pack(task, made.store) for task in made.pack_tasks] == [pack(task, made.store) for task in made.pack_tasks]
+
+
+def _with_first_slot(task: PackTask, **changes: Any) -> PackTask:
+    first, *others = task.slots
+    return task.model_copy(update={"slots": (first.model_copy(update=changes), *others)})
+
+
+def test_a_corrupt_chunk_is_refused(make_dataset: Callable[..., Any], store: Store) -> None:
+    (task, *_) = make_dataset().pack_tasks
+    where = task.slots[0].chunks["views"]
+    chunk = bytearray(store.read(where.digest, offset=where.offset, length=where.length))
+    chunk[100] ^= 1
+    digest = store.publish(bytes(chunk))
+    bad = ChunkRef(digest=digest, offset=0, length=len(chunk))
+    with pytest.raises(ValueError, match="crc32c of the chunk"):
+        pack(_with_first_slot(task, chunks={"views": bad}), store)
+
+
+def test_a_record_that_was_damaged_on_disk_is_refused(make_dataset: Callable[..., Any], store: Store) -> None:
+    (task, *_) = make_dataset().pack_tasks
+    path = store.path(task.slots[0].record.digest)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(OSError, match="other bytes than its name says"):
+        pack(task, store)
+
+
+def test_a_missing_artifact_is_refused(make_dataset: Callable[..., Any], store: Store) -> None:
+    (task, *_) = make_dataset().pack_tasks
+    store.path(task.slots[0].chunks["views"].digest).unlink()
+    with pytest.raises(FileNotFoundError):
+        pack(task, store)
+
+
+def test_what_is_wrong_is_named(make_dataset: Callable[..., Any], store: Store) -> None:
+    (task, *_) = make_dataset().pack_tasks
+    slot = task.slots[0]
+    with pytest.raises(ValueError, match="consecutive from 4 and at most 4; got 4 from 0 to 3"):
+        pack(task.model_copy(update={"shard": 1}), store)
+    with pytest.raises(ValueError, match="chunks of slot 0 must have 'views'"):
+        pack(_with_first_slot(task, chunks={}), store)
+    with pytest.raises(ValueError, match="labels of slot 0 must have 'energy'"):
+        pack(_with_first_slot(task, labels={"gamma": 1, "phi0": 1, "phi1": 1, "color": [0] * 3}), store)
+    with pytest.raises(ValueError, match="with n > 99; got float32"):
+        pack(_with_first_slot(task, record=slot.record.model_copy(update={"row": 99})), store)

@@ -1,0 +1,119 @@
+"""Publish: every reader gives back what went in, and a version is never half there."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tensorstore
+import xarray
+import zarr
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.store import Store
+from stickslip_workers.stages import publish as publish_module
+from stickslip_workers.stages.publish import publish
+
+Make = Callable[..., Any]
+
+
+def _tree(directory: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
+    }
+
+
+def _assert_same(got: np.ndarray[Any, Any], expected: np.ndarray[Any, Any], name: str) -> None:
+    assert got.dtype == expected.dtype, name
+    assert got.shape == expected.shape, name
+    assert got.tobytes() == expected.tobytes(), name
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"count": 7, "per_shard": 4, "rejected": (2,)},  # the last shard is partial
+        {"count": 8, "per_shard": 4, "rejected": (4, 5, 6, 7)},  # a shard without a valid sample
+        {"count": 2, "per_shard": 64, "rejected": ()},  # fewer samples than one shard holds
+        {"count": 5, "per_shard": 2, "rejected": (), "views": False},
+    ],
+)
+def test_three_readers_give_back_what_went_in(make_dataset: Make, shape: dict[str, Any]) -> None:
+    made = make_dataset(**shape)
+    directory = made.publish()
+    group = zarr.open_group(directory, mode="r")
+    assert group.attrs["spec_digest"] == made.spec.content_digest
+    with xarray.open_zarr(directory, chunks=None, mask_and_scale=False) as dataset:
+        assert set(dataset.variables) == set(made.arrays)
+        for name, expected in made.arrays.items():
+            _assert_same(group[name][...], expected, name)
+            _assert_same(dataset[name].values, expected, name)
+            spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{directory / name}/"}}
+            _assert_same(tensorstore.open(spec, read=True).result().read().result(), expected, name)
+    assert dataset["frame"].dims == ("sample", "point", "xyz", "director")
+    assert group["split"].attrs["categories"] == ["train", "validation", "test"]
+
+
+def test_manifest_says_everything(make_dataset: Make) -> None:
+    made = make_dataset()
+    directory = made.publish()
+    tree = _tree(directory)
+    manifest = Manifest.model_validate_json(tree.pop("manifest.json"))
+    assert {file.path: (file.sha256, file.size) for file in manifest.files} == {
+        path: (sha256(data), len(data)) for path, data in tree.items()
+    }
+    assert manifest.rejections == made.rejections
+    assert manifest.valid_count == 6
+    assert sum(manifest.split_counts.values()) == 6
+    assert [camera.name for camera in manifest.cameras]
+    assert manifest.acceptance_rate == pytest.approx(6 / 7)
+
+
+def test_publishing_again_and_after_a_crash_gives_the_same(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = make_dataset()
+    task = made.publish_task
+    directory = made.store.dataset_path(task.dataset, 1)
+
+    class Killed(BaseException):
+        """Not an Exception: nothing on the way may catch it, as nothing catches SIGKILL."""
+
+    links = 0
+    link = Store.link
+
+    def dying_link(self: Store, digest: str, target: Path) -> None:
+        nonlocal links
+        links += 1
+        if links == 10:
+            raise Killed
+        link(self, digest, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(publish_module.Store, "link", dying_link)
+        with pytest.raises(Killed):
+            publish(task, made.store)
+    assert not (directory / "manifest.json").exists()
+    first = publish(task, made.store)
+    tree = _tree(directory)
+    assert publish(task, made.store) == first
+    assert _tree(directory) == tree
+    assert first.bytes == sum(map(len, tree.values()))
+    assert not [path for path in tree if path.endswith(".tmp")]
+
+
+def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
+    made = make_dataset()
+    task = made.publish_task
+    with pytest.raises(ValueError, match=r"files must be those of 2 shards.*'"):
+        publish(task.model_copy(update={"files": task.files[1:]}), made.store)
+    with pytest.raises(ValueError, match="rejections must be the slots that are not valid"):
+        publish(task.model_copy(update={"rejections": ()}), made.store)
+    with pytest.raises(ValueError, match="dataset must be the id of its spec"):
+        publish(task.model_copy(update={"dataset": "../elsewhere"}), made.store)
+    made.store.path(task.files[0].sha256).write_bytes(b"cut")
+    with pytest.raises(OSError, match=r"must have .* bytes; it has 3"):
+        publish(task, made.store)
+    made.store.path(task.files[0].sha256).unlink()
+    with pytest.raises(FileNotFoundError):
+        publish(task, made.store)
+    assert not made.store.dataset_path(task.dataset, 1).exists()
