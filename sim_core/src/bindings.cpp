@@ -1,0 +1,131 @@
+// The Python face: arrays in, arrays out. Checks that name fields for the user are in rods.py.
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "build_info.hpp"
+#include "rod_derivatives.hpp"
+#include "rods.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using Input = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+template <class Scalar, class... Shape>
+using Output = nb::ndarray<nb::numpy, Scalar, nb::c_contig, Shape...>;
+
+// A fresh, uninitialised array that NumPy owns.
+template <class Array>
+Array allocate(std::initializer_list<std::size_t> shape) {
+  using Scalar = typename Array::Scalar;
+  std::size_t size = 1;
+  for (std::size_t extent : shape) size *= extent;
+  auto data = std::make_unique_for_overwrite<Scalar[]>(size);
+  nb::capsule owner(data.get(), [](void* p) noexcept { delete[] static_cast<Scalar*>(p); });
+  return Array(data.release(), shape, owner);
+}
+
+using Vectors = Output<double, nb::shape<-1, -1, 3>>;
+using Frames = Output<double, nb::shape<-1, -1, 3, 3>>;
+using Numbers = Output<double, nb::shape<-1>>;
+using Counts = Output<std::int32_t, nb::shape<-1>>;
+using Truths = Output<bool, nb::shape<-1>>;
+using Solution = std::tuple<Vectors, Vectors, Frames, Numbers, Truths, Truths, Counts, Numbers, Numbers>;
+
+sim_core::RodKernelChoice kernel_named(const std::string& name) {
+  if (name.empty()) return sim_core::best_rod_kernel();
+  for (const auto& kernel : sim_core::rod_kernels()) {
+    if (kernel.name == name && kernel.supported) return kernel;
+  }
+  throw std::invalid_argument("kernel: must be one that this build has and this processor runs, got '" + name + "'");
+}
+
+// Rods between two looks at pending signals: a few milliseconds of work.
+constexpr std::int64_t rods_between_signals = 256;
+
+Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness, int elements, int points,
+                    int start_level, const std::string& kernel_name) {
+  const std::size_t n = gamma.size(), p = static_cast<std::size_t>(points);
+  if (phi0.size() != n || phi1.size() != n) throw std::invalid_argument("gamma, phi0, phi1: lengths must be equal");
+  const sim_core::RodSettings settings{twist_stiffness, elements,
+                                       start_level < 0 ? sim_core::default_start_level(elements) : start_level};
+  sim_core::check_rod_settings(settings, points);
+  const sim_core::RodKernelChoice kernel = kernel_named(kernel_name);
+  auto centerline = allocate<Vectors>({n, p, 3}), curvature = allocate<Vectors>({n, p, 3});
+  auto frame = allocate<Frames>({n, p, 3, 3});
+  auto energy = allocate<Numbers>({n}), residual = allocate<Numbers>({n}), refinement = allocate<Numbers>({n});
+  auto converged = allocate<Truths>({n}), stable = allocate<Truths>({n});
+  auto iterations = allocate<Counts>({n});
+  const sim_core::RodBatch batch{gamma.data(),      phi0.data(),       phi1.data(),      centerline.data(),
+                                 curvature.data(),  frame.data(),      energy.data(),    residual.data(),
+                                 refinement.data(), iterations.data(), converged.data(), stable.data()};
+  const auto samples = sim_core::sample_points(points, elements);
+  const auto total = static_cast<std::int64_t>(n);
+  for (std::int64_t begin = 0; begin < total; begin += rods_between_signals) {
+    {
+      nb::gil_scoped_release unlocked;
+      kernel.solve(batch, settings, samples, begin, std::min(begin + rods_between_signals, total));
+    }
+    if (PyErr_CheckSignals() != 0) throw nb::python_error();
+  }
+  return {centerline, curvature, frame, energy, stable, converged, iterations, residual, refinement};
+}
+
+std::vector<std::string> rod_kernels() {
+  std::vector<std::string> names;
+  for (const auto& kernel : sim_core::rod_kernels()) {
+    if (kernel.supported) names.emplace_back(kernel.name);
+  }
+  return names;
+}
+
+using Quaternions = Eigen::Matrix<double, -1, 4, Eigen::RowMajor>;
+
+std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0, double phi1,
+                                                                     double twist_stiffness,
+                                                                     const nb::DRef<const Quaternions>& quaternions) {
+  const Quaternions chain = quaternions;
+  auto result = sim_core::rod_derivatives(gamma, phi0, phi1, twist_stiffness, chain);
+  return {result.energy, std::move(result.gradient), std::move(result.hessian)};
+}
+
+}  // namespace
+
+NB_MODULE(_sim_core, m) {
+#if defined(__AVX2__)
+  // Best effort: this unit itself was compiled for that instruction set.
+  __builtin_cpu_init();
+  if (!__builtin_cpu_supports("avx2")) throw nb::import_error("stickslip_sim_core was built for a newer processor");
+#endif
+  m.doc() = "Internal: the C++ core. Use stickslip_sim_core.";
+  nb::class_<sim_core::BuildInfo>(m, "BuildInfo", "What the C++ core was built from.")
+      .def_ro("version", &sim_core::BuildInfo::version)
+      .def_ro("build_hash", &sim_core::BuildInfo::build_hash,
+              "SHA-256, hex: over sources, compiler, flags and instruction set.")
+      .def_ro("compiler", &sim_core::BuildInfo::compiler, "Id and version.")
+      .def_ro("isa", &sim_core::BuildInfo::isa, "Instruction set of the whole library.")
+      .def_ro("rod_kernel", &sim_core::BuildInfo::rod_kernel,
+              "Vectors of the rod solver on this processor; its bits are the same for all.")
+      .def_ro("eigen", &sim_core::BuildInfo::eigen, "Version.");
+  m.def("build_info", &sim_core::build_info, "Tell what the C++ core was built from.");
+  m.def("solve_rods", &solve_rods, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "elements"_a, "points"_a,
+        "start_level"_a = -1, "kernel"_a = "",
+        "Internal: see stickslip_sim_core.solve_rods. Level -1 and kernel '' leave the choice to the solver.");
+  m.def("rod_kernels", &rod_kernels, "Internal: rod kernels this processor can run, narrowest first.");
+  m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
+        "Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by "
+        "world rotations of nodes 1 ... N.");
+  m.attr("ELEMENT_TURN_MAX") = sim_core::element_turn_max;
+}

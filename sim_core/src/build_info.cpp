@@ -1,0 +1,15 @@
+#include "build_info.hpp"
+
+#include "build_constants.hpp"
+#include "rods.hpp"
+
+namespace sim_core {
+
+BuildInfo build_info() {
+  const std::string isa = SIM_CORE_BUILD_ISA;
+  return {SIM_CORE_VERSION,        SIM_CORE_BUILD_HASH,
+          SIM_CORE_BUILD_COMPILER, isa.empty() ? SIM_CORE_BUILD_PROCESSOR : isa,
+          best_rod_kernel().name,  SIM_CORE_BUILD_EIGEN};
+}
+
+}  // namespace sim_core
