@@ -21,3 +21,18 @@ def failure(error: Exception) -> TaskResult:
     if isinstance(error, MemoryError):
         return failed(Reason.oom_killed, message)
     return failed(Reason.internal_error, message)
+
+
+def process_failure(error: Exception, *, renders: bool) -> TaskResult:
+    """Return the result of a task whose process raised `error` through Ray, or died."""
+    from ray import exceptions as ray_errors
+
+    if isinstance(error, ray_errors.RayTaskError):
+        # What was raised in the process; Ray leaves the traceback when the exception itself cannot travel.
+        return failure(error.cause) if isinstance(error.cause, Exception) else failed(Reason.internal_error, str(error))
+    if isinstance(error, ray_errors.OutOfMemoryError):
+        return failed(Reason.oom_killed, str(error))
+    node_died = "its node has died" in str(error)
+    if renders and isinstance(error, ray_errors.RayActorError) and not node_died:
+        return failed(Reason.renderer_crash, str(error))
+    return failed(Reason.worker_lost, str(error))

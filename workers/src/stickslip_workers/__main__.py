@@ -1,0 +1,104 @@
+"""Command line: `python -m stickslip_workers dispatch | replay | describe`."""
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+from pathlib import Path
+
+from stickslip_schemas.tasks import task_adapter
+
+from stickslip_workers.coordinator import CoordinatorError
+from stickslip_workers.settings import Settings, default_blender_python
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m stickslip_workers", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
+
+    dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray")
+    dispatch.add_argument("--url", required=True, help="base URL of the coordinator; key in STICKSLIP_API_KEY")
+    dispatch.add_argument("--store", type=Path, required=True, help="root of the store")
+    dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
+    dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
+    dispatch.add_argument("--ray-address", help="an existing Ray cluster (default: a cluster of its own)")
+    dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+
+    replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator")
+    replay.add_argument("task", type=Path, help="the task as JSON")
+    replay.add_argument("--store", type=Path, required=True, help="root of the store")
+    replay.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+
+    commands.add_parser("describe", help="print the builds of this environment")
+
+    options = parser.parse_args(arguments)
+    if options.command == "dispatch":
+        return _dispatch(options)
+    if options.command == "replay":
+        return _replay(options)
+    from stickslip_workers.stages.actor import StageActor
+
+    sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
+    return 0
+
+
+def _dispatch(options: argparse.Namespace) -> int:
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request
+    if not options.blender_python.exists():
+        logging.error("blender-python must be an interpreter; %s does not exist", options.blender_python)
+        return 2
+    settings = Settings(
+        url=options.url,
+        store=options.store,
+        name=options.name,
+        api_key=os.environ.get("STICKSLIP_API_KEY"),
+        slots=options.slots,
+        ray_address=options.ray_address,
+        # Not resolved: a virtual environment is known by the path of its link.
+        blender_python=options.blender_python.absolute(),
+    )
+    from stickslip_workers.cluster import ray_cluster
+    from stickslip_workers.dispatcher import Dispatcher, NameInUseError
+    from stickslip_workers.processes import StartError
+
+    stopped_early = False
+    dispatcher: Dispatcher | None = None
+
+    def stop(number: int, _frame: object) -> None:
+        nonlocal stopped_early
+        if dispatcher is None or stopped_early:
+            raise SystemExit(128 + number)  # nothing is running yet, or this is the second time
+        stopped_early = True
+        dispatcher.stop()
+
+    try:
+        with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cpus:
+            dispatcher = Dispatcher(settings, cluster_cpus=cpus)
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, stop)  # after Ray has set its own
+            dispatcher.run()
+    except (StartError, NameInUseError, CoordinatorError) as error:
+        logging.error("%s: %s", type(error).__name__, error)
+        return 1
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from stickslip_workers.replay import replay
+
+    result = replay(
+        task_adapter.validate_json(options.task.read_bytes()),
+        store=options.store,
+        blender_python=options.blender_python.absolute(),
+    )
+    sys.stdout.write(result.model_dump_json(indent=2) + "\n")
+    return 1 if result.outcome == "failed" else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

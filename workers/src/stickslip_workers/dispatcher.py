@@ -1,0 +1,413 @@
+"""The dispatcher: leases tasks from the coordinator, keeps the processes of a Ray cluster busy, reports results.
+
+One thread does everything but heartbeats. It sleeps in `ray.wait` and never blocks on the coordinator for longer than
+one request, so running work goes on while the coordinator is away, and its results wait.
+"""
+
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.states import Reason, Stage
+from stickslip_schemas.tasks import SimulateTask, Task, TaskResult
+from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
+
+from stickslip_workers.backoff import Backoff
+from stickslip_workers.coordinator import Coordinator, CoordinatorError, UnknownWorkerError, UnreachableError
+from stickslip_workers.failures import failed, failure, process_failure
+from stickslip_workers.heartbeat import HeartbeatThread
+from stickslip_workers.leases import LeaseBook
+from stickslip_workers.processes import Pool, PoolSettings, Process
+from stickslip_workers.settings import Settings
+from stickslip_workers.stages.kinds import KINDS, KindName
+from stickslip_workers.stages.run import AnyTask
+
+log = logging.getLogger(__name__)
+
+LONGEST_WAIT = 1.0
+"""The loop looks at time limits and dropped leases at least so often [s]."""
+
+LOST_SESSIONS = 5
+"""Sessions in a row that may be lost within two leases each: somebody else is using the name."""
+
+REPORTS_A_REQUEST = 512
+
+LARGEST_BATCH = max(kind.batch for kind in KINDS.values())
+"""How many simulations to ask for at once: one call takes them all."""
+
+_PRECEDENCE = (Stage.publish, Stage.pack, Stage.simulate, Stage.render)
+"""What goes first: the end of a job before its beginning, and simulations, being short, before renders."""
+
+_tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
+_results = TypeAdapter(list[TaskResult])
+
+
+class NameInUseError(RuntimeError):
+    """Another dispatcher of the same name takes the leases away, again and again."""
+
+
+@dataclass(eq=False)
+class Assignment:
+    """Work that a process is at: one task, or a batch of simulations."""
+
+    leases: list[Lease]
+    stage: Stage
+    process: Process
+    started_at: float
+    unwanted_since: float | None = None
+
+
+class Dispatcher:
+    """See the module. `run` returns when `stop` is called; Ray must be connected."""
+
+    def __init__(self, settings: Settings, *, cluster_cpus: int) -> None:
+        self._settings = settings
+        self._slots = settings.slots or cluster_cpus
+        # Both pools full take all CPUs of the cluster, so that neither can keep the other from starting.
+        share = int(0.5 * max(cluster_cpus, 1) / self._slots * 1000) / 1000
+        common: dict[str, Any] = {
+            "store": str(settings.store.resolve()),
+            "size": self._slots,
+            "num_cpus": share,
+            "start_seconds": settings.start_seconds,
+            "process_bytes": settings.process_bytes,
+        }
+        self._stage_pool = Pool(
+            PoolSettings(
+                sort="stage", factory="stickslip_workers.stages.actor:StageActor", tasks_per_process=10_000, **common
+            )
+        )
+        self._render_pool = Pool(
+            PoolSettings(
+                sort="render",
+                factory=settings.render_actor,
+                tasks_per_process=settings.renders_per_process,
+                python=str(settings.blender_python),
+                **common,
+            )
+        )
+        self._coordinator = Coordinator(settings.url, settings.api_key)
+        self._backoff = Backoff()
+        self._session: WorkerSession | None = None
+        self._session_started = 0.0
+        self._lost_sessions = 0
+        self._heartbeat: HeartbeatThread | None = None
+        self._book = LeaseBook()
+        self._queues: dict[Stage, deque[Lease]] = {stage: deque() for stage in _PRECEDENCE}
+        self._running: dict[Any, Assignment] = {}
+        self._reports: deque[Report] = deque()
+        self._next_lease = 0.0
+        self._stopping = False
+
+    def stop(self) -> None:
+        """Stop leasing, give back what has not been started, and let `run` return soon."""
+        self._stopping = True  # no lock: signal handlers call this
+
+    def run(self) -> None:
+        """Work until stopped."""
+        try:
+            self._find_builds()
+            # Blender takes seconds to start: the first job should not have to wait for it.
+            self._render_pool.grow(self._slots)
+            while not self._stopping:
+                self._turn()
+            self._finish_running()
+        finally:
+            self._give_back()
+
+    # --- one turn of the loop -------------------------------------------------------------------------------
+
+    def _turn(self) -> None:
+        self._collect(self._wait_seconds())
+        self._stage_pool.look()
+        self._render_pool.look()
+        self._enforce_limits()
+        self._start_work()
+        if time.monotonic() < self._backoff.next_try:
+            return
+        try:
+            if self._session is None or (self._heartbeat is not None and self._heartbeat.session_lost.is_set()):
+                self._open_session()
+            if self._report():
+                self._next_lease = 0.0  # what has ended may have made new tasks possible
+            if self._lease():
+                self._start_work()
+            if self._backoff.failures:
+                log.info("the coordinator is back")
+            self._backoff.succeeded()
+        except UnknownWorkerError:
+            if self._heartbeat is not None:
+                self._heartbeat.session_lost.set()
+        except UnreachableError as error:
+            if self._backoff.failures == 0:
+                log.warning("the coordinator is away: %s", error)
+            self._backoff.failed()
+
+    def _wait_seconds(self) -> float:
+        """Return how long there is nothing to do unless work ends or a process starts."""
+        if self._session is None or self._reports:
+            due = self._backoff.next_try
+        elif self._wanted():
+            due = max(self._next_lease, self._backoff.next_try)
+        else:
+            return LONGEST_WAIT
+        return min(max(due - time.monotonic(), 0.0), LONGEST_WAIT)
+
+    def _collect(self, timeout: float) -> None:
+        """Wait until something ends, and take in what has."""
+        import ray
+
+        refs = [*self._running, *self._stage_pool.waiting_refs(), *self._render_pool.waiting_refs()]
+        if not refs:
+            time.sleep(timeout)
+            return
+        ray.wait(refs, num_returns=1, timeout=timeout)
+        if not self._running:
+            return
+        ended, _ = ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
+        for ref in ended:
+            self._take_in(ref, self._running.pop(ref))
+
+    def _take_in(self, ref: Any, assignment: Assignment) -> None:
+        import ray
+
+        pool = self._pool(assignment.stage)
+        try:
+            answer, resident = ray.get(ref)
+        except ray.exceptions.RayError as error:
+            if isinstance(error, ray.exceptions.RayTaskError):
+                pool.give_back(assignment.process, 0)
+            else:
+                log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
+                pool.bury(assignment.process)
+            result = process_failure(error, renders=assignment.stage is Stage.render)
+            results = [result] * len(assignment.leases)
+        else:
+            pool.give_back(assignment.process, resident)
+            results = _read_results(answer, len(assignment.leases))
+        self._settle(assignment, results)
+
+    def _settle(self, assignment: Assignment, results: list[TaskResult]) -> None:
+        for lease, result in zip(assignment.leases, results, strict=True):
+            if result.outcome == "failed":
+                log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
+            if self._book.holds(lease):
+                self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
+
+    def _enforce_limits(self) -> None:
+        """Kill what has run too long, and what nobody wants any more."""
+        now = time.monotonic()
+        for ref, assignment in list(self._running.items()):
+            limit = self._settings.exec_seconds[assignment.stage]
+            if not any(self._book.holds(lease) for lease in assignment.leases):
+                # Most work ends by itself sooner than a new process would start.
+                assignment.unwanted_since = assignment.unwanted_since or now
+                if now < assignment.unwanted_since + self._settings.drop_seconds:
+                    continue
+            elif now < assignment.started_at + limit:
+                continue
+            del self._running[ref]
+            self._pool(assignment.stage).end(assignment.process)
+            result = failed(
+                Reason.exec_timeout, f"not done within {limit:g} s; process {assignment.process.pid} killed"
+            )
+            self._settle(assignment, [result] * len(assignment.leases))
+
+    # --- work -----------------------------------------------------------------------------------------------
+
+    def _pool(self, stage: Stage) -> Pool:
+        return self._render_pool if stage is Stage.render else self._stage_pool
+
+    def _start_work(self) -> None:
+        """Give processes what is queued, as far as slots and processes are free."""
+        for queue in self._queues.values():
+            wanted = [lease for lease in queue if self._book.holds(lease)]
+            if len(wanted) < len(queue):
+                queue.clear()
+                queue.extend(wanted)
+        for stage in _PRECEDENCE:
+            queue = self._queues[stage]
+            pool = self._pool(stage)
+            while queue and len(self._running) < self._slots:
+                process = pool.take()
+                if process is None:
+                    pool.grow(min(_batch_count(stage, queue), self._slots - len(self._running)))
+                    break
+                self._assign(_next_batch(queue), stage, process)
+
+    def _assign(self, leases: list[Lease], stage: Stage, process: Process) -> None:
+        if stage is Stage.render:
+            ref = process.actor.call.remote("render", leases[0].task.model_dump(mode="json"))
+        else:
+            tasks = _tasks.dump_json([lease.task for lease in leases]).decode()
+            ref = process.actor.call.remote("run", tasks)
+        self._running[ref] = Assignment(leases, stage, process, time.monotonic())
+        self._book.start(leases)
+
+    # --- the coordinator ------------------------------------------------------------------------------------
+
+    def _find_builds(self) -> None:
+        """Start the first process of each pool and ask it what it is."""
+        self._stage_pool.grow(1)
+        self._render_pool.grow(1)
+        while not self._stopping and None in (self._stage_pool.description, self._render_pool.description):
+            self._collect(LONGEST_WAIT)
+            self._stage_pool.look()
+            self._render_pool.look()
+            self._stage_pool.grow(1)
+            self._render_pool.grow(1)
+
+    def _open_session(self) -> None:
+        """Register. What was leased in an earlier session is lost; the coordinator gives it out again."""
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+            self._heartbeat = None
+        if self._session is not None:
+            self._note_lost_session(self._session)
+            self._session = None
+        self._book.clear()
+        self._reports.clear()
+        stage, render = self._stage_pool.description, self._render_pool.description
+        assert stage is not None
+        assert render is not None
+        registration = WorkerRegistration(
+            name=self._settings.name,
+            builds=Builds(**stage["builds"], blender=render["build"]),
+            kinds=tuple(KINDS),
+            slots=self._slots,
+            versions={**stage["versions"], **render.get("versions", {})},
+        )
+        self._session = self._coordinator.register(registration)
+        self._session_started = time.monotonic()
+        self._next_lease = 0.0
+        self._heartbeat = HeartbeatThread(self._coordinator, self._session, self._book)
+        self._heartbeat.start()
+        log.info("registered as %s with %d slots", self._session.worker_id, self._slots)
+
+    def _note_lost_session(self, session: WorkerSession) -> None:
+        lasted = time.monotonic() - self._session_started
+        self._lost_sessions = self._lost_sessions + 1 if lasted < 2 * session.lease_seconds else 1
+        log.warning("session %s is lost after %.1f s", session.worker_id, lasted)
+        if self._lost_sessions >= LOST_SESSIONS:
+            raise NameInUseError(
+                f"the name {self._settings.name!r} was registered by somebody else {LOST_SESSIONS} times in a row: "
+                "every dispatcher needs a name of its own"
+            )
+
+    def _report(self) -> bool:
+        """Send all reports; return whether there were any."""
+        assert self._session is not None
+        there_were = bool(self._reports)
+        while self._reports:
+            batch = tuple(islice(self._reports, REPORTS_A_REQUEST))
+            answer = self._coordinator.report(ReportBatch(worker_id=self._session.worker_id, reports=batch))
+            for report, verdict in zip(batch, answer.verdicts, strict=True):
+                self._reports.popleft()
+                self._book.remove(report.task_id, report.token)
+                if verdict.verdict == "stale":
+                    log.warning("the report of task %s came too late and was refused", report.task_id)
+        return there_were
+
+    def _lease(self) -> bool:
+        """Ask for work if some is wanted and it is time; return whether there was any."""
+        assert self._session is not None
+        wanted = self._wanted()
+        if not wanted or time.monotonic() < self._next_lease:
+            return False
+        batch = self._coordinator.lease(LeaseRequest(worker_id=self._session.worker_id, wanted=wanted))
+        self._next_lease = time.monotonic() + batch.retry_after_seconds
+        self._book.add(batch.leases)
+        for lease in batch.leases:
+            self._queues[Stage(lease.task.stage)].append(lease)
+        return bool(batch.leases)
+
+    def _wanted(self) -> dict[Stage, int]:
+        """Return how many tasks to ask for: what runs and as much again, so that a kill gives little back."""
+        held = len(self._running) + sum(_batch_count(stage, queue) for stage, queue in self._queues.items())
+        free = 2 * self._slots - held
+        if free <= 0:
+            return {}
+        wanted = {Stage.publish: 1, Stage.pack: free, Stage.render: free}
+        if not self._queues[Stage.simulate]:
+            wanted[Stage.simulate] = LARGEST_BATCH
+        return wanted
+
+    # --- the end --------------------------------------------------------------------------------------------
+
+    def _finish_running(self) -> None:
+        """Give running work a moment to end; what is queued goes back at once."""
+        deadline = time.monotonic() + self._settings.stop_seconds
+        self._release_queued()
+        while self._running and time.monotonic() < deadline:
+            self._collect(min(LONGEST_WAIT, deadline - time.monotonic()))
+            self._try_to_report()
+
+    def _give_back(self) -> None:
+        """Give all leases back, if the coordinator listens; it finds out by itself otherwise."""
+        self._release_queued()
+        for assignment in self._running.values():
+            for lease in assignment.leases:
+                self._release(lease)
+        self._running.clear()
+        for _ in range(3):
+            if self._try_to_report():
+                break
+            time.sleep(0.3)
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+        self._coordinator.close()
+
+    def _release_queued(self) -> None:
+        for queue in self._queues.values():
+            while queue:
+                self._release(queue.popleft())
+
+    def _release(self, lease: Lease) -> None:
+        if self._book.holds(lease):
+            self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=None))
+
+    def _try_to_report(self) -> bool:
+        if self._session is None:
+            return True
+        try:
+            self._report()
+        except CoordinatorError as error:
+            log.warning("could not report: %s", error)
+            return False
+        return True
+
+
+def _next_batch(queue: deque[Lease]) -> list[Lease]:
+    """Take what one process can do together from the front of `queue`: simulations of one kind, or one task."""
+    batch = [queue.popleft()]
+    kind = _simulated_kind(batch[0])
+    limit = KINDS[kind].batch if kind in KINDS else 1
+    while queue and len(batch) < limit and _simulated_kind(queue[0]) == kind:
+        batch.append(queue.popleft())
+    return batch
+
+
+def _read_results(answer: Any, count: int) -> list[TaskResult]:
+    """Return the results of `count` tasks: the renderer answers with a dict, the stages with JSON."""
+    try:
+        return [TaskResult.model_validate(answer)] if isinstance(answer, dict) else _results.validate_json(answer)
+    except ValidationError as error:
+        return [failure(error)] * count
+
+
+def _batch_count(stage: Stage, queue: deque[Lease]) -> int:
+    """Return about how many calls the tasks of `queue` take."""
+    return -(-len(queue) // LARGEST_BATCH) if stage is Stage.simulate else len(queue)
+
+
+def _simulated_kind(lease: Lease) -> KindName | None:
+    return lease.task.simulation.kind if isinstance(lease.task, SimulateTask) else None
+
+
+def _names(leases: list[Lease]) -> str:
+    return leases[0].task_id if len(leases) == 1 else f"{leases[0].task_id} and {len(leases) - 1} more"

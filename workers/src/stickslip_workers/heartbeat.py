@@ -1,0 +1,48 @@
+"""The heartbeat: renews leases from a thread of its own, whatever the dispatcher's loop is busy with."""
+
+import logging
+import threading
+
+from stickslip_schemas.worker_api import Heartbeat, WorkerSession
+
+from stickslip_workers.coordinator import Coordinator, CoordinatorError, UnknownWorkerError
+from stickslip_workers.leases import LeaseBook
+
+log = logging.getLogger(__name__)
+
+
+class HeartbeatThread(threading.Thread):
+    """Beats three times a lease. A daemon: it never keeps the process alive."""
+
+    def __init__(self, coordinator: Coordinator, session: WorkerSession, book: LeaseBook) -> None:
+        super().__init__(name="heartbeat", daemon=True)
+        self._coordinator = coordinator
+        self._session = session
+        self._book = book
+        self._ended = threading.Event()
+        self.session_lost = threading.Event()
+        """Set when the coordinator does not know the session any more; the thread ends then."""
+
+    def stop(self) -> None:
+        """Beat no more."""
+        self._ended.set()
+
+    def run(self) -> None:
+        """Beat until told to stop."""
+        interval = self._session.lease_seconds / 3
+        wait = interval
+        while not self._ended.wait(wait):
+            states = self._book.states()
+            try:
+                answer = self._coordinator.heartbeat(Heartbeat(worker_id=self._session.worker_id, leases=states))
+            except UnknownWorkerError:
+                self.session_lost.set()
+                return
+            except CoordinatorError as error:
+                log.warning("no heartbeat: %s", error)
+                wait = min(1.0, interval)  # the lease is running out: a beat that failed is not skipped
+                continue
+            wait = interval
+            if answer.drop:
+                log.info("dropping %d tasks", len(answer.drop))
+                self._book.drop(answer.drop, as_of=states)

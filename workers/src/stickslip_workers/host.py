@@ -1,0 +1,28 @@
+"""A process that runs tasks, as Ray sees it.
+
+This module is pickled by value, so that the Blender environment need not have stickslip_workers: it may import
+nothing of ours.
+"""
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+
+class Host:
+    """Holds one object for the life of a process and calls it."""
+
+    def __init__(self, factory: str, store: str) -> None:
+        module, name = factory.split(":")
+        self._inner = getattr(importlib.import_module(module), name)(store)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the object says about itself, and the pid."""
+        return {**self._inner.describe(), "pid": os.getpid()}
+
+    def call(self, method: str, argument: Any) -> tuple[Any, int]:
+        """Call a method, and return its answer and the resident memory after it [bytes]."""
+        answer = getattr(self._inner, method)(argument)
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return answer, pages * os.sysconf("SC_PAGE_SIZE")

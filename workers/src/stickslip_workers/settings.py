@@ -1,0 +1,50 @@
+"""Settings of a dispatcher."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from stickslip_schemas.states import Stage
+
+RENDER_ACTOR = "stickslip_blender.actor:RenderActor"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What a dispatcher is told when it starts. Times are in seconds."""
+
+    url: str
+    """Base URL of the coordinator."""
+    store: Path
+    """Root of the store: the same directory on every node."""
+    name: str
+    """Name of this dispatcher; a second one of the same name takes the first one's place."""
+    api_key: str | None = None
+    slots: int | None = None
+    """How many tasks run at once; by default the CPUs of the cluster."""
+    ray_address: str | None = None
+    """An existing Ray cluster; by default one of its own on this machine, which ends with the dispatcher."""
+
+    blender_python: Path = field(default_factory=lambda: default_blender_python())
+    render_actor: str = RENDER_ACTOR
+    """Class, in the Blender interpreter, that is made with the root of the store and has `describe` and `render`."""
+    renders_per_process: int = 1000
+    """Renders after which a process gives way to a fresh one: Blender's memory grows slowly."""
+    process_bytes: int = 4 * 2**30
+    """Resident memory at which a process gives way to a fresh one [bytes]."""
+
+    exec_seconds: dict[Stage, float] = field(
+        default_factory=lambda: {Stage.simulate: 600, Stage.render: 300, Stage.pack: 600, Stage.publish: 3600}
+    )
+    """Limit of one task, or batch of simulations, by stage; then its process is killed."""
+    start_seconds: float = 120
+    """Limit for a process to be scheduled by Ray and to start; then the dispatcher ends with an error."""
+    drop_seconds: float = 5
+    """How long work that nobody wants any more may go on before its process is killed."""
+    stop_seconds: float = 8
+    """How long running work may go on after SIGTERM."""
+
+
+def default_blender_python() -> Path:
+    """Return the interpreter of the Blender environment beside the running one."""
+    return Path(sys.prefix).parent / ".venv-blender" / "bin" / "python"

@@ -1,0 +1,31 @@
+"""The stages as an object that a process holds, with JSON on both sides, as the renderer has it."""
+
+from typing import Any
+
+from pydantic import TypeAdapter
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import Task, TaskResult
+
+from stickslip_workers import builds
+from stickslip_workers.stages.run import AnyTask, run_tasks
+
+_tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
+_results = TypeAdapter(list[TaskResult])
+
+
+class StageActor:
+    """Runs simulate, pack and publish."""
+
+    def __init__(self, store: str) -> None:
+        self._store = Store(store)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the builds of what runs here, and versions for people."""
+        return {
+            "builds": {"sim_core": builds.sim_core_build(), "packer": builds.packer_build()},
+            "versions": builds.versions(),
+        }
+
+    def run(self, tasks: str) -> str:
+        """Run tasks, see `run_tasks`."""
+        return _results.dump_json(run_tasks(_tasks.validate_json(tasks), self._store)).decode()

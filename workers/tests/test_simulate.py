@@ -1,0 +1,89 @@
+"""Simulate: one artifact a batch, numbers that do not depend on the batch, rejections that say why."""
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+import stickslip_sim_core
+from stickslip_schemas.states import Reason
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import ClothSimulation, RodSimulation, SimulateTask, TaskResult
+from stickslip_workers.stages.run import run_tasks
+
+
+def _rods(count: int) -> list[SimulateTask]:
+    gammas = np.linspace(1, 300, count)
+    return [
+        SimulateTask(simulation=RodSimulation(gamma=float(gamma), phi0=2.0, phi1=8.0, poisson=0.5)) for gamma in gammas
+    ]
+
+
+def _curves(store: Store, result: TaskResult) -> dict[str, Any]:
+    record = result.output.record
+    with np.load(io.BytesIO(store.read(record.digest))) as arrays:
+        return {name: values[record.row] for name, values in arrays.items()}
+
+
+def test_a_batch_is_one_artifact_and_the_same_again(store: Store) -> None:
+    first, second = run_tasks(_rods(20), store), run_tasks(_rods(20), store)
+    assert {result.outcome for result in first} == {"succeeded"}
+    assert len({result.output.record.digest for result in first}) == 1
+    assert [result.output for result in first] == [result.output for result in second]
+    assert sum(result.cpu_seconds for result in first) > 0
+    curves = _curves(store, first[3])
+    assert {name: (values.shape, values.dtype) for name, values in curves.items()} == {
+        "centerline": ((150, 3), np.float32),
+        "curvature": ((150, 3), np.float32),
+        "frame": ((150, 3, 3), np.float32),
+    }
+
+
+def test_a_rod_does_not_depend_on_its_batch(store: Store) -> None:
+    tasks = _rods(7)
+    # Other settings in the same batch make an artifact of their own.
+    odd = SimulateTask(simulation=RodSimulation(gamma=9.0, phi0=1.0, phi1=1.0, poisson=0.3))
+    together = run_tasks([odd, *tasks], store)[1:]
+    for task, result in zip(tasks, together, strict=True):
+        (alone,) = run_tasks([task], store)
+        assert alone.output.labels == result.output.labels
+        one, many = _curves(store, alone), _curves(store, result)
+        assert all(np.array_equal(one[name], many[name]) for name in one)
+
+
+def test_a_rod_without_a_stable_shape_is_rejected(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    solve = stickslip_sim_core.solve_rods
+
+    def fail_some(*args: Any, **kwargs: Any) -> Any:
+        solution = solve(*args, **kwargs)
+        solution.converged[1] = False
+        solution.stable[1:3] = False
+        return solution
+
+    monkeypatch.setattr(stickslip_sim_core, "solve_rods", fail_some)
+    results = run_tasks(_rods(4), store)
+    assert [result.outcome for result in results] == ["succeeded", "rejected", "rejected", "succeeded"]
+    assert {result.reason for result in results[1:3]} == {Reason.solver_diverged}
+    assert results[1].message.startswith("the solver did not converge at gamma = 100.667, phi0 = 2")
+    assert results[2].message.startswith("no stable equilibrium was found")
+    assert [results[0].output.record.row, results[3].output.record.row] == [0, 1]
+
+
+def test_all_rejected_makes_no_artifact(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    solve = stickslip_sim_core.solve_rods
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        solution = solve(*args, **kwargs)
+        solution.stable[:] = False
+        return solution
+
+    monkeypatch.setattr(stickslip_sim_core, "solve_rods", fail)
+    assert {result.outcome for result in run_tasks(_rods(2), store)} == {"rejected"}
+    assert not (store.root / "artifacts").exists()
+
+
+def test_cloth_is_refused_by_name(store: Store) -> None:
+    cloth = ClothSimulation(material="royal-target", mu=0.2, preset="fast", mesh=5, seed=0)
+    (result,) = run_tasks([SimulateTask(simulation=cloth)], store)
+    assert (result.outcome, result.reason) == ("failed", Reason.internal_error)
+    assert "kind must be one of rod_hang for this worker; got 'cloth_drag'" in result.message
