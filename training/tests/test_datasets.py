@@ -1,0 +1,131 @@
+import multiprocessing
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from stickslip_training.datasets import ClipDataset, RodDataset, collate
+from stickslip_training.reader import DatasetReader
+from torch.utils.data import DataLoader
+
+
+def test_a_rod(rods):
+    dataset = RodDataset(rods.root, "train")
+    assert len(dataset) == rods.manifest.split_counts["train"]
+    item = dataset[3]
+    slot = int(item["slot"])
+    assert slot == dataset.slots[3]
+    assert {name: (value.dtype, tuple(value.shape)) for name, value in item.items()} == {
+        "centerline": (torch.float32, (150, 3)),
+        "curvature": (torch.float32, (150, 3)),
+        "gamma": (torch.float32, ()),
+        "phi0": (torch.float32, ()),
+        "phi1": (torch.float32, ()),
+        "slot": (torch.int64, ()),
+        "sample_key": (torch.uint8, (32,)),
+    }
+    for name in ("centerline", "curvature", "gamma", "phi0", "phi1", "sample_key"):
+        assert np.array_equal(item[name].numpy(), rods.arrays[name][slot].astype(item[name].numpy().dtype))
+
+
+def test_a_rod_with_views_and_frame(seen_rods):
+    item = RodDataset(seen_rods.root, views=True, frame=True)[2]
+    assert item["slot"] == 3  # 2 is rejected
+    assert np.array_equal(item["views"].numpy(), seen_rods.arrays["views"][3])
+    assert np.array_equal(item["color"].numpy(), seen_rods.arrays["color"][3])
+    assert np.array_equal(item["frame"].numpy(), seen_rods.arrays["frame"][3])
+
+
+def test_a_clip(clips):
+    dataset = ClipDataset(clips.root)
+    assert [int(item["slot"]) for item in dataset] == [slot for slot in range(12) if slot not in (3, 9)]
+    item = dataset[8]
+    assert item["video"].shape == (2, 224, 224, 3)
+    assert np.array_equal(item["video"].numpy(), clips.arrays["video"][10])
+    assert dataset.categories("material")[item["material"]] == "camel-ponte-roma"
+    assert dataset.categories("texture")[item["texture"]] == "plaid"
+    assert dataset.categories("viewpoint")[item["viewpoint"]] == "left"
+    assert item["mu"] == np.float32(0.4)
+
+
+def test_a_batch_is_its_items(clips):
+    dataset = ClipDataset(DatasetReader(clips.root), "train")
+    indices = [2, 0, 1]
+    batch = dataset.__getitems__(indices)
+    for place, index in enumerate(indices):
+        for name, value in dataset[index].items():
+            assert torch.equal(batch[name][place], value)
+
+
+def test_what_does_not_fit_is_refused(clips, rods):
+    with pytest.raises(ValueError, match="kind of the dataset must be rod_hang for a RodDataset: it is cloth_drag"):
+        RodDataset(clips.root)
+    with pytest.raises(ValueError, match="the dataset has no array views; it has centerline"):
+        RodDataset(rods.root, views=True)
+    with pytest.raises(ValueError, match="ring must be"):
+        ClipDataset(clips.root, ring=-1)
+
+
+def test_a_loader_without_our_collate_says_what_to_do(clips):
+    with pytest.raises(TypeError, match="collate_fn=collate"):
+        next(iter(DataLoader(ClipDataset(clips.root), batch_size=2)))
+
+
+def test_a_batch_of_a_ring_is_valid_until_ring_further_batches_are_drawn(clips):
+    dataset = ClipDataset(clips.root, ring=3)
+    drawn = iter(dataset.loader(2))
+    first = next(drawn)
+    content = first["video"].clone()
+    next(drawn), next(drawn)
+    assert torch.equal(first["video"], content)
+    again = next(drawn)
+    assert again["video"].data_ptr() == first["video"].data_ptr()
+    assert not torch.equal(first["video"], content)
+
+
+def test_without_a_ring_every_batch_has_its_own_memory(clips):
+    batches = list(ClipDataset(clips.root).loader(2))
+    assert len({batch["video"].data_ptr() for batch in batches}) == len(batches) == 5
+
+
+def test_a_ring_takes_batches_of_any_size(clips):
+    dataset = ClipDataset(clips.root, ring=1)
+    for indices in ([0, 1], [2, 3, 4], [5]):
+        batch = dataset.__getitems__(indices)
+        assert np.array_equal(batch["video"].numpy(), clips.arrays["video"][dataset.slots[indices]])
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_read_what_one_process_reads(clips, method):
+    dataset = ClipDataset(clips.root, ring=2)
+    dataset.__getitems__([0])  # used in the parent first
+    context = multiprocessing.get_context(method)
+    loader = dataset.loader(3, shuffle=True, num_workers=2, multiprocessing_context=context)
+    batches = list(loader)  # all of them kept: the ring does not reach into workers
+    slots = torch.cat([batch["slot"] for batch in batches])
+    videos = torch.cat([batch["video"] for batch in batches])
+    assert sorted(slots.tolist()) == dataset.slots.tolist()
+    assert np.array_equal(videos.numpy(), clips.arrays["video"][slots.numpy()])
+
+
+def test_an_error_in_a_worker_arrives_as_itself(clips, tmp_path):
+    from stickslip_training.errors import MissingFileError
+
+    made = clips.copy(tmp_path / "v1")
+    dataset = ClipDataset(made.root)
+    (made.root / "video/c/1/0/0/0/0").unlink()
+    with pytest.raises(MissingFileError, match="is not there, and the manifest says it is"):
+        list(dataset.loader(12, num_workers=1))  # one batch: none is left behind in a queue
+
+
+def test_pickles_without_its_buffers(clips):
+    dataset = ClipDataset(clips.root, ring=1)
+    dataset.__getitems__([0, 1, 2])
+    data = pickle.dumps(dataset)
+    assert len(data) < 50_000
+    assert torch.equal(pickle.loads(data)[4]["video"], dataset[4]["video"])
+
+
+def test_collate_copies_nothing(clips):
+    batch = ClipDataset(clips.root).__getitems__([0])
+    assert collate(batch) is batch
