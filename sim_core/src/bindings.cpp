@@ -61,7 +61,7 @@ Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness,
   if (phi0.size() != n || phi1.size() != n) throw std::invalid_argument("gamma, phi0, phi1: lengths must be equal");
   const sim_core::RodSettings settings{twist_stiffness, elements,
                                        start_level < 0 ? sim_core::default_start_level(elements) : start_level};
-  sim_core::check_rod_settings(settings, points);
+  sim_core::check_rods(settings, points, phi0.data(), phi1.data(), static_cast<std::int64_t>(n));
   const sim_core::RodKernelChoice kernel = kernel_named(kernel_name);
   auto centerline = allocate<Vectors>({n, p, 3}), curvature = allocate<Vectors>({n, p, 3});
   auto frame = allocate<Frames>({n, p, 3, 3});
@@ -127,5 +127,4 @@ NB_MODULE(_sim_core, m) {
   m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
         "Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by "
         "world rotations of nodes 1 ... N.");
-  m.attr("ELEMENT_TURN_MAX") = sim_core::element_turn_max;
 }

@@ -37,7 +37,10 @@ struct Solver {
   using T = Lanes<W>;
 
   Level<W> levels[3];
+  Limit<W> limit;
   NewtonWorkspace<W> work;
+  std::vector<Difference<T>> differences;
+  std::vector<NodeJets<T>> nodes;
   T sweeps{};         // of all levels so far
   Mask<W> converged;  // on all levels so far
 
@@ -51,7 +54,7 @@ struct Solver {
     converged = converged & levels[k].converged;
   }
 
-  // From the natural shape on one level to all three.
+  // From the natural shape on one level to all three and to their limit.
   void solve(const Rod<T>& rod, int start) {
     converged = Mask<W>(true);
     start_natural(rod, levels[start]);
@@ -61,9 +64,11 @@ struct Solver {
       relax(rod, k, tolerance_start);
     }
     for (int k = start + 1; k < 3; ++k) {
-      start_from(rod, levels[k - 1], k > 1 ? &levels[k - 2] : nullptr, levels[k]);
+      start_from(rod, levels[k - 1], k > 1 ? &levels[k - 2] : nullptr, levels[k], differences);
       relax(rod, k, k == 2 ? tolerance : tolerance_start);
     }
+    extrapolate(levels[0], levels[1], levels[2], limit, differences);
+    node_jets(rod, limit, nodes);
   }
 };
 
@@ -88,15 +93,14 @@ void solve_pack(const RodBatch& batch, const RodSettings& settings, const std::v
   for (int start = settings.start_level; start < 3 && any(pending); ++start) {
     solver.solve(rod, start);
     const Level<W>& fine = solver.levels[2];
-    const Limit<W> limit = extrapolate(solver.levels[0], solver.levels[1], fine);
-    const Mask<W> converged = solver.converged & less_equal(limit.refinement, T(refinement_max));
+    const Mask<W> converged = solver.converged & less_equal(solver.limit.refinement, T(refinement_max));
     const Mask<W> stable = converged & fine.stable;
-    sample(rod, limit, points, batch, pending, begin, count);
+    sample(rod, solver.nodes, points, batch, pending, begin, count);
     for (int lane = 0; lane < count; ++lane) {
       if (pending.v[lane] == 0) continue;
       const std::int64_t i = begin + lane;
-      batch.energy[i] = limit.energy.v[lane];
-      batch.refinement[i] = limit.refinement.v[lane];
+      batch.energy[i] = solver.limit.energy.v[lane];
+      batch.refinement[i] = solver.limit.refinement.v[lane];
       batch.residual[i] = fine.residual.v[lane];
       batch.iterations[i] = static_cast<std::int32_t>(solver.sweeps.v[lane]);
       batch.converged[i] = converged.v[lane] != 0;

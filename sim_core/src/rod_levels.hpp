@@ -41,7 +41,7 @@ Vec3<T> rotation_between(Quat<T> a, Quat<T> b) {
 // The moment at a node is the discrete Legendre transform of the element after it, f - tau / 2 with tau the weight's
 // torque on the node [Marsden and West 2001, Sec. 1.5]; being symmetric it keeps the even expansion in h.
 template <int W>
-void balance(const Rod<Lanes<W>>& rod, Level<W>& level) {
+[[gnu::flatten]] void balance(const Rod<Lanes<W>>& rod, Level<W>& level) {
   using T = Lanes<W>;
   const int n = level.elements;
   const double h = level.h();
@@ -107,11 +107,12 @@ void fill_odd_nodes(std::vector<Difference<T>>& field) {
 // Start a level from the one of half as many elements: cubic Hermite interpolation of the frames. Where a still coarser
 // level is known, the error it shows is taken off first: y_h = y_2h - (y_4h - y_2h) / 4 + O(h^4).
 template <int W>
-void start_from(const Rod<Lanes<W>>& rod, const Level<W>& coarse, const Level<W>* coarser, Level<W>& level) {
+[[gnu::flatten]] void start_from(const Rod<Lanes<W>>& rod, const Level<W>& coarse, const Level<W>* coarser,
+                                 Level<W>& level, std::vector<Difference<Lanes<W>>>& error) {
   using T = Lanes<W>;
   const int n = coarse.elements;
   const T eighth(0.125 * coarse.h());
-  std::vector<Difference<T>> error(n + 1, Difference<T>{});
+  error.assign(n + 1, Difference<T>{});
   if (coarser) {
     for (int k = 0; k <= coarser->elements; ++k) error[2 * k] = difference(coarse, 2 * k, *coarser, k);
     fill_odd_nodes(error);
@@ -137,18 +138,21 @@ struct Limit {
 
   std::vector<Quat<T>> frame;
   std::vector<Vec3<T>> moment;
-  T energy;
-  T refinement;  // largest turn of a frame by the last term of the extrapolation [rad]
+  T energy{};
+  T refinement{};  // largest turn of a frame by the last term of the extrapolation [rad]
 };
 
 // (64 y_h - 20 y_2h + y_4h) / 45 = y_h - (y_2h - y_h) / 3 + ((y_4h - y_h) - 5 (y_2h - y_h)) / 45. The last term, small
 // and smooth, is known at the nodes of the coarsest level and interpolated to those of the middle one.
 template <int W>
-Limit<W> extrapolate(const Level<W>& coarse, const Level<W>& middle, const Level<W>& fine) {
+[[gnu::flatten]] void extrapolate(const Level<W>& coarse, const Level<W>& middle, const Level<W>& fine, Limit<W>& limit,
+                                  std::vector<Difference<Lanes<W>>>& last) {
   using T = Lanes<W>;
   const int n = middle.elements;
-  std::vector<Difference<T>> last(n + 1);
-  Limit<W> limit{std::vector<Quat<T>>(n + 1), std::vector<Vec3<T>>(n + 1), T(0.0), T(0.0)};
+  last.assign(n + 1, Difference<T>{});
+  limit.frame.resize(n + 1);
+  limit.moment.resize(n + 1);
+  limit.refinement = T(0.0);
   for (int i = 0; i <= n; i += 2) {
     last[i] = T(1.0 / 45.0) * (difference(fine, 2 * i, coarse, i / 2) - T(5.0) * difference(fine, 2 * i, middle, i));
     limit.refinement = max(limit.refinement, dot(last[i].turn, last[i].turn));
@@ -161,7 +165,6 @@ Limit<W> extrapolate(const Level<W>& coarse, const Level<W>& middle, const Level
   }
   limit.refinement = sqrt(limit.refinement);
   limit.energy = T(1.0 / 45.0) * (T(64.0) * fine.energy - T(20.0) * middle.energy + coarse.energy);
-  return limit;
 }
 
 }  // namespace

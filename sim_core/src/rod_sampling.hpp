@@ -28,7 +28,7 @@ struct NodeJets {
 
 // Everything but the position, which is a sum over the nodes before.
 template <class T>
-NodeJets<T> node_jets(const Rod<T>& rod, double s, Quat<T> q, Vec3<T> m) {
+NodeJets<T> node_jet(const Rod<T>& rod, double s, Quat<T> q, Vec3<T> m) {
   const Vec3<T> d1 = direction1(q), d2 = direction2(q), d3 = direction3(q);
   const Vec3<T> g{-d1.z, -d2.z, -d3.z};
   const Vec3<T> kappa = curvature(rod, m);
@@ -55,12 +55,13 @@ Field hermite(const SamplePoint& p, const Jet<Field>& a, const Jet<Field>& b) {
 }
 
 template <int W>
-std::vector<NodeJets<Lanes<W>>> nodes_of(const Rod<Lanes<W>>& rod, const Limit<W>& limit) {
+[[gnu::flatten]] void node_jets(const Rod<Lanes<W>>& rod, const Limit<W>& limit,
+                                std::vector<NodeJets<Lanes<W>>>& nodes) {
   using T = Lanes<W>;
   const int n = static_cast<int>(limit.frame.size()) - 1;
   const double h = 1.0 / n;
-  std::vector<NodeJets<T>> nodes(n + 1);
-  for (int i = 0; i <= n; ++i) nodes[i] = node_jets(rod, i * h, limit.frame[i], limit.moment[i]);
+  nodes.resize(n + 1);
+  for (int i = 0; i <= n; ++i) nodes[i] = node_jet(rod, i * h, limit.frame[i], limit.moment[i]);
   // Quintic Hermite quadrature of the tangent, error O(h^7) per interval.
   for (int i = 0; i < n; ++i) {
     const NodeJets<T>&a = nodes[i], &b = nodes[i + 1];
@@ -68,7 +69,6 @@ std::vector<NodeJets<Lanes<W>>> nodes_of(const Rod<Lanes<W>>& rod, const Limit<W
                                 T(h * h / 10.0) * (a.centerline.d2 - b.centerline.d2) +
                                 T(h * h * h / 120.0) * (a.bend + b.bend);
   }
-  return nodes;
 }
 
 // Write lane l of a vector to out[l * stride ...], for those of the first `count` lanes that the mask names.
@@ -85,10 +85,10 @@ void scatter(Vec3<Lanes<W>> v, double* out, std::int64_t stride, int step, Mask<
 
 // Sample the masked ones of the first `count` lanes into rods begin ... begin + count of the batch.
 template <int W>
-void sample(const Rod<Lanes<W>>& rod, const Limit<W>& limit, const std::vector<SamplePoint>& points,
-            const RodBatch& batch, Mask<W> mask, std::int64_t begin, int count) {
+[[gnu::flatten]] void sample(const Rod<Lanes<W>>& rod, const std::vector<NodeJets<Lanes<W>>>& nodes,
+                             const std::vector<SamplePoint>& points, const RodBatch& batch, Mask<W> mask,
+                             std::int64_t begin, int count) {
   using T = Lanes<W>;
-  const auto nodes = nodes_of(rod, limit);
   const std::int64_t stride = 3 * static_cast<std::int64_t>(points.size());
   for (std::size_t j = 0; j < points.size(); ++j) {
     const SamplePoint& p = points[j];

@@ -1,5 +1,8 @@
 #include "rods.hpp"
 
+#include <algorithm>
+#include <cmath>
+#include <sstream>
 #include <stdexcept>
 #include <string>
 
@@ -36,7 +39,7 @@ int default_start_level(int elements) {
   return level;
 }
 
-void check_rod_settings(const RodSettings& settings, int points) {
+void check_rods(const RodSettings& settings, int points, const double* phi0, const double* phi1, std::int64_t n) {
   if (points < 2) throw std::invalid_argument("points: must be at least 2, got " + std::to_string(points));
   if (settings.elements < elements_min || settings.elements % 4 != 0) {
     throw std::invalid_argument("elements: must be a multiple of 4 and at least " + std::to_string(elements_min) +
@@ -44,6 +47,15 @@ void check_rod_settings(const RodSettings& settings, int points) {
   }
   if (settings.start_level < 0 || settings.start_level > 2) {
     throw std::invalid_argument("start_level: must be 0, 1 or 2, got " + std::to_string(settings.start_level));
+  }
+  double turn = 0.0;
+  for (std::int64_t i = 0; i < n; ++i) turn = std::max(turn, std::hypot(phi0[i], phi1[i]));
+  if (turn > element_turn_max * (settings.elements / 4)) {
+    std::ostringstream message;
+    message << "elements: must be at least 4 |(phi0, phi1)| / " << element_turn_max
+            << " so that every element turns by less than half a turn, got " << settings.elements
+            << " for |(phi0, phi1)| = " << turn;
+    throw std::invalid_argument(message.str());
   }
 }
 

@@ -52,8 +52,8 @@ RodKernelChoice best_rod_kernel();
 // phi0 0.2 ... 12, phi1 6 ... 20: 16 elements fail in 0.4 % of the rods, 24 in none.
 int default_start_level(int elements);
 
-// Throw std::invalid_argument for settings that the solver cannot run.
-void check_rod_settings(const RodSettings& settings, int points);
+// Throw std::invalid_argument for settings that the solver cannot run, or cannot run for these n rods.
+void check_rods(const RodSettings& settings, int points, const double* phi0, const double* phi1, std::int64_t n);
 
 // `points` points of uniform arc length from s = 0 to s = 1, both included.
 std::vector<SamplePoint> sample_points(int points, int elements);

@@ -49,5 +49,3 @@ def rod_derivatives(gamma: float, phi0: float, phi1: float, twist_stiffness: flo
     """
     Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by world rotations of nodes 1 ... N.
     """
-
-ELEMENT_TURN_MAX: float = 2.5

