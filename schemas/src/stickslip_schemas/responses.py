@@ -6,6 +6,7 @@ from typing import Annotated, Any, Generic, TypeVar
 from pydantic import Field
 
 from stickslip_schemas.base import Document
+from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
@@ -100,6 +101,33 @@ class DatasetVersion(Document):
     sample_count: int
     valid_count: int
     bytes: int
+
+
+class SampleState(Document):
+    """A sample of a job and how far it is; `labels` are its point of the grid."""
+
+    slot: int
+    sample_key: Sha256
+    split: int
+    labels: dict[str, Any]
+    state: TaskState
+    reason: Reason | None
+    message: str
+
+
+class Worker(Document):
+    """A dispatcher that has registered."""
+
+    id: str
+    name: str
+    kinds: tuple[str, ...]
+    slots: int
+    builds: Builds
+    versions: dict[str, str]
+    registered_at: datetime
+    last_seen_at: datetime
+    alive: bool = Field(description="it was heard of within the time that a lease lasts")
+    leased: int = Field(description="tasks that it holds")
 
 
 class Preview(Document):

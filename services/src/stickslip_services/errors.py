@@ -1,0 +1,47 @@
+"""What may go wrong when a request is perfectly well-formed. problems.py turns each into a problem document.
+
+StickslipError
+├── NotFoundError               404
+├── UnknownWorkerError          404
+├── ConflictError               409
+├── InvalidTokenError           422
+├── IdempotencyKeyReusedError   422
+├── KindNotAvailableError       422
+└── MissingArtifactError        500
+"""
+
+
+class StickslipError(Exception):
+    """Base of the errors of the coordinator."""
+
+
+class NotFoundError(StickslipError):
+    """There is no such thing."""
+
+
+class ConflictError(StickslipError):
+    """It cannot be done in the state that the thing is in."""
+
+
+class InvalidTokenError(StickslipError):
+    """A page token that is none of ours."""
+
+    def __init__(self, token: str) -> None:
+        super().__init__(f"page_token must be one that an earlier page gave, and it is {token[:200]!r}")
+        self.token = token
+
+
+class IdempotencyKeyReusedError(StickslipError):
+    """The key came with another document before."""
+
+
+class KindNotAvailableError(StickslipError):
+    """No worker makes this kind."""
+
+
+class UnknownWorkerError(StickslipError):
+    """No worker has registered under this id."""
+
+
+class MissingArtifactError(StickslipError):
+    """The store does not have what the database says it has, or not all of it."""

@@ -1,0 +1,24 @@
+"""Names: those that the coordinator gives, and those of tasks, `<stage>-<content key>`."""
+
+import secrets
+
+from stickslip_schemas.keys import is_sha256
+from stickslip_schemas.states import Stage
+
+
+def new_id(prefix: str) -> str:
+    """Return a new, unguessable name such as `job-4f1c09d3a2b87e65`."""
+    return f"{prefix}-{secrets.token_hex(8)}"
+
+
+def task_id(stage: str, key: bytes) -> str:
+    """Return the name of a task."""
+    return f"{stage}-{key.hex()}"
+
+
+def task_key(name: str) -> bytes | None:
+    """Return the content key in a task's name, or None where it is not one."""
+    stage, _, key = name.partition("-")
+    if stage not in list(Stage) or not is_sha256(key):
+        return None
+    return bytes.fromhex(key)

@@ -1,0 +1,55 @@
+"""The OpenAPI document.
+
+python -m stickslip_services.openapi > docs/openapi.json
+"""
+
+import json
+import sys
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel, TypeAdapter
+from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.problems import Problem
+from stickslip_schemas.tasks import task_adapter
+from stickslip_schemas.worker_api import Heartbeat, LeaseRequest, ReportBatch, WorkerRegistration
+
+from stickslip_services.bodies import body_components
+
+_DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
+    "JobSpec": job_spec_adapter,
+    "Task": task_adapter,
+    "WorkerRegistration": WorkerRegistration,
+    "LeaseRequest": LeaseRequest,
+    "Heartbeat": Heartbeat,
+    "ReportBatch": ReportBatch,
+    "Manifest": Manifest,
+    "Problem": Problem,
+}
+
+
+def describe(app: FastAPI) -> dict[str, Any]:
+    """Return the OpenAPI document of `app`, with the documents that bodies.py reads instead of FastAPI."""
+    if not app.openapi_schema:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        components = document.setdefault("components", {}).setdefault("schemas", {})
+        for name, schema in body_components(_DOCUMENTS).items():
+            components.setdefault(name, schema)
+        for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
+            components.pop(unused, None)
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def document_text() -> str:
+    """Return the OpenAPI document as it is committed."""
+    from stickslip_services.app import make_app  # it imports this module
+    from stickslip_services.settings import Settings
+
+    return json.dumps(make_app(Settings()).openapi(), indent=2, sort_keys=True) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(document_text())

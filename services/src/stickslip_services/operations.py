@@ -1,0 +1,368 @@
+"""The coordinator's work: everything that can be asked of it, each as one or two transactions."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sqlalchemy import Connection
+from stickslip_schemas import responses
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.keys import is_sha256
+from stickslip_schemas.layout import layout
+from stickslip_schemas.responses import Dataset, DatasetVersion, Job, JobDetail, Page, Preview, SampleState, Validation
+from stickslip_schemas.states import JobState, Reason, TaskState
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import FileEntry, PublishOutput, TaskResult
+from stickslip_schemas.worker_api import (
+    Heartbeat,
+    HeartbeatAnswer,
+    LeaseBatch,
+    LeaseRequest,
+    Report,
+    ReportAnswer,
+    ReportBatch,
+    WorkerRegistration,
+    WorkerSession,
+)
+
+from stickslip_services import migrate
+from stickslip_services.bell import Bell
+from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.compose import AnyTask, find_task
+from stickslip_services.datasets import (
+    CommittedVersion,
+    find_dataset,
+    find_file,
+    find_version,
+    list_datasets,
+    read_version,
+)
+from stickslip_services.db import Database
+from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError
+from stickslip_services.jobs import (
+    Replay,
+    builds_for,
+    cancel_job,
+    find_job,
+    find_replay,
+    fingerprint,
+    has_live_job,
+    insert_job,
+    is_preview,
+    keep_replay,
+    list_jobs,
+    list_previews,
+    list_samples,
+    plan_job,
+    show_job,
+    unplanned_jobs,
+)
+from stickslip_services.leasing import grant_leases, has_ready_task, renew_leases
+from stickslip_services.ledger import Ledger, ledger, set_job_state
+from stickslip_services.paging import PageRequest
+from stickslip_services.planning import Plan, Spec, count_settled, expand
+from stickslip_services.reports import take_reports
+from stickslip_services.retrying import find_held, lose
+from stickslip_services.settings import Settings
+from stickslip_services.sweeping import find_stranded, is_sweep_due, note_stranded, renew_all_leases, sweep
+from stickslip_services.workers import (
+    Worker,
+    find_worker,
+    insert_worker,
+    note_seen,
+    other_sessions,
+    present_workers,
+    show_workers,
+)
+
+_NO_BUILDS = Builds(sim_core="0" * 64, blender="0" * 64, packer="0" * 64)
+"""Stands in where simulations are only counted."""
+
+BUSY_POLL_SECONDS = 0.2
+IDLE_POLL_SECONDS = 1.0
+
+
+@dataclass(slots=True)
+class Coordinator:
+    """The queue, the store's index and the clock."""
+
+    settings: Settings
+    clock: Clock = field(default_factory=steady_clock)
+    bell: Bell = field(default_factory=Bell)
+    database: Database = field(init=False)
+    store: Store = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.database = Database(self.settings.database_path)
+        self.store = Store(self.settings.store_root)
+
+    def start(self) -> None:
+        """Bring the database up to date and take up the work where it was left."""
+        migrate.upgrade(self.database.url)
+        with self.database.write() as connection:
+            renew_all_leases(connection, self.clock(), self.settings)
+        self.plan_waiting_jobs()
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self.database.close()
+
+    @contextmanager
+    def _book(self) -> Iterator[Ledger]:
+        with self.database.write() as connection, ledger(connection, self.clock()) as book:
+            yield book
+        self.bell.ring()
+
+    # --- users ----------------------------------------------------------------------------------------------------
+
+    def validate(self, spec: Spec) -> Validation:
+        """Tell what a job would be."""
+        with self.database.read() as connection:
+            builds = builds_for(connection, spec.kind)
+            plan = expand(spec, builds or _NO_BUILDS)
+            cached = None if builds is None else count_settled(connection, plan.tasks)
+        return Validation(
+            spec=spec,
+            spec_digest=spec.content_digest,
+            sample_count=spec.sample_count,
+            simulation_count=plan.simulation_count,
+            cached_count=cached,
+            bytes_estimate=spec.sample_count * sum(array.sample_bytes for array in layout(spec)),
+        )
+
+    def submit(self, spec: Spec, idempotency_key: str | None) -> JobDetail | Replay:
+        """Make a job of a spec; with a key that has been here before, return the first answer."""
+        print_ = fingerprint(spec)
+        plan: Plan | None = None
+        while True:
+            with self.database.read() as connection:
+                if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
+                    return replay
+                builds = builds_for(connection, spec.kind)
+            if builds is not None and (plan is None or plan.builds != builds):
+                plan = self._expand(spec, builds)
+            with self.database.write() as connection:
+                if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
+                    return replay
+                if builds_for(connection, spec.kind) != builds:
+                    continue  # a worker with other builds has registered in between
+                now = self.clock()
+                job = insert_job(connection, spec, plan, now)
+                shown = self.show(connection, job)
+                if idempotency_key:
+                    keep_replay(connection, idempotency_key, print_, job, shown.model_dump_json(), now)
+            self.bell.ring()
+            return shown
+
+    def cancel(self, job_id: str) -> JobDetail:
+        """Cancel a job."""
+        with self._book() as book:
+            job = cancel_job(book, job_id)
+        with self.database.read() as connection:
+            return self.show(connection, job)
+
+    def find_job(self, job_id: str) -> int:
+        """Return the number of a job inside the database."""
+        with self.database.read() as connection:
+            return int(find_job(connection, job_id).seq)
+
+    def show(self, connection: Connection, job: int) -> JobDetail:
+        """Return a job as a transaction sees it."""
+        return show_job(connection, job, self._alive(connection))
+
+    def show_job(self, job_id: str) -> JobDetail:
+        """Return a job."""
+        with self.database.read() as connection:
+            return self.show(connection, find_job(connection, job_id).seq)
+
+    def list_jobs(self, page: PageRequest) -> Page[Job]:
+        """Return a page of jobs."""
+        with self.database.read() as connection:
+            return list_jobs(connection, page, self._alive(connection))
+
+    def list_samples(self, job_id: str, page: PageRequest, state: TaskState | None) -> Page[SampleState]:
+        """Return a page of the samples of a job."""
+        with self.database.read() as connection:
+            return list_samples(connection, find_job(connection, job_id).seq, page, state)
+
+    def list_previews(self, job_id: str) -> list[Preview]:
+        """Return the previews of a job."""
+        with self.database.read() as connection:
+            return list_previews(connection, find_job(connection, job_id).seq)
+
+    def find_preview(self, digest: str) -> Path:
+        """Return the file of a preview; raise NotFoundError."""
+        with self.database.read() as connection:
+            known = is_sha256(digest) and is_preview(connection, digest)
+        if not known:
+            raise NotFoundError(f"there is no preview {digest[:100]!r}")
+        return self.store.path(digest)
+
+    def list_datasets(self, page: PageRequest) -> Page[Dataset]:
+        """Return a page of datasets."""
+        with self.database.read() as connection:
+            return list_datasets(connection, page)
+
+    def show_dataset(self, dataset: str) -> Dataset:
+        """Return a dataset with its versions."""
+        with self.database.read() as connection:
+            return find_dataset(connection, dataset)
+
+    def show_version(self, dataset: str, version: int) -> DatasetVersion:
+        """Return a committed version."""
+        with self.database.read() as connection:
+            return find_version(connection, dataset, version)
+
+    def find_file(self, dataset: str, version: int, path: str) -> FileEntry:
+        """Return a file of a committed version; raise NotFoundError, MissingArtifactError."""
+        manifest = self.show_version(dataset, version).manifest
+        return find_file(self.store, manifest, dataset, version, path)
+
+    def show_task(self, name: str) -> AnyTask:
+        """Return a task as a worker gets it."""
+        with self.database.read() as connection:
+            return find_task(connection, name)
+
+    # --- workers --------------------------------------------------------------------------------------------------
+
+    def register(self, registration: WorkerRegistration) -> WorkerSession:
+        """Let a worker in; it takes the leases of an earlier session of its name away."""
+        with self._book() as book:
+            old = other_sessions(book.connection, registration.name)
+            worker = insert_worker(book.connection, registration, book.now)
+            message = f"worker {registration.name} was started anew"
+            lose(book, find_held(book, owners=old), self.settings, message=message)
+        self.plan_waiting_jobs()
+        self._note_stranded()
+        return WorkerSession(worker_id=worker.id, lease_seconds=self.settings.lease_seconds)
+
+    def lease(self, request: LeaseRequest) -> LeaseBatch:
+        """Lease tasks to a worker."""
+        self.sweep()
+        worker = self._meet(request.worker_id)
+        if worker.superseded:
+            raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
+        wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+        with self.database.read() as connection:
+            ready = has_ready_task(connection, worker, wanted.keys())
+            waiting = has_live_job(connection)
+        if not ready:
+            return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
+        with self._book() as book:
+            leases = grant_leases(book, find_worker(book.connection, worker.id), wanted, self.settings)
+        return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
+
+    def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
+        """Renew a worker's leases and tell it what to drop."""
+        worker = self._meet(heartbeat.worker_id)
+        if not heartbeat.leases:
+            return HeartbeatAnswer(drop=())
+        with self._book() as book:
+            drop = renew_leases(book, find_worker(book.connection, worker.id), heartbeat.leases, self.settings)
+        return HeartbeatAnswer(drop=drop)
+
+    def report(self, batch: ReportBatch) -> ReportAnswer:
+        """Take results in."""
+        worker = self._meet(batch.worker_id)
+        versions: dict[str, CommittedVersion] = {}
+        reports = [self._with_manifest(report, versions) for report in batch.reports]
+        with self._book() as book:
+            verdicts = take_reports(book, worker.id, reports, versions, self.settings)
+        return ReportAnswer(verdicts=verdicts)
+
+    def _with_manifest(self, report: Report, versions: dict[str, CommittedVersion]) -> Report:
+        """Read the manifest that a publish report names; a report whose manifest does not hold is a failure."""
+        if report.result is None or not isinstance(report.result.output, PublishOutput):
+            return report
+        output = report.result.output
+        try:
+            versions[report.task_id] = read_version(self.store, output.manifest, output.bytes)
+        except (OSError, ValueError) as error:
+            failure = TaskResult(
+                outcome="failed",
+                reason=Reason.storage_error,
+                message=f"the published manifest {output.manifest} does not hold: {error}"[:2000],
+                cpu_seconds=report.result.cpu_seconds,
+                wall_seconds=report.result.wall_seconds,
+            )
+            return report.model_copy(update={"result": failure})
+        return report
+
+    def _meet(self, worker_id: str) -> Worker:
+        """Return a worker that has just been heard of."""
+        now = self.clock()
+        with self.database.read() as connection:
+            worker = find_worker(connection, worker_id)
+        if now - worker.last_seen_at > self.settings.lease_seconds / 4:  # a poll is not worth a write each time
+            with self.database.write() as connection:
+                note_seen(connection, worker_id, now)
+        return worker
+
+    # --- the coordinator itself ------------------------------------------------------------------------------------
+
+    def sweep(self) -> None:
+        """Take back expired leases, let due retries go on, and let jobs that nobody serves say so."""
+        with self.database.read() as connection:
+            due = is_sweep_due(connection, self.clock())
+        if due:
+            with self._book() as book:
+                sweep(book, self.settings)
+        self._note_stranded()
+
+    def plan_waiting_jobs(self) -> None:
+        """Plan the jobs that came before the first worker."""
+        with self.database.read() as connection:
+            waiting = unplanned_jobs(connection)
+        for row in waiting:
+            spec = job_spec_adapter.validate_json(row.spec)
+            with self.database.read() as connection:
+                try:
+                    builds = builds_for(connection, row.kind)
+                except KindNotAvailableError as error:
+                    refusal = str(error)
+                else:
+                    if builds is None:
+                        return
+                    refusal = ""
+            plan = None if refusal or builds is None else self._expand(spec, builds)
+            with self.database.write() as connection:
+                if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
+                    continue  # cancelled, or planned by somebody else
+                if plan is None:
+                    set_job_state(
+                        connection,
+                        row.seq,
+                        JobState.failed,
+                        self.clock(),
+                        reason=Reason.waiting_for_worker,
+                        message=refusal,
+                    )
+                else:
+                    plan_job(connection, row.seq, plan, self.clock())
+            self.bell.ring()
+
+    def show_workers(self) -> list[responses.Worker]:
+        """Return the newest session of every worker."""
+        with self.database.read() as connection:
+            return show_workers(connection, alive_since=self.clock() - self.settings.lease_seconds)
+
+    def alive_workers(self) -> list[Worker]:
+        """Return the workers that were heard of within the time that a lease lasts."""
+        with self.database.read() as connection:
+            return self._alive(connection)
+
+    def _alive(self, connection: Connection) -> list[Worker]:
+        return present_workers(connection, seen_since=self.clock() - self.settings.lease_seconds)
+
+    def _expand(self, spec: Spec, builds: Builds) -> Plan:
+        return expand(spec, builds, previews=self.settings.previews_per_job)
+
+    def _note_stranded(self) -> None:
+        with self.database.read() as connection:
+            stranded = find_stranded(connection, self.clock(), self.settings)
+        if stranded:
+            with self.database.write() as connection:
+                note_stranded(connection, self.clock(), self.settings)
+            self.bell.ring()

@@ -1,0 +1,140 @@
+"""What becomes of a task that was not finished: another try, or the end.
+
+A try counts only where the task had been started. A failed try waits a little (1 s, 2 s, ...) before the next; after
+`max_tries` of them the task fails, and with it every job that needs it. Such a job starts no further tasks; what is
+running finishes and is kept.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import select, text, update
+from stickslip_schemas.events import TaskStateEvent
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+
+from stickslip_services import events
+from stickslip_services.db import batches
+from stickslip_services.ids import task_id
+from stickslip_services.ledger import LIVE, Ending, Ledger, cancel_tasks, live_jobs
+from stickslip_services.settings import Settings
+from stickslip_services.tables import jobs, tasks
+
+
+@dataclass(frozen=True, slots=True)
+class HeldTask:
+    """A task on lease, or one that was a moment ago."""
+
+    seq: int
+    key: bytes
+    stage: Stage
+    state: TaskState
+    tries: int
+
+
+def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: bool = False) -> list[HeldTask]:
+    """Return the tasks that `owners` hold, or whose lease has expired."""
+    query = select(tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.tries).where(
+        text("tasks.owner IS NOT NULL")  # in the words of the partial index
+    )
+    if owners is not None:
+        query = query.where(tasks.c.owner.in_(owners))
+    if expired:
+        query = query.where(tasks.c.expires_at <= book.now)
+    return [
+        HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries)
+        for row in book.connection.execute(query)
+    ]
+
+
+def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:
+    """Let tasks wait again as if they had never been leased, or cancel them where no live job needs them."""
+    for task, heir in _with_heirs(book, held):
+        _release(book, task, TaskState.pending, job=heir)
+
+
+def lose(book: Ledger, held: Sequence[HeldTask], settings: Settings, *, message: str) -> None:
+    """Take leases from a worker that is lost: tasks that it had started have failed once more."""
+    give_back(book, [task for task in held if task.state is TaskState.leased])
+    started = [task for task in held if task.state is not TaskState.leased]
+    fail_tries(book, [(task, Reason.worker_lost, message) for task in started], settings)
+
+
+def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], settings: Settings) -> None:
+    """Count failed tries; each task tries again or fails for good."""
+    why = {task.seq: (reason, message) for task, reason, message in failures}
+    for task, heir in _with_heirs(book, [task for task, _, _ in failures]):
+        reason, message = why[task.seq]
+        tries = task.tries + 1
+        state = TaskState.soft_failed if tries < settings.max_tries else TaskState.failed
+        retry_at = book.now + settings.retry_seconds * 2 ** (tries - 1)
+        _release(
+            book,
+            task,
+            state,
+            job=heir,
+            tries=tries,
+            reason=reason,
+            message=message,
+            retry_at=retry_at if state is TaskState.soft_failed else None,
+            finished_at=book.now if state is TaskState.failed else None,
+        )
+        name = task_id(task.stage, task.key)
+        tell(
+            book, task.seq, TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
+        )
+        if state is TaskState.failed:
+            _fail_jobs(book, task, f"task {name} failed {tries} times, at last with {reason}: {message}", settings)
+
+
+def tell(book: Ledger, task: int, event: TaskStateEvent) -> None:
+    """Tell all jobs of a task what became of it."""
+    for holder in book.holders([task]).get(task, ()):
+        events.append_task_state(book.connection, holder.job, event, book.now)
+
+
+def retry_due(book: Ledger) -> None:
+    """Let tasks whose wait is over be leased again."""
+    due = book.connection.execute(
+        select(tasks.c.seq, tasks.c.stage).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now)
+    ).all()
+    for batch in batches(due):
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq.in_([row.seq for row in batch]))
+            .values(state=TaskState.pending, retry_at=None)
+        )
+    for seq, stage in due:
+        book.moved(seq, stage, TaskState.soft_failed, TaskState.pending)
+
+
+def reproducer(name: str, settings: Settings) -> str:
+    """Return the command that runs a task again, by itself, on a machine with a worker's environment."""
+    return f"curl -s {settings.url}/v1/tasks/{name} -o task.json && python -m stickslip_workers replay task.json"
+
+
+def _with_heirs(book: Ledger, held: Sequence[HeldTask]) -> list[tuple[HeldTask, int]]:
+    """Return the tasks that a live job still needs with the oldest such job; cancel the others."""
+    heirs = live_jobs(book.connection, [task.seq for task in held])
+    cancel_tasks(book, [(task.seq, task.stage, task.state) for task in held if task.seq not in heirs])
+    return [(task, heirs[task.seq]) for task in held if task.seq in heirs]
+
+
+def _release(book: Ledger, task: HeldTask, state: TaskState, **values: object) -> None:
+    book.connection.execute(
+        update(tasks).where(tasks.c.seq == task.seq).values(state=state, owner=None, expires_at=None, **values)
+    )
+    book.moved(task.seq, task.stage, task.state, state)
+
+
+def _fail_jobs(book: Ledger, task: HeldTask, message: str, settings: Settings) -> None:
+    command = reproducer(task_id(task.stage, task.key), settings)
+    ending = Ending(
+        JobState.failed,
+        Reason.failed_tasks,
+        f"{message}. No further tasks are started; what is done is kept, and submitting the job again tries again. "
+        f"To reproduce: {command}",
+    )
+    holders = [holder.job for holder in book.holders([task.seq]).get(task.seq, ())]
+    live = book.connection.scalars(select(jobs.c.seq).where(jobs.c.seq.in_(holders), jobs.c.state.in_(LIVE)))
+    for job in live.all():
+        book.end_job(job, ending)

@@ -1,0 +1,87 @@
+"""Datasets, their versions and their files.
+
+`.../versions/N/files/` is the root of a Zarr store: any Zarr reader opens it at its URL.
+"""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.responses import Dataset, DatasetVersion, Page
+
+from stickslip_services.files import OPENAPI_HEADERS, serve
+from stickslip_services.routes.common import CoordinatorDep, PageDep, problem_responses
+
+router = APIRouter(tags=["datasets"])
+
+Version = Annotated[int, Path(ge=1, lt=2**31)]
+
+_BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+
+
+def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+    return {
+        200: {"description": "The file", "headers": OPENAPI_HEADERS, "content": content},
+        206: {"description": "The range that was asked for", "headers": OPENAPI_HEADERS, "content": content},
+        304: {"description": "The client has it already", "headers": OPENAPI_HEADERS},
+        **problem_responses(404, 416, 422),
+    }
+
+
+@router.get("/v1/datasets", responses=problem_responses(422))
+def get_datasets(page: PageDep, coordinator: CoordinatorDep) -> Page[Dataset]:
+    """List datasets, newest first."""
+    return coordinator.list_datasets(page)
+
+
+@router.get("/v1/datasets/{dataset}", responses=problem_responses(404))
+def get_dataset(dataset: str, coordinator: CoordinatorDep) -> Dataset:
+    """Return a dataset with its versions."""
+    return coordinator.show_dataset(dataset)
+
+
+@router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404, 422))
+def get_version(dataset: str, version: Version, coordinator: CoordinatorDep) -> DatasetVersion:
+    """Return a version."""
+    return coordinator.show_version(dataset, version)
+
+
+_MANIFEST_CONTENT: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Manifest"}}}
+
+
+@router.get(
+    "/v1/datasets/{dataset}/versions/{version}/manifest",
+    response_class=Response,
+    responses=_file_responses(_MANIFEST_CONTENT),
+)
+@router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
+def get_manifest(dataset: str, version: Version, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return the manifest: every file of the version with its digest, and what it was made from."""
+    return _serve(request, coordinator, dataset, version, MANIFEST_NAME)
+
+
+@router.get(
+    "/v1/datasets/{dataset}/versions/{version}/files/{path:path}",
+    response_class=Response,
+    responses=_file_responses(_BINARY),
+)
+@router.head("/v1/datasets/{dataset}/versions/{version}/files/{path:path}", include_in_schema=False)
+def get_file(dataset: str, version: Version, path: str, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return a file of the version, or a range of it."""
+    return _serve(request, coordinator, dataset, version, path)
+
+
+@router.get(
+    "/v1/previews/{digest}",
+    response_class=Response,
+    responses=_file_responses({"image/png": {"schema": {"type": "string", "format": "binary"}}}),
+    tags=["jobs"],
+)
+def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return the picture of a sample."""
+    return serve(request, coordinator.find_preview(digest), digest, name="preview.png")
+
+
+def _serve(request: Request, coordinator: CoordinatorDep, dataset: str, version: int, path: str) -> Response:
+    file = coordinator.find_file(dataset, version, path)
+    return serve(request, coordinator.store.path(file.sha256), file.sha256, name=path)

@@ -1,0 +1,73 @@
+"""Settings of the coordinator, from the environment (`STICKSLIP_...`) or the command line."""
+
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Self
+
+from pydantic import Field, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+DEFAULT_PORT = 8765
+
+
+class Settings(BaseSettings):
+    """Where the coordinator keeps its things, where it listens, and how patient its queue is."""
+
+    model_config = SettingsConfigDict(env_prefix="STICKSLIP_", frozen=True, extra="forbid")
+
+    data: Path = Path("stickslip-data")
+    """Directory of the database and, unless `store_path` says otherwise, of the store."""
+    store_path: Path | None = None
+    """Root of the store; null is `data/store`."""
+    host: str = "127.0.0.1"
+    port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
+
+    lease_seconds: float = Field(default=30.0, gt=0)
+    """How long a lease lasts without a heartbeat [s]."""
+    max_tries: int = Field(default=3, ge=1)
+    """Failed tries after which a task fails."""
+    retry_seconds: float = Field(default=1.0, ge=0)
+    """Wait before the second try [s]; it doubles with every further one."""
+    sweep_seconds: float = Field(default=1.0, gt=0)
+    """Time between two looks at expired leases and due retries [s]."""
+    lease_limit: int = Field(default=1000, ge=1)
+    """The most tasks of one stage that one request is granted."""
+    previews_per_job: int = Field(default=24, ge=0)
+    """How many samples of a job, evenly spread over its slots, are rendered with a preview."""
+    body_limit: int = Field(default=16 * 2**20, ge=1024)
+    """The largest request body that is read [bytes]."""
+
+    @model_validator(mode="after")
+    def _loopback_only(self) -> Self:
+        if not is_loopback(self.host):
+            raise ValueError(
+                f"host must be a loopback address, because this version has no API keys and anyone who reaches the "
+                f"port may submit and cancel jobs; it is {self.host!r}. Use 127.0.0.1, and an SSH tunnel from afar."
+            )
+        return self
+
+    @property
+    def database_path(self) -> Path:
+        """File of the database."""
+        return self.data / "coordinator.sqlite3"
+
+    @property
+    def store_root(self) -> Path:
+        """Root of the store."""
+        return self.data / "store" if self.store_path is None else self.store_path
+
+    @property
+    def url(self) -> str:
+        """Where the coordinator can be reached."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}"
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether only this machine can reach `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False
