@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.cameras import Camera, load_rig, read_rigs, rig_names
+from stickslip_schemas.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
 
 LEVEL = Camera(  # three units in front of the origin on the x axis, looking back at it
     name="level",
@@ -118,6 +118,11 @@ def test_rod_4_holds_every_rod_of_the_thesis_grid() -> None:
         points = np.column_stack([reach * ring, np.full(len(ring), z)])
         for camera in load_rig("rod-4"):
             assert camera.in_frame(points, radius=0.008, margin=1.0), (camera.name, z)
+
+
+def test_the_digest_of_a_rig_changes_only_on_purpose() -> None:
+    # It is in the content key of every picture: new numbers here mean that all of them are rendered again.
+    assert rig_digest("rod-4") == "fa3c632297ec32d0cc9c40ab57493d1ab6075c23aef6537f7977c7e354511e10"
 
 
 def test_an_unknown_rig_is_refused_by_name() -> None:

@@ -23,8 +23,9 @@ import numpy.typing as npt
 from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
 
 from stickslip_schemas.base import Document
+from stickslip_schemas.keys import content_key
 
-__all__ = ["Camera", "Matrix3", "Vector3", "load_rig", "read_rigs", "rig_names"]
+__all__ = ["Camera", "Matrix3", "Vector3", "load_rig", "read_rigs", "rig_digest", "rig_names"]
 
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows
@@ -180,3 +181,9 @@ def load_rig(name: str) -> tuple[Camera, ...]:
     if name not in rigs:
         raise ValueError(f"rig must be one of {', '.join(rigs)}; got {name!r}")
     return rigs[name]
+
+
+@cache
+def rig_digest(name: str) -> str:
+    """Return the content key of a shipped rig: its cameras' numbers, in order."""
+    return content_key("rig", [camera.model_dump(mode="json") for camera in load_rig(name)])
