@@ -1,0 +1,85 @@
+"""Settings of the render engine that every scene shares: Cycles on the CPU, one thread, a fixed seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from stickslip_schemas.jobs import Quality
+
+from stickslip_blender.blender import import_bpy
+
+SEED = 0  # the same for every frame: what noise is left does not flicker, and clips compress
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What a quality means to Cycles."""
+
+    samples: int
+    """Paths per pixel, the same for every pixel (no adaptive sampling)."""
+    denoiser: Literal["none", "fast"] = "none"
+    """`fast`: OpenImageDenoise, guided by albedo and normal without prefiltering."""
+
+
+# Frozen: a change makes other pictures, and the build digest says so. benchmarks/render_rods.py measures them.
+SAMPLING = {
+    Quality.draft: Sampling(samples=16),
+    Quality.standard: Sampling(samples=64),
+}
+REFERENCE = Sampling(samples=256)
+"""What pictures are compared with."""
+
+
+def new_scene() -> Any:
+    """Empty Blender and return its one scene, with the engine set up and a world."""
+    bpy = import_bpy()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    _set_up_cycles(scene)
+    _set_up_colors(scene)
+    scene.world = bpy.data.worlds.new("world")
+    return scene
+
+
+def _set_up_cycles(scene: Any) -> None:
+    render, cycles = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    render.threads_mode = "FIXED"
+    render.threads = 1
+    render.use_persistent_data = True
+    render.use_compositing = False
+    render.use_sequencer = False
+    render.resolution_percentage = 100
+    cycles.device = "CPU"
+    cycles.seed = SEED
+    cycles.use_animated_seed = False
+    cycles.use_adaptive_sampling = False
+    cycles.time_limit = 0.0
+    cycles.pixel_filter_type = "BOX"  # a pixel is the mean over its own area, as on a sensor
+    cycles.caustics_reflective = False
+    cycles.caustics_refractive = False
+
+
+def _set_up_colors(scene: Any) -> None:
+    """Make 8-bit values the sRGB encoding of the light itself, without filmic curve or dither: colors keep meaning."""
+    scene.display_settings.display_device = "sRGB"
+    view = scene.view_settings
+    view.view_transform = "Standard"
+    view.look = "None"
+    view.exposure = 0.0
+    view.gamma = 1.0
+    scene.render.dither_intensity = 0.0
+
+
+def set_sampling(scene: Any, sampling: Sampling) -> None:
+    """Set the parameters that a quality names."""
+    cycles = scene.cycles
+    cycles.samples = sampling.samples
+    cycles.use_denoising = sampling.denoiser != "none"
+    if sampling.denoiser == "fast":
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.denoising_quality = "FAST"
+        cycles.denoising_prefilter = "NONE"
+        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+        cycles.denoising_use_gpu = False

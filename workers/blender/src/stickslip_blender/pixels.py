@@ -1,0 +1,119 @@
+"""Get a rendered frame out of Blender as bytes.
+
+Headless Blender does not give its pixels away in memory, so a frame goes through an uncompressed file: on Linux one
+that has no name and lies in memory, so that a killed process leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from stickslip_blender.blender import import_bpy
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a frame: columns [left, right), rows [top, bottom) [px], row 0 on top."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def is_empty(self) -> bool:
+        """True where there is no pixel in it."""
+        return self.right <= self.left or self.bottom <= self.top
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the window in a frame (height, width, ...)."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+class FrameReader:
+    """Renders a scene into arrays. With a scratch folder given, frames go through a file there instead of memory."""
+
+    def __init__(self, scene: Any, scratch: str | Path | None = None) -> None:
+        self._memory: int | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        if scratch is None and hasattr(os, "memfd_create"):
+            self._memory = os.memfd_create("frame")
+            self._path = Path(f"/proc/self/fd/{self._memory}")
+        else:
+            self._folder = tempfile.TemporaryDirectory(prefix="stickslip-frames-", dir=scratch)
+            self._path = Path(self._folder.name) / "frame.bmp"
+        self._scene = scene
+        image, render = scene.render.image_settings, scene.render
+        image.file_format = "BMP"
+        image.color_mode = "RGB"
+        image.color_management = "FOLLOW_SCENE"
+        render.use_stamp = False
+        render.use_file_extension = False
+        render.filepath = str(self._path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._folder is not None:
+            self._folder.cleanup()
+        if self._memory is not None:
+            os.close(self._memory)
+        self._memory = self._folder = None
+
+    def read(self, window: Window | None = None) -> npt.NDArray[np.uint8]:
+        """Render the scene as it stands, or a window of it: 8-bit sRGB, shape (height, width, 3).
+
+        A window has the very bytes that it would have in the whole frame.
+        """
+        _set_window(self._scene.render, window)
+        self._path.write_bytes(b"")  # so that a frame is never an old one
+        with _quiet():
+            import_bpy().ops.render.render(write_still=True)
+        with Image.open(io.BytesIO(self._path.read_bytes())) as image:
+            return np.asarray(image.convert("RGB"))
+
+
+def _set_window(render: Any, window: Window | None) -> None:
+    render.use_border = render.use_crop_to_border = window is not None
+    if window is not None:
+        width, height = render.resolution_x, render.resolution_y
+        # Blender truncates to whole pixels: half a pixel keeps rounding out of it. It counts rows from below.
+        render.border_min_x = (window.left + 0.5) / width
+        render.border_max_x = (window.right + 0.5) / width
+        render.border_min_y = (height - window.bottom + 0.5) / height
+        render.border_max_y = (height - window.top + 0.5) / height
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Send file descriptor 1 nowhere: Blender logs every saved frame there and, as a module, has no switch for it."""
+    sys.stdout.flush()
+    stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
+        os.close(nowhere)
