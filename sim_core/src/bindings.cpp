@@ -104,10 +104,12 @@ std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamm
 }  // namespace
 
 NB_MODULE(_sim_core, m) {
-#if defined(__AVX2__)
+#ifdef SIM_CORE_IMPORT_GUARD
   // Best effort: this unit itself was compiled for that instruction set.
   __builtin_cpu_init();
-  if (!__builtin_cpu_supports("avx2")) throw nb::import_error("stickslip_sim_core was built for a newer processor");
+  if (!__builtin_cpu_supports(SIM_CORE_IMPORT_GUARD)) {
+    throw nb::import_error("stickslip_sim_core was built for " SIM_CORE_IMPORT_GUARD ", which this processor lacks");
+  }
 #endif
   m.doc() = "Internal: the C++ core. Use stickslip_sim_core.";
   nb::class_<sim_core::BuildInfo>(m, "BuildInfo", "What the C++ core was built from.")
