@@ -88,8 +88,9 @@ def grid(spec: RodHangSpec | ClothDragSpec) -> Iterator[dict[str, Any]]:
     columns = [
         axis_values(axis, dimension=position if zipped else 0) for position, axis in enumerate(spec.named_axes.values())
     ]
+    names = tuple(spec.named_axes)
     for point in zip(*columns, strict=True) if zipped else product(*columns):
-        yield dict(zip(spec.named_axes, point, strict=True))
+        yield dict(zip(names, point, strict=True))
 
 
 class KeyedPoint(NamedTuple):

@@ -1,0 +1,63 @@
+"""Time and memory of accepting a job of many samples, over HTTP, into an empty and into a full queue.
+
+    python benchmarks/plan.py [--samples 100000]
+
+Prints one JSON object. Targets: 100,000 samples in 2 s and 500 MB (peak resident memory of the coordinator).
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+
+def spec(samples: int, *, start: float) -> dict[str, Any]:
+    """Return a grid of rods with so many samples."""
+    axis = {"type": "linspace", "start": start, "stop": start + 100.0, "num": samples // 100}
+    ten = {"type": "linspace", "start": 0.0, "stop": 10.0, "num": 10}
+    return {"kind": "rod_hang", "axes": {"gamma": axis, "phi0": ten, "phi1": ten}}
+
+
+def peak_megabytes(pid: int) -> float:
+    """Return the peak resident memory of a process [MB]."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    raise ValueError("no VmHWM")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=100_000)
+    samples = parser.parse_args().samples
+    result: dict[str, Any] = {"samples": samples}
+    with tempfile.TemporaryDirectory() as data:
+        command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", data, "--port", "0"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as coordinator:
+            assert coordinator.stdout is not None
+            url = coordinator.stdout.readline().split()[-1]
+            with httpx.Client(base_url=url, timeout=120) as client:
+                builds = {"sim_core": "a" * 64, "blender": "b" * 64, "packer": "c" * 64}
+                worker = {"name": "bench", "builds": builds, "kinds": ["rod_hang"], "slots": 1}
+                client.post("/v1/workers", json=worker).raise_for_status()
+                for name, start in (("first_seconds", 0.0), ("second_seconds", 500.0), ("same_again_seconds", 0.0)):
+                    begin = time.perf_counter()
+                    response = client.post("/v1/jobs", json=spec(samples, start=start))
+                    result[name] = round(time.perf_counter() - begin, 3)
+                    response.raise_for_status()
+                    result.setdefault("tasks", response.json()["progress"]["total"])
+            result["coordinator_peak_mb"] = round(peak_megabytes(coordinator.pid), 1)
+            result["database_mb"] = round((Path(data) / "coordinator.sqlite3").stat().st_size / 1e6, 1)
+            coordinator.terminate()
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
