@@ -5,6 +5,7 @@ A try counts only where the task had been started. A failed try waits a little (
 running finishes and is kept.
 """
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -109,7 +110,8 @@ def retry_due(book: Ledger) -> None:
 
 def reproducer(name: str, settings: Settings) -> str:
     """Return the command that runs a task again, by itself, on a machine with a worker's environment."""
-    return f"curl -s {settings.url}/v1/tasks/{name} -o task.json && python -m stickslip_workers replay task.json"
+    fetch = f"curl -s {settings.url}/v1/tasks/{name} -o task.json"
+    return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(str(settings.store_root))}"
 
 
 def _with_heirs(book: Ledger, held: Sequence[HeldTask]) -> list[tuple[HeldTask, int]]:

@@ -1,0 +1,50 @@
+"""Errors on the command line: the field, the rule and the value, and no traceback."""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from stickslip_services.cli.specs import SpecFileError
+from stickslip_services.client import ClientError, ProblemError, UnreachableError
+from stickslip_services.supervisor import SupervisorError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """Print what a command may stumble over, and exit with status 1."""
+
+    @functools.wraps(command)
+    def run(*arguments: P.args, **options: P.kwargs) -> R:
+        try:
+            return command(*arguments, **options)
+        except ProblemError as error:
+            _print(error.problem.detail if not error.problem.errors else error.problem.title)
+            for field in error.problem.errors:
+                place = field.pointer.lstrip("/").replace("/", ".") or "the document"
+                value = f", and it is {field.value}" if field.value else ""
+                _print_line(f"  [bold]{escape(place)}[/]: {escape(field.rule)}{escape(value)}")
+            if error.problem.request_id and error.problem.status >= 500:
+                _print_line(f"  request {escape(error.problem.request_id)}; the coordinator's log says more")
+        except UnreachableError as error:
+            _print(f"{error}. Is it running? `stickslip up` starts one; --url or STICKSLIP_URL names another.")
+        except (ClientError, SpecFileError, SupervisorError) as error:
+            _print(str(error))
+        except OSError as error:
+            _print(f"{error.filename or 'the file system'}: {error.strerror or error}")
+        raise typer.Exit(1)
+
+    return run
+
+
+def _print(message: str) -> None:
+    _print_line(f"[bold red]error:[/] {escape(message)}")
+
+
+def _print_line(markup: str) -> None:
+    Console(stderr=True, soft_wrap=True, highlight=False).print(markup)

@@ -1,0 +1,67 @@
+"""Spec files: YAML or JSON."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+class SpecFileError(Exception):
+    """A file that holds no spec."""
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML as people expect it: `1e-3` is a number, and a key that is there twice is a mistake."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no word", key_node.start_mark)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is there twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+
+def read_spec(path: Path) -> dict[str, Any]:
+    """Read a spec file; whether it is a good spec is for the coordinator to say. Raise SpecFileError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise SpecFileError(f"there is no file {path}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecFileError(f"{path} cannot be read: {error}") from error
+    try:
+        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _Loader)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise SpecFileError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
+    if not isinstance(document, dict):
+        raise SpecFileError(f"{path} must hold a mapping (kind: ..., axes: ...), and it holds {document!r:.100}")
+    _check(document, "", path)
+    return document
+
+
+def _check(value: Any, place: str, path: Path) -> None:
+    """Refuse what JSON has no word for, before it is sent."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check(item, f"{place}.{key}" if place else str(key), path)
+    elif isinstance(value, list):
+        for position, item in enumerate(value):
+            _check(item, f"{place}.{position}", path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise SpecFileError(f"{path}: {place} must be a finite number, and it is {value}")
+    elif value is not None and not isinstance(value, str | int | float | bool):
+        raise SpecFileError(f"{path}: {place} must be a number, a word, a list or a mapping, and it is {value!r}")

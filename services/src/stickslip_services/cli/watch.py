@@ -1,0 +1,114 @@
+"""Watching a job: bars on a terminal, plain lines elsewhere."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from stickslip_schemas.events import DatasetPublishedEvent, JobProgressEvent, JobStateEvent, TaskStateEvent
+from stickslip_schemas.responses import Progress as JobProgress
+from stickslip_schemas.states import JobState, Stage, TaskState
+
+from stickslip_services.cli import wording
+from stickslip_services.client import Client
+
+GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
+
+_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed, TaskState.cancelled)
+
+
+class _Screen(Protocol):
+    def line(self, markup: str) -> None: ...
+    def progress(self, progress: JobProgress) -> None: ...
+
+
+def watch(client: Client, job_id: str, console: Console) -> JobState:
+    """Show a job until it ends; return how it did."""
+    state = client.job(job_id).state
+    with (_bars if console.is_terminal else _lines)(console) as screen:
+        for event in client.events(job_id):
+            match event:
+                case JobProgressEvent():
+                    screen.progress(event.progress)
+                case JobStateEvent():
+                    state = event.state
+                    screen.line(f"{job_id} is {wording.state(state)}{_because(event.message)}")
+                case TaskStateEvent():
+                    screen.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
+                case DatasetPublishedEvent():
+                    screen.line(f"published [bold]{wording.dataset(event.dataset)}[/]")
+    return state
+
+
+def _because(message: str) -> str:
+    return f": {escape(message)}" if message else ""
+
+
+class _Lines:
+    """One line for each piece of news."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._last = ""
+
+    def line(self, markup: str) -> None:
+        self._console.print(markup, soft_wrap=True, highlight=False)
+
+    def progress(self, progress: JobProgress) -> None:
+        text = wording.stages(progress)
+        if progress.eta is not None:
+            text += f"; {wording.eta(progress.eta)} left"
+        if text != self._last:
+            self.line(escape(text))
+        self._last = text
+
+
+class _Bars:
+    """A bar for each stage."""
+
+    def __init__(self, console: Console, bars: Progress) -> None:
+        self._console = console
+        self._bars = bars
+        self._ids: dict[Stage, TaskID] = {}
+
+    def line(self, markup: str) -> None:
+        self._console.print(markup, soft_wrap=True, highlight=False)
+
+    def progress(self, progress: JobProgress) -> None:
+        for stage, counted in progress.stages.items():
+            total = sum(counted.counts.values())
+            if not total:
+                continue
+            if stage not in self._ids:
+                self._ids[stage] = self._bars.add_task(stage, total=total, extra="")
+            over = sum(counted.counts.get(state, 0) for state in _OVER)
+            running = counted.counts.get(TaskState.running, 0)
+            notes = [f"{running} running"] if running else []
+            notes += [f"{counted.cached} cached"] if counted.cached else []
+            notes += [
+                f"{counted.counts[state]} {state}"
+                for state in (TaskState.rejected, TaskState.soft_failed, TaskState.failed)
+                if counted.counts.get(state)
+            ]
+            self._bars.update(self._ids[stage], total=total, completed=over, extra=", ".join(notes))
+        if self._ids and progress.eta is not None:  # on the last bar, which has nothing else to say for long
+            self._bars.update(max(self._ids.values()), extra=f"{wording.eta(progress.eta)} left")
+
+
+@contextmanager
+def _lines(console: Console) -> Iterator[_Screen]:
+    yield _Lines(console)
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[_Screen]:
+    columns = (
+        TextColumn("{task.description:>9}"),
+        BarColumn(bar_width=32),
+        MofNCompleteColumn(),
+        TextColumn("[dim]{task.fields[extra]}"),
+    )
+    with Progress(*columns, console=console, transient=False) as bars:
+        yield _Bars(console, bars)
