@@ -1,6 +1,8 @@
 """A made-up dataset of rods: its tasks, and what its arrays must hold."""
 
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,9 @@ from stickslip_schemas.tasks import (
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
 from stickslip_workers.stages.records import encode_records
+
+HERE = str(Path(__file__).parent)
+sys.path.append(HERE)  # coordinator_double, fake_renderer
 
 BUILDS = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
 
@@ -133,3 +138,14 @@ def make_dataset(store: Store) -> Callable[..., Made]:
         return Made(spec, store, tasks, arrays, tuple(rejections), tuple(sample.key for sample in members))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def cluster_cpus() -> Iterator[int]:
+    """A Ray cluster for all tests, with `fake_renderer` in reach of its processes."""
+    from stickslip_workers.cluster import ray_cluster
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", HERE)
+        with ray_cluster(name=f"tests-{os.getpid()}", address=None, cpus=2) as cpus:
+            yield cpus

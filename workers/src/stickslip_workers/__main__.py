@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
 
     dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray")
-    dispatch.add_argument("--url", required=True, help="base URL of the coordinator; key in STICKSLIP_API_KEY")
+    dispatch.add_argument("--url", required=True, help="base URL of the coordinator")
     dispatch.add_argument("--store", type=Path, required=True, help="root of the store")
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
@@ -56,14 +56,13 @@ def _dispatch(options: argparse.Namespace) -> int:
         url=options.url,
         store=options.store,
         name=options.name,
-        api_key=os.environ.get("STICKSLIP_API_KEY"),
         slots=options.slots,
         ray_address=options.ray_address,
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
     from stickslip_workers.cluster import ray_cluster
-    from stickslip_workers.dispatcher import Dispatcher, NameInUseError
+    from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.processes import StartError
 
     stopped_early = False
@@ -82,7 +81,7 @@ def _dispatch(options: argparse.Namespace) -> int:
             for number in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(number, stop)  # after Ray has set its own
             dispatcher.run()
-    except (StartError, NameInUseError, CoordinatorError) as error:
+    except (StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
     return 0

@@ -30,6 +30,7 @@ _OWNER = "STICKSLIP_RAY_OWNER"
 def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator[int]:
     """Connect to the cluster at `address`, or start one with `cpus`; yield the number of its CPUs."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # a call after the end must not start another cluster
     if address is None:
         directory = _own_directory(name)
         _bury(directory)

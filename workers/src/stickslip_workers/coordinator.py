@@ -31,6 +31,10 @@ class UnknownWorkerError(CoordinatorError):
     """The coordinator does not know the session (any more): register again."""
 
 
+class SupersededError(CoordinatorError):
+    """A newer dispatcher has registered under the same name: this one has to go."""
+
+
 class RefusedError(CoordinatorError):
     """A request that will be refused every time."""
 
@@ -38,9 +42,8 @@ class RefusedError(CoordinatorError):
 class Coordinator:
     """A client, for any number of threads."""
 
-    def __init__(self, url: str, api_key: str | None = None) -> None:
-        headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
-        self._http = httpx.Client(base_url=url.rstrip("/"), headers=headers, timeout=httpx.Timeout(30, connect=5))
+    def __init__(self, url: str) -> None:
+        self._http = httpx.Client(base_url=url.rstrip("/"), timeout=httpx.Timeout(30, connect=5))
 
     def register(self, registration: WorkerRegistration) -> WorkerSession:
         """Present the dispatcher."""
@@ -48,15 +51,15 @@ class Coordinator:
 
     def lease(self, request: LeaseRequest) -> LeaseBatch:
         """Ask for tasks."""
-        return self._post("/v1/workers/lease", request, LeaseBatch)
+        return self._post("/v1/worker/lease", request, LeaseBatch)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         """Renew leases."""
-        return self._post("/v1/workers/heartbeat", heartbeat, HeartbeatAnswer)
+        return self._post("/v1/worker/heartbeat", heartbeat, HeartbeatAnswer)
 
     def report(self, reports: ReportBatch) -> ReportAnswer:
         """Report results."""
-        return self._post("/v1/workers/report", reports, ReportAnswer)
+        return self._post("/v1/worker/report", reports, ReportAnswer)
 
     def close(self) -> None:
         """Close the connections."""
@@ -73,9 +76,14 @@ class Coordinator:
             raise UnreachableError(f"{path}: {response.status_code} {response.text[:500]}")
         if response.is_success:
             return answer.model_validate_json(response.content)
-        if _problem_code(response) == ProblemCode.unknown_worker:
-            raise UnknownWorkerError(f"{path}: {response.text[:500]}")
-        raise RefusedError(f"{path}: {response.status_code} {response.text[:500]}")
+        kind = _ERRORS.get(_problem_code(response), RefusedError)
+        raise kind(f"{path}: {response.status_code} {response.text[:500]}")
+
+
+_ERRORS: dict[str | None, type[CoordinatorError]] = {
+    ProblemCode.unknown_worker: UnknownWorkerError,
+    ProblemCode.conflict: SupersededError,
+}
 
 
 def _problem_code(response: httpx.Response) -> str | None:

@@ -32,9 +32,6 @@ log = logging.getLogger(__name__)
 LONGEST_WAIT = 1.0
 """The loop looks at time limits and dropped leases at least so often [s]."""
 
-LOST_SESSIONS = 5
-"""Sessions in a row that may be lost within two leases each: somebody else is using the name."""
-
 REPORTS_A_REQUEST = 512
 
 LARGEST_BATCH = max(kind.batch for kind in KINDS.values())
@@ -45,10 +42,6 @@ _PRECEDENCE = (Stage.publish, Stage.pack, Stage.simulate, Stage.render)
 
 _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
 _results = TypeAdapter(list[TaskResult])
-
-
-class NameInUseError(RuntimeError):
-    """Another dispatcher of the same name takes the leases away, again and again."""
 
 
 @dataclass(eq=False)
@@ -91,11 +84,9 @@ class Dispatcher:
                 **common,
             )
         )
-        self._coordinator = Coordinator(settings.url, settings.api_key)
+        self._coordinator = Coordinator(settings.url)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
-        self._session_started = 0.0
-        self._lost_sessions = 0
         self._heartbeat: HeartbeatThread | None = None
         self._book = LeaseBook()
         self._queues: dict[Stage, deque[Lease]] = {stage: deque() for stage in _PRECEDENCE}
@@ -162,7 +153,9 @@ class Dispatcher:
         """Wait until something ends, and take in what has."""
         import ray
 
-        refs = [*self._running, *self._stage_pool.waiting_refs(), *self._render_pool.waiting_refs()]
+        refs = list(self._running)
+        if not self._stopping:
+            refs += [*self._stage_pool.waiting_refs(), *self._render_pool.waiting_refs()]
         if not refs:
             time.sleep(timeout)
             return
@@ -268,7 +261,7 @@ class Dispatcher:
             self._heartbeat.stop()
             self._heartbeat = None
         if self._session is not None:
-            self._note_lost_session(self._session)
+            log.warning("session %s is lost", self._session.worker_id)
             self._session = None
         self._book.clear()
         self._reports.clear()
@@ -283,21 +276,10 @@ class Dispatcher:
             versions={**stage["versions"], **render.get("versions", {})},
         )
         self._session = self._coordinator.register(registration)
-        self._session_started = time.monotonic()
         self._next_lease = 0.0
         self._heartbeat = HeartbeatThread(self._coordinator, self._session, self._book)
         self._heartbeat.start()
         log.info("registered as %s with %d slots", self._session.worker_id, self._slots)
-
-    def _note_lost_session(self, session: WorkerSession) -> None:
-        lasted = time.monotonic() - self._session_started
-        self._lost_sessions = self._lost_sessions + 1 if lasted < 2 * session.lease_seconds else 1
-        log.warning("session %s is lost after %.1f s", session.worker_id, lasted)
-        if self._lost_sessions >= LOST_SESSIONS:
-            raise NameInUseError(
-                f"the name {self._settings.name!r} was registered by somebody else {LOST_SESSIONS} times in a row: "
-                "every dispatcher needs a name of its own"
-            )
 
     def _report(self) -> bool:
         """Send all reports; return whether there were any."""
@@ -348,7 +330,9 @@ class Dispatcher:
             self._try_to_report()
 
     def _give_back(self) -> None:
-        """Give all leases back, if the coordinator listens; it finds out by itself otherwise."""
+        """End all processes and give all leases back, if the coordinator listens; it finds out by itself otherwise."""
+        self._stage_pool.close()
+        self._render_pool.close()
         self._release_queued()
         for assignment in self._running.values():
             for lease in assignment.leases:

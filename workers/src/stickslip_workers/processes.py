@@ -117,6 +117,12 @@ class Pool:
         self._starting += self._idle
         self._idle = []
 
+    def close(self) -> None:
+        """Kill all processes: one that is at work would not end by itself."""
+        for process in [*self._starting, *self._idle, *self._busy]:
+            self.end(process)
+        self._starting, self._idle = [], []
+
     def look(self) -> None:
         """See which processes have started; raise StartError when they do not."""
         import ray

@@ -19,7 +19,6 @@ class Settings:
     """Root of the store: the same directory on every node."""
     name: str
     """Name of this dispatcher; a second one of the same name takes the first one's place."""
-    api_key: str | None = None
     slots: int | None = None
     """How many tasks run at once; by default the CPUs of the cluster."""
     ray_address: str | None = None

@@ -1,0 +1,43 @@
+"""A renderer for tests of the dispatcher: quick, and what it does to a task is the number of its colour seed."""
+
+import errno
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import ChunkRef, RenderOutput, RenderTask, TaskResult
+
+BUILD = "2" * 64
+FINE, DISK_FULL, BUG, UNTIL_RELEASED = range(4)
+
+
+class RenderActor:
+    """Has the face of stickslip_blender's. Tests and it talk through files beside the store."""
+
+    def __init__(self, store: str) -> None:
+        self._store = Store(store)
+        self._beside = Path(store)
+
+    def describe(self) -> dict[str, Any]:
+        return {"build": BUILD, "versions": {"fake": "1"}}
+
+    def render(self, task: dict[str, Any]) -> dict[str, Any]:
+        job = RenderTask.model_validate(task)
+        what = job.render.color_seed
+        if what == DISK_FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "artifacts")
+        if what == BUG:
+            raise RuntimeError("a bug")
+        if what >= UNTIL_RELEASED:
+            (self._beside / f"pid-{what}").write_text(str(os.getpid()))
+            while not (self._beside / f"release-{what}").exists():
+                time.sleep(0.01)
+        chunk = encode_chunk(bytes(4 * 224 * 224 * 3))
+        output = RenderOutput(
+            chunks={"views": ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
+            labels={"color": [0.1, 0.2, 0.3]},
+        )
+        return TaskResult(outcome="succeeded", output=output, cpu_seconds=0.1).model_dump(mode="json")

@@ -1,0 +1,284 @@
+"""The dispatcher on Ray, with a coordinator and a renderer that do what they are told."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import fake_renderer
+import pytest
+from coordinator_double import CoordinatorDouble
+from stickslip_schemas.states import Reason, Stage
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import RecordRef, RenderTask, RodRender, RodSimulation, SimulateTask
+from stickslip_workers.coordinator import SupersededError
+from stickslip_workers.dispatcher import Dispatcher
+from stickslip_workers.processes import StartError
+from stickslip_workers.settings import Settings
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves its log files open
+
+
+class Running:
+    """A dispatcher in a thread."""
+
+    def __init__(self, settings: Settings, cpus: int) -> None:
+        self.dispatcher = Dispatcher(settings, cluster_cpus=cpus)
+        self.error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.dispatcher.run()
+        except BaseException as error:
+            self.error = error
+
+    def stop(self) -> None:
+        self.dispatcher.stop()
+        self.join()
+
+    def join(self) -> None:
+        self._thread.join(timeout=30)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def double() -> Iterator[CoordinatorDouble]:
+    coordinator = CoordinatorDouble()
+    coordinator.start()
+    yield coordinator
+    coordinator.stop()
+
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def start(double: CoordinatorDouble, store: Store, cluster_cpus: int) -> Iterator[Start]:
+    """Start a dispatcher; it is stopped after the test."""
+    store.root.mkdir()
+    started: list[Running] = []
+
+    def make(**changes: Any) -> Running:
+        settings = {
+            "url": f"http://127.0.0.1:{double.port}",
+            "store": store.root,
+            "name": "test",
+            "slots": 2,
+            "blender_python": Path(sys.executable),
+            "render_actor": "fake_renderer:RenderActor",
+            "drop_seconds": 0.2,
+            "stop_seconds": 0.5,
+        }
+        started.append(Running(Settings(**{**settings, **changes}), cluster_cpus))
+        return started[-1]
+
+    yield make
+    for running in started:
+        running.stop()
+
+
+def _render(what: int) -> RenderTask:
+    look = RodRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
+    return RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
+
+
+def _simulate(count: int) -> dict[str, SimulateTask]:
+    return {
+        f"rod-{i}": SimulateTask(simulation=RodSimulation(gamma=1.0 + i, phi0=2.0, phi1=5.0, poisson=0.5))
+        for i in range(count)
+    }
+
+
+HANG = fake_renderer.UNTIL_RELEASED
+
+
+def _wait_for_pid(double: CoordinatorDouble, store: Store, what: int) -> int:
+    """Wait until the renderer is at work; heartbeats, which go on, are the clock."""
+    path = store.root / f"pid-{what}"
+    double.until(lambda: path.exists() and path.read_text() != "")
+    return int(path.read_text())
+
+
+def test_runs_what_it_is_given_and_says_who_it_is(
+    start: Start, double: CoordinatorDouble, store: Store, make_dataset: Callable[..., Any]
+) -> None:
+    made = make_dataset(count=5, per_shard=4)
+    start()
+    double.offer(**_simulate(700), picture=_render(fake_renderer.FINE), shard=made.pack_tasks[0], all=made.publish_task)
+    double.until(lambda: len(double.results) == 703)
+    assert {result.outcome for result in double.results.values()} == {"succeeded"}
+    # 700 rods are two batches, and each is one artifact.
+    assert len({double.results[f"rod-{i}"].output.record.digest for i in range(700)}) == 2
+    assert (store.dataset_path(made.publish_task.dataset, 1) / "manifest.json").exists()
+    (registration,) = double.registrations
+    assert registration.builds.blender == fake_renderer.BUILD
+    assert registration.kinds == ("rod_hang",)
+    assert registration.slots == 2
+    assert registration.versions["fake"] == "1"
+
+
+def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -> None:
+    start()
+    double.offer(full=_render(fake_renderer.DISK_FULL), bug=_render(fake_renderer.BUG), fine=_render(0))
+    double.until(lambda: len(double.results) == 3)
+    assert double.results["full"].reason is Reason.storage_error
+    assert "No space left on device" in double.results["full"].message
+    assert double.results["bug"].reason is Reason.internal_error
+    assert "a bug" in double.results["bug"].message
+    assert double.results["fine"].outcome == "succeeded"
+
+
+def test_a_render_process_that_is_killed_costs_one_try(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start()
+    double.offer(crash=_render(HANG), other=_render(HANG + 1))
+    pid = _wait_for_pid(double, store, HANG)
+    _wait_for_pid(double, store, HANG + 1)
+    os.kill(pid, signal.SIGKILL)
+    double.until(lambda: "crash" in double.results)
+    assert double.results["crash"].reason is Reason.renderer_crash
+    (store.root / f"release-{HANG}").touch()
+    (store.root / f"release-{HANG + 1}").touch()
+    double.offer(again=_render(HANG))
+    double.until(lambda: len(double.results) == 3)
+    assert double.results["again"].outcome == double.results["other"].outcome == "succeeded"
+
+
+def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start(exec_seconds={**Settings(url="", store=store.root, name="x").exec_seconds, Stage.render: 0.5})
+    double.offer(slow=_render(HANG))
+    pid = _wait_for_pid(double, store, HANG)
+    double.until(lambda: "slow" in double.results)
+    assert double.results["slow"].reason is Reason.exec_timeout
+    assert f"not done within 0.5 s; process {pid} killed" in double.results["slow"].message
+    double.until(lambda: not Path(f"/proc/{pid}").exists())
+
+
+def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start(slots=1)
+    double.offer(running=_render(HANG), waiting=_render(HANG + 1), third=_render(HANG + 2))
+    _wait_for_pid(double, store, HANG)
+    double.until(lambda: double.started == {"running"})
+    assert double.leased.keys() == {"running", "waiting"}  # twice what runs, no more
+    beats = double.beats
+    double.until(lambda: double.beats > beats + 2)
+    assert double.started == {"running"}
+
+
+def test_dropped_tasks_are_left_alone_and_never_reported(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start(slots=1)
+    double.offer(running=_render(HANG), waiting=_render(HANG + 1))
+    pid = _wait_for_pid(double, store, HANG)
+    double.drop |= {"running", "waiting"}
+    double.until(lambda: not Path(f"/proc/{pid}").exists())
+    double.offer(next=_render(fake_renderer.FINE))
+    double.until(lambda: "next" in double.results)
+    assert double.results.keys() == {"next"}
+    assert not (store.root / f"pid-{HANG + 1}").exists()
+
+
+def test_results_wait_for_a_coordinator_that_is_away(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start()
+    double.offer(one=_render(HANG), two=_render(HANG + 1))
+    pid = _wait_for_pid(double, store, HANG)
+    _wait_for_pid(double, store, HANG + 1)
+    double.stop()
+    (store.root / f"release-{HANG}").touch()
+    double.start()
+    double.until(lambda: "one" in double.results)
+    (store.root / f"release-{HANG + 1}").touch()
+    double.until(lambda: "two" in double.results)
+    assert {result.outcome for result in double.results.values()} == {"succeeded"}
+    assert len(double.registrations) == 1
+    assert Path(f"/proc/{pid}").exists()  # no process was lost over it
+
+
+def test_a_forgotten_session_is_opened_again(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start(slots=1)
+    double.offer(lost=_render(HANG))
+    pid = _wait_for_pid(double, store, HANG)
+    double.forget_sessions()
+    double.until(lambda: len(double.registrations) == 1)
+    double.until(lambda: not Path(f"/proc/{pid}").exists())
+    double.offer(next=_render(fake_renderer.FINE))
+    double.until(lambda: "next" in double.results)
+    assert "lost" not in double.results
+
+
+def test_a_stale_report_is_forgotten(start: Start, double: CoordinatorDouble) -> None:
+    start()
+    double.stale.add("late")
+    double.offer(late=_render(fake_renderer.FINE))
+    double.until(lambda: "late" not in double.stale)
+    double.offer(next=_render(fake_renderer.FINE))
+    double.until(lambda: "next" in double.results)
+    assert "late" not in double.results
+
+
+def test_a_superseded_dispatcher_goes(start: Start, double: CoordinatorDouble) -> None:
+    running = start()
+    double.until(lambda: len(double.registrations) == 1)
+    double.superseded = True
+    running.join()
+    assert isinstance(running.error, SupersededError)
+
+
+def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    running = start(slots=1)
+    double.offer(running=_render(HANG), waiting=_render(HANG + 1))
+    _wait_for_pid(double, store, HANG)
+    double.until(lambda: "waiting" in double.leased)
+    running.stop()
+    assert running.error is None
+    assert set(double.released) == {"running", "waiting"}
+    assert double.results == {}
+
+
+def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    running = start(slots=1, stop_seconds=20)
+    double.offer(running=_render(HANG), waiting=_render(HANG + 1))
+    _wait_for_pid(double, store, HANG)
+    double.until(lambda: "waiting" in double.leased)
+    running.dispatcher.stop()
+    double.until(lambda: "waiting" in double.released)
+    (store.root / f"release-{HANG}").touch()
+    running.join()
+    assert double.results.keys() == {"running"}
+
+
+def test_processes_give_way_to_fresh_ones(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    start(slots=1, renders_per_process=1)
+    pids = []
+    for what in (HANG, HANG + 1):
+        (store.root / f"release-{what}").touch()
+        double.offer(**{f"render-{what}": _render(what)})
+        pids.append(_wait_for_pid(double, store, what))
+    double.until(lambda: len(double.results) == 2)
+    assert pids[0] != pids[1]
+
+
+def test_a_renderer_that_does_not_start_is_told(start: Start, double: CoordinatorDouble) -> None:
+    running = start(render_actor="no_such_renderer:RenderActor")
+    running.join()
+    assert isinstance(running.error, StartError)
+    assert "No module named 'no_such_renderer'" in str(running.error)
+    assert double.registrations == []
+
+
+def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: Store, cluster_cpus: int) -> None:
+    settings = Settings(
+        url=f"http://127.0.0.1:{double.port}",
+        store=store.root,
+        name="test",
+        slots=1,
+        blender_python=Path(sys.executable),
+        render_actor="fake_renderer:RenderActor",
+        start_seconds=1.0,
+    )
+    # As if the cluster had promised more CPUs than it has.
+    with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 50 CPUs"):
+        Dispatcher(settings, cluster_cpus=100).run()
