@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 OBJECT_STORE_BYTES = 128 * 2**20
 """Tasks and results are small: bulk data goes through the store."""
 
-_OWNER = "STICKSLIP_RAY_OWNER"
+OWNER = "STICKSLIP_RAYOWNER"
 """Environment variable of all processes of a cluster of ours: its directory and the dispatcher's pid."""
 
 
@@ -38,7 +38,7 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
         os.environ |= {
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
-            _OWNER: f"{directory}:{os.getpid()}",
+            OWNER: f"{directory}:{os.getpid()}",
         }
         options = {
             "num_cpus": cpus,
@@ -85,7 +85,7 @@ def _bury(directory: Path) -> None:
         for variable in environment:
             key, _, value = variable.decode(errors="replace").partition("=")
             owned_by, _, pid = value.rpartition(":")
-            if key == _OWNER and owned_by == str(directory) and not Path("/proc", pid).exists():
+            if key == OWNER and owned_by == str(directory) and not Path("/proc", pid).exists():
                 log.info("ending process %s of dispatcher %s, which is gone", entry.name, pid)
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(int(entry.name), signal.SIGKILL)

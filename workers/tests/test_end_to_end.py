@@ -1,0 +1,131 @@
+"""The command line against the real coordinator and the real renderer, each in its own process."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+import pytest
+import zarr
+from stickslip_workers.cluster import OWNER
+from stickslip_workers.settings import default_blender_python
+
+pytest.importorskip("stickslip_services")
+pytestmark = pytest.mark.skipif(not default_blender_python().exists(), reason="there is no Blender environment")
+
+T = TypeVar("T")
+
+
+def _wait_for(what: str, probe: Callable[[], T | None], timeout: float = 120) -> T:
+    deadline = time.monotonic() + timeout
+    while time.monotonic() < deadline:
+        if (answer := probe()) is not None:
+            return answer
+        time.sleep(0.05)
+    raise AssertionError(f"waited {timeout} s in vain for {what}")
+
+
+class Services:
+    """A coordinator, and dispatchers one after the other."""
+
+    def __init__(self, directory: Path) -> None:
+        self.store = directory / "store"
+        self._directory = directory
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._start("coordinator", "stickslip_services.coordinator", "--data", directory, "--port", "0")
+        found = self._wait_for_line("coordinator", r"listening on (http://\S+)")
+        self.url = found[1]
+
+    def _start(self, log: str, *command: object) -> subprocess.Popen[bytes]:
+        with (self._directory / f"{log}.log").open("wb") as file:
+            words = [sys.executable, "-m", *map(str, command)]
+            process = subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT)
+        self._processes.append(process)
+        return process
+
+    def _wait_for_line(self, log: str, pattern: str) -> re.Match[str]:
+        path = self._directory / f"{log}.log"
+        return _wait_for(f"{pattern!r} in {log}.log", lambda: re.search(pattern, path.read_text()))
+
+    def dispatch(self, log: str) -> subprocess.Popen[bytes]:
+        name = f"end-to-end-{os.getpid()}"
+        process = self._start(
+            log, "stickslip_workers", "dispatch", "--url", self.url, "--store", self.store, "--name", name
+        )
+        self._wait_for_line(log, "registered as")
+        return process
+
+    def submit(self, count: int) -> str:
+        spec = {
+            "kind": "rod_hang",
+            "axes": {"gamma": {"type": "linspace", "start": 100.0, "stop": 900.0, "num": count}, "phi0": 2, "phi1": 8},
+            "samples_per_shard": 4,
+            "quality": "draft",
+        }
+        for axis in ("phi0", "phi1"):
+            spec["axes"][axis] = float(spec["axes"][axis])
+        response = httpx.post(f"{self.url}/v1/jobs", json=spec, timeout=30)
+        assert response.status_code == 202, response.text
+        return str(response.json()["id"])
+
+    def job(self, job: str) -> dict[str, Any]:
+        answer: dict[str, Any] = httpx.get(f"{self.url}/v1/jobs/{job}", timeout=30).json()
+        return answer
+
+    def close(self) -> None:
+        for process in reversed(self._processes):
+            process.terminate()
+        for process in self._processes:
+            process.wait(timeout=30)
+
+
+@pytest.fixture
+def services(tmp_path: Path) -> Iterator[Services]:
+    running = Services(tmp_path)
+    yield running
+    running.close()
+
+
+def _processes_of(dispatcher: int) -> list[int]:
+    """Return the Ray processes that a dispatcher, dead or alive, has started."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            mine = re.search(rf"{OWNER}=[^\0]*:{dispatcher}\0", (entry / "environ").read_text(errors="replace"))
+            if entry.name.isdigit() and int(entry.name) != dispatcher and mine:
+                found.append(int(entry.name))
+    return found
+
+
+def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> None:
+    first = services.dispatch("first")
+    job = services.submit(12)
+
+    def some_rendered() -> bool | None:
+        counts = services.job(job)["progress"]["stages"]["render"]["counts"]
+        return True if 1 < counts.get("succeeded", 0) < 12 else None
+
+    _wait_for("some renders", some_rendered)
+    assert _processes_of(first.pid)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+
+    second = services.dispatch("second")
+    assert _processes_of(first.pid) == []
+    done = _wait_for("the end of the job", lambda: (now := services.job(job))["finished_at"] and now)
+    assert done["state"] == "succeeded"
+    version = services.store / "datasets" / done["dataset"]["dataset"] / f"v{done['dataset']['version']}"
+    group = zarr.open_group(version, mode="r")
+    assert group["valid"][...].all()
+    assert (group["views"][...].reshape(12, -1).max(axis=1) > 0).all()
+
+    second.send_signal(signal.SIGTERM)
+    assert second.wait(timeout=20) == 0
+    _wait_for("the end of Ray's processes", lambda: True if _processes_of(second.pid) == [] else None)
