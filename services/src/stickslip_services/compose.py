@@ -78,7 +78,7 @@ def _render_tasks(connection: Connection, group: list[StoredTask]) -> dict[int, 
             select(task_dependencies.c.task, tasks.c.output)
             .join(tasks, tasks.c.seq == task_dependencies.c.depends_on)
             .where(task_dependencies.c.task.in_(batch))
-        ).tuples()
+        )
     )
     composed: dict[int, AnyTask] = {}
     for task in group:

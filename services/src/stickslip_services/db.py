@@ -20,9 +20,6 @@ BATCH = 5000
 
 _PRAGMAS = (
     "journal_mode=WAL",  # readers and the writer do not wait for each other
-    # FULL: what was answered with 202, or accepted as a dataset version, is there after a power cut, too. A commit
-    # costs an fsync; leases and reports come in batches, so that is a handful a second.
-    "synchronous=FULL",
     "busy_timeout=30000",  # another process may look at the database (a backup, a person)
     "foreign_keys=ON",
     "cache_size=-65536",  # 64 MiB: the index of 200,000 task keys fits
@@ -33,13 +30,16 @@ _PRAGMAS = (
 class Database:
     """Transactions on one database file."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, durable: bool = True) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.url = URL.create("sqlite+pysqlite", database=str(path))
-        self._engine = create_engine(self.url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
+        # FULL: what was answered with 202, or accepted as a dataset version, is there after a power cut, too. A
+        # commit costs an fsync; leases and reports come in batches, so that is a handful a second.
+        self._pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
+        url = URL.create("sqlite+pysqlite", database=str(path))
+        self._engine = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
         # SQLite's own waiting for the write lock polls and is unfair; threads of this process queue up here.
         self._writing = threading.Lock()
-        event.listen(self._engine, "connect", _prepare)
+        event.listen(self._engine, "connect", self._prepare)
         event.listen(self._engine, "begin", _begin)
 
     @contextmanager
@@ -60,11 +60,10 @@ class Database:
         """Close all connections."""
         self._engine.dispose()
 
-
-def _prepare(connection: Any, _record: Any) -> None:
-    connection.isolation_level = None  # transactions are begun by _begin, not by the driver
-    for pragma in _PRAGMAS:
-        connection.execute(f"PRAGMA {pragma}")
+    def _prepare(self, connection: Any, _record: Any) -> None:
+        connection.isolation_level = None  # transactions are begun by _begin, not by the driver
+        for pragma in self._pragmas:
+            connection.execute(f"PRAGMA {pragma}")
 
 
 def _begin(connection: Connection) -> None:

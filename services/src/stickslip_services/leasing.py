@@ -193,4 +193,8 @@ def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, int, str, str]]) ->
     seqs = [seq for _, seq, _, _ in held]
     needed = live_jobs(book.connection, seqs)
     cancelling = book.holders(seq for seq in seqs if seq not in needed)
-    return {seq for lease, seq, _, _ in held if seq not in needed and (seq in cancelling or not lease.started)}
+    return {
+        seq
+        for lease, seq, _, state in held
+        if seq not in needed and (seq in cancelling or not (lease.started or state == TaskState.running))
+    }

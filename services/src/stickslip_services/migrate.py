@@ -4,25 +4,25 @@ from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import URL
+from sqlalchemy import Connection
 
 _MIGRATIONS = Path(__file__).parent / "migrations"
 
 
-def config(url: URL) -> Config:
-    """Return Alembic's configuration for a database."""
+def config(connection: Connection) -> Config:
+    """Return Alembic's configuration for an open transaction."""
     made = Config()
     made.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
-    made.set_main_option("sqlalchemy.url", url.render_as_string(hide_password=False).replace("%", "%%"))
     made.set_main_option("path_separator", "os")
+    made.attributes["connection"] = connection
     return made
 
 
-def upgrade(url: URL) -> None:
-    """Apply all migrations that the database has not had yet."""
-    command.upgrade(config(url), "head")
+def upgrade(connection: Connection) -> None:
+    """Apply all migrations that the database has not had yet: all of them or, where one fails, none."""
+    command.upgrade(config(connection), "head")
 
 
-def check(url: URL) -> None:
+def check(connection: Connection) -> None:
     """Raise where the database, after all migrations, differs from `tables`."""
-    command.check(config(url))
+    command.check(config(connection))

@@ -95,13 +95,13 @@ class Coordinator:
     store: Store = field(init=False)
 
     def __post_init__(self) -> None:
-        self.database = Database(self.settings.database_path)
+        self.database = Database(self.settings.database_path, durable=self.settings.durable)
         self.store = Store(self.settings.store_root)
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
-        migrate.upgrade(self.database.url)
         with self.database.write() as connection:
+            migrate.upgrade(connection)
             renew_all_leases(connection, self.clock(), self.settings)
         self.plan_waiting_jobs()
 

@@ -22,6 +22,8 @@ class Settings(BaseSettings):
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 
+    durable: bool = True
+    """Wait for the disk at each commit. Without it a power cut may lose what was accepted; for tests."""
     lease_seconds: float = Field(default=30.0, gt=0)
     """How long a lease lasts without a heartbeat [s]."""
     max_tries: int = Field(default=3, ge=1)

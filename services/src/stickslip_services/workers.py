@@ -85,7 +85,7 @@ def note_seen(connection: Connection, worker_id: str, now: float) -> None:
 def leased_counts(connection: Connection) -> dict[str, int]:
     """Return how many tasks each worker holds."""
     query = select(tasks.c.owner, func.count()).where(text("tasks.owner IS NOT NULL")).group_by(tasks.c.owner)
-    return dict(connection.execute(query).tuples().all())
+    return dict(connection.execute(query).all())
 
 
 def show_workers(connection: Connection, *, alive_since: float) -> list[responses.Worker]:

@@ -1,13 +1,8 @@
-"""Alembic's entry: runs migrations on the database that `migrate` names."""
+"""Alembic's entry: runs migrations in the transaction that `migrate` has opened."""
 
 from alembic import context
-from sqlalchemy import create_engine
 from stickslip_services.tables import metadata
 
-engine = create_engine(context.config.get_main_option("sqlalchemy.url") or "")
-with engine.connect() as connection:
-    # SQLite cannot alter most things: batch mode makes a new table and copies.
-    context.configure(connection=connection, target_metadata=metadata, render_as_batch=True)
-    with context.begin_transaction():
-        context.run_migrations()
-engine.dispose()
+# SQLite cannot alter most things: batch mode makes a new table and copies.
+context.configure(connection=context.config.attributes["connection"], target_metadata=metadata, render_as_batch=True)
+context.run_migrations()

@@ -1,0 +1,278 @@
+"""For tests of whoever speaks to a coordinator: a clock that stands still, a worker that only pretends, a server."""
+
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.states import Reason, Stage
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import (
+    ChunkRef,
+    FileEntry,
+    PackOutput,
+    PublishOutput,
+    PublishTask,
+    RecordRef,
+    RenderOutput,
+    SimulateOutput,
+    TaskResult,
+)
+from stickslip_schemas.worker_api import (
+    Heartbeat,
+    HeartbeatAnswer,
+    Lease,
+    LeaseBatch,
+    LeaseRequest,
+    LeaseState,
+    Report,
+    ReportAnswer,
+    ReportBatch,
+    WorkerRegistration,
+    WorkerSession,
+)
+
+A = TypeVar("A", bound=BaseModel)
+
+BUILDS = Builds(sim_core="a" * 64, blender="b" * 64, packer="c" * 64)
+ALL_STAGES = dict.fromkeys(Stage, 1000)
+
+
+class ManualClock:
+    """A clock that stands still until it is told otherwise."""
+
+    def __init__(self) -> None:
+        self.now = 1_800_000_000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now += seconds
+
+
+def rods(gamma: Any = (1.0, 2.0), phi1: Any = (1.0, 3.0), **rest: Any) -> dict[str, Any]:
+    """Return a small spec."""
+    gamma = list(gamma) if isinstance(gamma, tuple) else gamma
+    axes = {"gamma": gamma, "phi0": 0.0, "phi1": list(phi1) if isinstance(phi1, tuple) else phi1}
+    return {"kind": "rod_hang", "axes": axes, "samples_per_shard": 2, **rest}
+
+
+def parsed(spec: dict[str, Any]) -> Any:
+    """Return a spec as the coordinator gets it."""
+    return job_spec_adapter.validate_python(spec)
+
+
+def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed") -> TaskResult:
+    """Return a failed try."""
+    return TaskResult(outcome="failed", reason=reason, message=message, wall_seconds=1.0)
+
+
+def rejection(message: str = "it diverged") -> TaskResult:
+    """Return a rejected sample."""
+    return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
+
+
+@dataclass
+class PretendWorker:
+    """Does what a dispatcher does, at once and with made-up data that the store really holds."""
+
+    api: Any  # a Coordinator, or what has its four verbs
+    store: Store
+    name: str = "pretend"
+    builds: Builds = BUILDS
+    kinds: tuple[str, ...] = ("rod_hang",)
+    slots: int = 2
+    judge: Callable[[Any], TaskResult | None] = lambda _task: None
+    id: str = ""
+    ran: list[str] = field(default_factory=list)
+
+    def register(self) -> "PretendWorker":
+        """Present itself."""
+        registration = WorkerRegistration(
+            name=self.name, builds=self.builds, kinds=self.kinds, slots=self.slots, versions={}
+        )
+        self.id = self.api.register(registration).worker_id
+        return self
+
+    def lease(self, **wanted: int) -> tuple[Lease, ...]:
+        """Ask for tasks, all there are unless told otherwise."""
+        stages = {Stage(stage): count for stage, count in wanted.items()} or ALL_STAGES
+        leases: tuple[Lease, ...] = self.api.lease(LeaseRequest(worker_id=self.id, wanted=stages)).leases
+        return leases
+
+    def start(self, *leases: Lease) -> tuple[str, ...]:
+        """Say that tasks have been started; return those to drop."""
+        return self.beat(*leases, started=True)
+
+    def beat(self, *leases: Lease, started: bool = False) -> tuple[str, ...]:
+        """Renew leases; return those to drop."""
+        states = tuple(LeaseState(task_id=lease.task_id, token=lease.token, started=started) for lease in leases)
+        drop: tuple[str, ...] = self.api.heartbeat(Heartbeat(worker_id=self.id, leases=states)).drop
+        return drop
+
+    def report(self, *ended: tuple[Lease, TaskResult | None]) -> list[str]:
+        """Report results; return the verdicts."""
+        reports = tuple(Report(task_id=lease.task_id, token=lease.token, result=result) for lease, result in ended)
+        answer = self.api.report(ReportBatch(worker_id=self.id, reports=reports))
+        return [verdict.verdict for verdict in answer.verdicts]
+
+    def finish(self, *leases: Lease) -> list[str]:
+        """Run tasks and report what came of them."""
+        self.ran += [lease.task_id for lease in leases]
+        return self.report(*((lease, self.result(lease.task)) for lease in leases))
+
+    def work(self, rounds: int = 1000) -> int:
+        """Run all there is to run; return the number of tasks."""
+        count = 0
+        for _ in range(rounds):
+            leases = self.lease()
+            if not leases:
+                return count
+            count += len(leases)
+            self.finish(*leases)
+        raise AssertionError("there is no end of it")
+
+    def result(self, task: Any) -> TaskResult:
+        """Return what a task gives."""
+        judged = self.judge(task)
+        if judged is not None:
+            return judged
+        output: Any
+        if task.stage == "simulate":
+            digest = self.store.publish(task.model_dump_json().encode())
+            output = SimulateOutput(record=RecordRef(digest=digest, row=0), labels={"energy": 0.5})
+        elif task.stage == "render":
+            data = task.model_dump_json().encode()
+            digest = self.store.publish(data)
+            preview = self.store.publish(b"\x89PNG" + data) if task.preview else None
+            chunk = ChunkRef(digest=digest, offset=0, length=len(data))
+            output = RenderOutput(chunks={"views": chunk}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
+        elif task.stage == "pack":
+            data = b"".join(slot.sample_key.encode() for slot in task.slots) * 50
+            entry = FileEntry(path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data))
+            output = PackOutput(files=(entry,))
+        else:
+            output = self._publish(task)
+        return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0)
+
+    def _publish(self, task: PublishTask) -> PublishOutput:
+        files = (*task.files, *self._zarr(len(task.sample_keys)))
+        manifest = Manifest(
+            dataset=task.dataset,
+            version=task.version,
+            spec=task.spec,
+            spec_digest=task.spec.content_digest,
+            builds=task.builds,
+            cameras=(),
+            sample_count=len(task.sample_keys),
+            valid_count=len(task.sample_keys) - len(task.rejections),
+            split_counts={},
+            rejections=task.rejections,
+            sample_keys=task.sample_keys,
+            files=tuple(sorted(files, key=lambda file: file.path)),
+        )
+        digest = self.store.publish(manifest.model_dump_json().encode())
+        return PublishOutput(manifest=digest, bytes=manifest.size)
+
+    def _zarr(self, count: int) -> list[FileEntry]:
+        """Return the files of a small Zarr group."""
+        import zarr
+        from zarr.storage import MemoryStore
+
+        memory: dict[str, Any] = {}
+        group = zarr.open_group(MemoryStore(memory), mode="w")
+        array = group.create_array("mu", shape=(count,), chunks=(count,), dtype="float64", dimension_names=["sample"])
+        array[:] = range(count)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # consolidated metadata is not in the Zarr v3 specification yet
+            zarr.consolidate_metadata(group.store)
+        entries = []
+        for path, value in memory.items():
+            data = value.to_bytes()
+            entries.append(FileEntry(path=path, sha256=self.store.publish(data), size=len(data)))
+        return entries
+
+
+@dataclass
+class RunningServer:
+    """A coordinator as a process of its own."""
+
+    url: str
+    data: Path
+    process: "subprocess.Popen[str]"
+
+    @property
+    def store(self) -> Store:
+        """Its store."""
+        return Store(self.data / "store")
+
+    def worker(self, **options: Any) -> PretendWorker:
+        """Return a worker that has registered."""
+        return PretendWorker(HttpApi(self.url), self.store, **options).register()
+
+    def stop(self) -> None:
+        """Stop it."""
+        self.process.terminate()
+        self.process.wait(20)
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+class HttpApi:
+    """The four verbs of the worker API over HTTP."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+
+    def register(self, document: WorkerRegistration) -> WorkerSession:
+        """Register a worker."""
+        return self._post("/v1/workers", document, WorkerSession)
+
+    def lease(self, document: LeaseRequest) -> LeaseBatch:
+        """Lease tasks."""
+        return self._post("/v1/worker/lease", document, LeaseBatch)
+
+    def heartbeat(self, document: Heartbeat) -> HeartbeatAnswer:
+        """Renew leases."""
+        return self._post("/v1/worker/heartbeat", document, HeartbeatAnswer)
+
+    def report(self, document: ReportBatch) -> ReportAnswer:
+        """Report results."""
+        return self._post("/v1/worker/report", document, ReportAnswer)
+
+    def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
+        content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
+        response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
+        response.raise_for_status()
+        return answer.model_validate_json(response.content)
+
+
+def start_server(data: Path, port: int = 0) -> RunningServer:
+    """Start a coordinator and wait until it answers."""
+    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", str(port)]
+    log = (data.parent / f"{data.name}.log").open("ab")
+    with log:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+    assert process.stdout is not None
+    words = process.stdout.readline().split()
+    assert words, "the coordinator did not start"
+    return RunningServer(words[-1], data, process)
+
+
+def wait_until(condition: Callable[[], bool], *, seconds: float = 20.0) -> None:
+    """Return when `condition` holds; fail after `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come to pass"
+        time.sleep(0.02)

@@ -1,0 +1,548 @@
+"""The life of jobs and tasks: leases, fencing, retries, sharing, cancelling."""
+
+import json
+from typing import Any
+
+import pytest
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask
+from stickslip_schemas.worker_api import LeaseRequest
+from stickslip_services.audit import audit
+from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
+from stickslip_services.events import read_events
+from stickslip_services.operations import Coordinator
+from stickslip_services.paging import PageRequest
+from stickslip_services.settings import Settings
+from stickslip_services.testing import (
+    BUILDS,
+    ManualClock,
+    PretendWorker,
+    failure,
+    parsed,
+    rejection,
+    rods,
+)
+
+
+def submit(coordinator: Coordinator, **spec: Any) -> str:
+    job = coordinator.submit(parsed(rods(**spec)), None)
+    assert not isinstance(job, tuple)
+    return job.id  # type: ignore[union-attr]
+
+
+def check(coordinator: Coordinator) -> None:
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+
+
+def counts(coordinator: Coordinator, job: str, stage: Stage) -> dict[TaskState, int]:
+    return coordinator.show_job(job).progress.stages[stage].counts
+
+
+def test_a_job_runs_from_grid_to_dataset(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator, name="first")
+    assert coordinator.show_job(job_id).state is JobState.queued
+    first = worker.lease(simulate=1)
+    assert coordinator.show_job(job_id).state is JobState.running
+    worker.finish(*first)
+    assert worker.work() == 4 + 4 + 2 + 1 - 1
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.rejected_count, job.progress.done, job.progress.total) == (JobState.succeeded, 0, 11, 11)
+    assert job.progress.stages[Stage.render].cpu_seconds == 8.0
+    assert job.dataset is not None
+    dataset = coordinator.show_dataset(job.dataset.dataset)
+    assert (dataset.name, [version.version for version in dataset.versions]) == ("first", [1])
+    assert dataset.versions[0].manifest == job.dataset.manifest
+    check(coordinator)
+
+
+def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    (simulate, *others) = worker.lease(simulate=100)
+    worker.report((simulate, rejection("no equilibrium")), *((task, worker.result(task.task)) for task in others))
+    renders = worker.lease(render=100)
+    assert len(renders) == 3
+    assert all(isinstance(lease.task, RenderTask) and lease.task.preview for lease in renders)
+    worker.finish(*renders)
+    (first, second) = worker.lease(pack=100)
+    assert isinstance(first.task, PackTask)
+    rejected, good = first.task.slots
+    assert rejected.rejection is not None
+    assert (rejected.slot, rejected.valid, rejected.rejection.message) == (0, False, "no equilibrium")
+    assert rejected.rejection.labels == {"gamma": 1.0, "phi0": 0.0, "phi1": 1.0}
+    assert good.labels == {"gamma": 1.0, "phi0": 0.0, "phi1": 3.0, "energy": 0.5, "color": [1.0, 0.5, 0.0]}
+    assert good.record is not None
+    assert set(good.chunks) == {"views"}
+    worker.finish(first, second)
+    (publish,) = worker.lease(publish=1)
+    assert isinstance(publish.task, PublishTask)
+    assert [file.path for file in publish.task.files] == ["views/c/0/0", "views/c/1/0"]
+    assert [entry.slot for entry in publish.task.rejections] == [0]
+    assert len(publish.task.sample_keys) == 4
+    assert publish.task.sample_keys[1] == good.sample_key
+    check(coordinator)
+
+
+def test_nothing_is_rendered_where_no_views_are_wanted(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator, views=None)
+    assert worker.work() == 4 + 2 + 1
+    assert coordinator.show_job(job_id).state is JobState.succeeded
+    check(coordinator)
+
+
+def test_a_rejected_simulation_rejects_its_renders(coordinator: Coordinator, worker: PretendWorker) -> None:
+    worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
+    job_id = submit(coordinator)
+    worker.work()
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 2)
+    assert "2 of 4 samples were rejected" in job.message
+    page = coordinator.list_samples(job_id, PageRequest(10, None), TaskState.rejected)
+    assert [(item.slot, item.reason, item.message) for item in page.items] == [
+        (0, Reason.solver_diverged, "it diverged"),
+        (1, Reason.solver_diverged, "it diverged"),
+    ]
+    assert len([name for name in worker.ran if name.startswith("render")]) == 2
+    check(coordinator)
+
+
+def test_all_samples_rejected_is_a_dataset_too(coordinator: Coordinator, worker: PretendWorker) -> None:
+    worker.judge = lambda task: rejection() if task.stage == "simulate" else None
+    job_id = submit(coordinator)
+    worker.work()
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 4)
+    assert job.dataset is not None
+    assert coordinator.show_version(job.dataset.dataset, 1).valid_count == 0
+
+
+def test_the_same_grid_again_runs_nothing(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    worker.work()
+    again = coordinator.show_job(submit(coordinator, name="again"))
+    assert again.state is JobState.succeeded
+    assert again.dataset is not None
+    assert again.dataset.version == 1
+    assert [stage.cached for stage in again.progress.stages.values()] == [4, 4, 2, 1]
+    assert worker.lease() == ()
+    check(coordinator)
+
+
+def test_a_bigger_grid_runs_what_is_new(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    worker.work()
+    ran = len(worker.ran)
+    bigger = submit(coordinator, gamma=(1.0, 2.0, 5.0))
+    worker.work()
+    job = coordinator.show_job(bigger)
+    assert job.state is JobState.succeeded
+    assert len(worker.ran) - ran == 2 + 2 + 1 + 1  # two shards are those of the smaller grid
+    assert job.progress.stages[Stage.simulate].cached == 4
+    assert job.progress.stages[Stage.simulate].cpu_seconds == 4.0
+    check(coordinator)
+
+
+def test_other_builds_make_another_version(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    worker.work()
+    other = PretendWorker(
+        coordinator, coordinator.store, name="new", builds=BUILDS.model_copy(update={"blender": "e" * 64})
+    ).register()
+    job_id = submit(coordinator)
+    other.work()
+    job = coordinator.show_job(job_id)
+    assert job.dataset is not None
+    assert job.dataset.version == 2
+    assert job.progress.stages[Stage.simulate].cached == 4  # the simulator is the same
+    assert len(coordinator.show_dataset(job.dataset.dataset).versions) == 2
+    check(coordinator)
+
+
+def test_a_stale_token_is_refused(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(coordinator)
+    (late,) = worker.lease(simulate=1)
+    clock.advance(31)
+    (again,) = worker.lease(simulate=1)
+    assert (again.task_id, again.token, again.attempt) == (late.task_id, late.token + 1, 1)
+    assert worker.finish(late) == ["stale"]
+    assert worker.beat(late) == (late.task_id,)
+    assert worker.finish(again) == ["accepted"]
+    assert worker.finish(again) == ["duplicate"]
+    assert worker.finish(late) == ["stale"]
+    check(coordinator)
+
+
+def test_another_worker_cannot_report(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    (mine,) = worker.lease(simulate=1)
+    thief = PretendWorker(coordinator, coordinator.store, name="thief").register()
+    assert thief.finish(mine) == ["stale"]
+    assert thief.beat(mine) == (mine.task_id,)
+    assert worker.finish(mine, mine) == ["accepted", "duplicate"]
+    check(coordinator)
+
+
+def test_a_heartbeat_keeps_a_lease(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(coordinator)
+    (mine,) = worker.lease(simulate=1)
+    for _ in range(5):
+        clock.advance(20)
+        assert worker.start(mine) == ()
+        coordinator.sweep()
+    assert worker.finish(mine) == ["accepted"]
+
+
+def test_an_expired_lease_counts_where_the_task_was_started(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job_id = submit(coordinator)
+    started, idle = worker.lease(simulate=2)
+    worker.start(started)
+    clock.advance(31)
+    coordinator.sweep()
+    assert counts(coordinator, job_id, Stage.simulate) == {TaskState.pending: 3, TaskState.soft_failed: 1}
+    clock.advance(1)
+    leases = {lease.task_id: lease for lease in worker.lease(simulate=10)}
+    assert (leases[started.task_id].attempt, leases[idle.task_id].attempt) == (2, 1)
+    with coordinator.database.read() as connection:
+        events = read_events(connection, 1, after=0, limit=100)
+    lost = [json.loads(event.data) for event in events if event.name == "task.state"]
+    assert [(event["state"], event["reason"]) for event in lost] == [("soft_failed", "worker_lost")]
+    check(coordinator)
+
+
+def test_three_failed_tries_fail_the_job(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
+    job_id = submit(coordinator)
+    poison, running, other, _ = worker.lease(simulate=4)
+    worker.start(running)
+    for tries in range(3):
+        worker.report((poison, failure(message=f"crash {tries}")))
+        assert worker.lease(simulate=1) == ()  # it waits a little first
+        clock.advance(10)
+        worker.beat(running, other)
+        leases = worker.lease(simulate=1)
+        assert len(leases) == (1 if tries < 2 else 0)
+        poison = leases[0] if leases else poison
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.reason) == (JobState.failed, Reason.failed_tasks)
+    assert "failed 3 times" in job.message
+    assert "crash 2" in job.message
+    assert f"/v1/tasks/{poison.task_id}" in job.message
+    assert "stickslip_workers replay" in job.message
+    assert worker.lease() == ()  # nothing further is started
+    assert worker.beat(running, started=True) == ()  # what runs may finish
+    assert worker.beat(other) == (other.task_id,)  # what has not been started is dropped
+    assert worker.finish(running) == ["accepted"]
+    check(coordinator)
+
+
+def test_submitting_a_failed_job_again_tries_again(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    worker.judge = lambda task: failure() if task.stage == "render" else None
+    first = submit(coordinator)
+    for _ in range(4):
+        worker.work()
+        clock.advance(10)
+    assert coordinator.show_job(first).state is JobState.failed
+    worker.judge = lambda _task: None
+    second = submit(coordinator)
+    check(coordinator)
+    worker.work()
+    job = coordinator.show_job(second)
+    assert job.state is JobState.succeeded
+    assert job.progress.stages[Stage.simulate].cached == 4
+    assert coordinator.show_job(first).state is JobState.failed
+    check(coordinator)
+
+
+def test_a_failure_with_a_deterministic_reason_is_a_failure(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    (task,) = worker.lease(simulate=1)
+    worker.report((task, failure(Reason.solver_diverged)))
+    assert counts(coordinator, job_id, Stage.simulate)[TaskState.soft_failed] == 1
+
+
+def test_a_released_task_waits_again_without_a_count(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    (task,) = worker.lease(simulate=1)
+    assert worker.report((task, None)) == ["accepted"]
+    (again,) = worker.lease(simulate=1)
+    assert (again.task_id, again.attempt, again.token) == (task.task_id, 1, task.token + 1)
+    assert worker.report((task, None)) == ["duplicate"]
+    assert worker.finish(again) == ["accepted"]
+    check(coordinator)
+
+
+def test_a_new_session_takes_the_leases_of_the_old_one(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    submit(coordinator)
+    started, idle = worker.lease(simulate=2)
+    worker.start(started)
+    successor = PretendWorker(coordinator, coordinator.store).register()
+    assert worker.finish(started) == ["stale"]
+    assert worker.beat(idle) == (idle.task_id,)
+    with pytest.raises(ConflictError, match="another session"):
+        worker.lease()
+    clock.advance(1)
+    attempts = {lease.task_id: lease.attempt for lease in successor.lease(simulate=10)}
+    assert (attempts[started.task_id], attempts[idle.task_id], len(attempts)) == (2, 1, 4)
+    check(coordinator)
+
+
+def test_an_unknown_worker_is_told_to_register(coordinator: Coordinator) -> None:
+    with pytest.raises(UnknownWorkerError, match="register again"):
+        coordinator.lease(LeaseRequest(worker_id="worker-0", wanted={Stage.simulate: 1}))
+
+
+def test_jobs_share_tasks_and_one_can_be_cancelled(coordinator: Coordinator, worker: PretendWorker) -> None:
+    small = submit(coordinator, gamma=(1.0,))
+    big = submit(coordinator)
+    first = worker.lease(simulate=1)
+    assert coordinator.show_job(small).state is coordinator.show_job(big).state is JobState.running
+    check(coordinator)
+    assert coordinator.cancel(small).state is JobState.cancelled  # what is leased, the other job needs
+    check(coordinator)
+    assert worker.beat(*first, started=True) == ()
+    worker.finish(*first)
+    worker.work()
+    assert coordinator.show_job(big).state is JobState.succeeded
+    assert coordinator.show_job(small).state is JobState.cancelled
+    check(coordinator)
+    assert coordinator.show_job(submit(coordinator, gamma=(1.0,))).state is JobState.queued  # its own last task only
+
+
+def test_cancelling_drops_what_runs(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    started, idle = worker.lease(simulate=2)
+    worker.start(started)
+    assert coordinator.cancel(job_id).state is JobState.cancelling
+    assert coordinator.cancel(job_id).state is JobState.cancelling
+    check(coordinator)
+    assert worker.lease() == ()
+    assert set(worker.beat(started, idle)) == {started.task_id, idle.task_id}
+    assert coordinator.show_job(job_id).state is JobState.cancelled
+    assert worker.finish(started) == ["stale"]
+    assert coordinator.cancel(job_id).state is JobState.cancelled
+    check(coordinator)
+
+
+def test_a_result_that_comes_before_the_drop_is_kept(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    (task,) = worker.lease(simulate=1)
+    coordinator.cancel(job_id)
+    assert worker.finish(task) == ["accepted"]
+    assert coordinator.show_job(job_id).state is JobState.cancelled
+    again = coordinator.show_job(submit(coordinator))
+    assert again.progress.stages[Stage.simulate].cached == 1
+    check(coordinator)
+
+
+def test_cancelling_ends_although_the_worker_is_gone(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job_id = submit(coordinator)
+    worker.start(*worker.lease(simulate=2))
+    coordinator.cancel(job_id)
+    clock.advance(31)
+    coordinator.sweep()
+    assert coordinator.show_job(job_id).state is JobState.cancelled
+    check(coordinator)
+
+
+def test_a_job_that_has_ended_cannot_be_cancelled(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    worker.work()
+    with pytest.raises(ConflictError, match="has ended"):
+        coordinator.cancel(job_id)
+    with pytest.raises(NotFoundError):
+        coordinator.cancel("job-0")
+
+
+def test_a_job_waits_for_the_first_worker(coordinator: Coordinator) -> None:
+    job_id = submit(coordinator)
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.reason, job.progress.total) == (JobState.queued, Reason.waiting_for_worker, 0)
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.reason, job.message, job.progress.total) == (JobState.queued, None, "", 11)
+    worker.work()
+    assert coordinator.show_job(job_id).state is JobState.succeeded
+    check(coordinator)
+
+
+def test_a_waiting_job_can_be_cancelled(coordinator: Coordinator) -> None:
+    job_id = submit(coordinator)
+    assert coordinator.cancel(job_id).state is JobState.cancelled
+    PretendWorker(coordinator, coordinator.store).register()
+    assert coordinator.show_job(job_id).progress.total == 0
+    check(coordinator)
+
+
+CLOTH = {
+    "kind": "cloth_drag",
+    "axes": {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "plaid"], "viewpoint": "left"},
+}
+
+
+def test_a_kind_that_no_worker_makes_is_refused(coordinator: Coordinator, worker: PretendWorker) -> None:
+    with pytest.raises(KindNotAvailableError, match="rod_hang"):
+        coordinator.submit(parsed(CLOTH), None)
+    assert coordinator.list_jobs(PageRequest(10, None)).items == ()
+    assert worker.lease() == ()
+
+
+def test_a_waiting_job_of_such_a_kind_fails(coordinator: Coordinator) -> None:
+    job = coordinator.submit(parsed(CLOTH), None)
+    PretendWorker(coordinator, coordinator.store).register()
+    shown = coordinator.show_job(job.id)  # type: ignore[union-attr]
+    assert shown.state is JobState.failed
+    assert "no worker makes 'cloth_drag'" in shown.message
+
+
+def test_many_renders_share_one_simulation(coordinator: Coordinator) -> None:
+    worker = PretendWorker(coordinator, coordinator.store, kinds=("rod_hang", "cloth_drag")).register()
+    job = coordinator.submit(parsed(CLOTH), None)
+    (simulation,) = worker.lease(simulate=10)
+    worker.report((simulation, rejection()))
+    assert worker.lease(render=10) == ()
+    worker.work()
+    shown = coordinator.show_job(job.id)  # type: ignore[union-attr]
+    assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 2)
+    check(coordinator)
+
+
+def test_a_stranded_job_says_so(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
+    job_id = submit(coordinator)
+    clock.advance(31)
+    coordinator.sweep()
+    job = coordinator.show_job(job_id)
+    assert (job.state, job.reason) == (JobState.queued, Reason.waiting_for_worker)
+    assert "no worker is connected" in job.message
+    other = BUILDS.model_copy(update={"sim_core": "f" * 64})
+    PretendWorker(coordinator, coordinator.store, builds=other).register()
+    assert "no connected worker has the builds" in coordinator.show_job(job_id).message
+    PretendWorker(coordinator, coordinator.store, name="old").register()
+    job = coordinator.show_job(job_id)
+    assert (job.reason, job.message) == (None, "")
+    check(coordinator)
+
+
+def test_tasks_go_only_to_their_builds(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    other = BUILDS.model_copy(update={"blender": "f" * 64})
+    foreign = PretendWorker(coordinator, coordinator.store, name="foreign", builds=other).register()
+    leases = foreign.lease()
+    assert {lease.task.stage for lease in leases} == {"simulate"}  # the simulator is the same
+    foreign.finish(*leases)
+    assert foreign.lease() == ()
+    assert {lease.task.stage for lease in worker.lease()} == {"render"}
+
+
+def test_a_small_job_does_not_wait_behind_a_big_one(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator, gamma={"type": "linspace", "start": 0, "stop": 50, "num": 50})
+    small = submit(coordinator, gamma=(77.0,))
+    held = worker.lease(simulate=4)
+    gammas = sorted(lease.task.simulation.gamma for lease in held)  # type: ignore[union-attr]
+    assert gammas[-2:] == [77.0, 77.0]
+    assert coordinator.show_job(small).state is JobState.running
+    check(coordinator)
+
+
+def test_work_survives_a_restart(settings: Settings, clock: ManualClock) -> None:
+    before = Coordinator(settings, clock)
+    before.start()
+    worker = PretendWorker(before, before.store).register()
+    job_id = submit(before)
+    held = worker.lease(simulate=2)
+    worker.start(*held)
+    before.close()
+    clock.advance(3600)  # the leases have expired, but nobody could have renewed them
+    after = Coordinator(settings, clock)
+    after.start()
+    worker.api = after
+    after.sweep()
+    assert worker.start(*held) == ()
+    assert worker.finish(*held) == ["accepted", "accepted"]
+    worker.work()
+    assert after.show_job(job_id).state is JobState.succeeded
+    check(after)
+    after.close()
+
+
+def test_a_worker_that_publishes_what_is_not_there_is_not_believed(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job_id = submit(coordinator)
+    while not (publish := worker.lease(publish=1)):
+        worker.finish(*worker.lease())
+    good = worker.result(publish[0].task)
+    assert good.output is not None
+    lie = good.model_copy(update={"output": good.output.model_copy(update={"manifest": "0" * 64})})
+    assert worker.report((publish[0], lie)) == ["accepted"]
+    assert counts(coordinator, job_id, Stage.publish) == {TaskState.soft_failed: 1}
+    clock.advance(5)
+    (again,) = worker.lease(publish=1)
+    assert again.task == publish[0].task  # the same version number
+    assert worker.finish(again) == ["accepted"]
+    assert coordinator.show_job(job_id).state is JobState.succeeded
+    check(coordinator)
+
+
+def test_an_output_of_another_stage_is_no_answer(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    (simulate, other) = worker.lease(simulate=2)
+    worker.finish(other)
+    (render,) = worker.lease(render=1)
+    worker.report((simulate, worker.result(render.task)))
+    assert counts(coordinator, job_id, Stage.simulate)[TaskState.soft_failed] == 1
+    check(coordinator)
+
+
+def test_a_task_can_be_read_for_a_replay(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    leases = worker.lease(simulate=4)
+    assert coordinator.show_task(leases[0].task_id) == leases[0].task
+    worker.finish(*leases)
+    (render,) = worker.lease(render=1)
+    assert coordinator.show_task(render.task_id) == render.task
+    with pytest.raises(NotFoundError):
+        coordinator.show_task("render-" + "0" * 64)
+    with pytest.raises(NotFoundError):
+        coordinator.show_task(render.task_id.replace("render", "simulate"))
+
+
+def test_versions_of_two_builds_at_once_do_not_share_a_number(coordinator: Coordinator, worker: PretendWorker) -> None:
+    submit(coordinator)
+    builds = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+    other = PretendWorker(coordinator, coordinator.store, name="other", builds=builds).register()
+    submit(coordinator)
+    publishes = []
+    for one in (worker, other):
+        while not (publish := one.lease(publish=1)):
+            one.finish(*one.lease())
+        publishes.append((one, publish[0]))
+    assert [lease.task.version for _, lease in publishes] == [1, 2]  # type: ignore[union-attr]
+    for one, lease in reversed(publishes):
+        assert one.finish(lease) == ["accepted"]
+    check(coordinator)
+
+
+def test_the_time_left_is_measured(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator, gamma=(1.0, 2.0, 3.0))
+    assert coordinator.show_job(job_id).progress.eta is None
+    worker.finish(*worker.lease(simulate=6))
+    assert coordinator.show_job(job_id).progress.eta is None  # no render has been measured
+    worker.finish(*worker.lease(render=2))
+    eta = coordinator.show_job(job_id).progress.eta
+    assert eta is not None
+    # 4 renders of 1 s, 3 packs and 1 publish taken as 1 s each, two at a time
+    assert eta.seconds == pytest.approx((4 + 3 + 1) / 2)
+    assert 0 <= eta.low < eta.seconds < eta.high
+    worker.work()
+    assert coordinator.show_job(job_id).progress.eta is None
+    earlier = coordinator.show_job(submit(coordinator, gamma=(8.0,))).progress.eta
+    assert earlier is not None  # from the job before
+    assert earlier.seconds == pytest.approx(4.0)  # 6 tasks on 2 slots, but each stage waits for the one before
