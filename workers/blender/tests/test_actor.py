@@ -2,6 +2,8 @@
 
 import io
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -136,21 +138,29 @@ def test_what_is_not_the_samples_fault_is_raised(actor: RenderActor, store: Stor
 
 
 _CRASH = """
-import json, os, sys
+import json, os, signal, sys
 from stickslip_blender.actor import RenderActor
 from stickslip_blender.pixels import FrameReader
-FrameReader.read = lambda self, window=None: os.abort()  # as Blender does when it crashes
+FrameReader.read = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
 """
 
 
-def test_a_crash_of_blender_leaves_the_store_as_it_was(actor: RenderActor, store: Store, record: str) -> None:
+def test_a_crash_of_blender_leaves_everything_as_it_was(
+    actor: RenderActor, store: Store, record: str, tmp_path: Path
+) -> None:
     before = _files(store)
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
     done = subprocess.run(
-        [sys.executable, "-c", _CRASH, str(store.root), json.dumps(_task(record))], capture_output=True, check=False
+        [sys.executable, "-c", _CRASH, str(store.root), json.dumps(_task(record))],
+        capture_output=True,
+        check=False,
+        env=os.environ | {"TMPDIR": str(temporary)},
     )
-    assert done.returncode < 0
+    assert done.returncode == -signal.SIGKILL
     assert _files(store) == before
+    assert list(temporary.iterdir()) == []
     assert actor.render(_task(record))["outcome"] == "succeeded"
 
 
