@@ -1,0 +1,211 @@
+"""The queue against a small model of it, in any order of events, with an audit of the ledger after each."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from stickslip_schemas.states import JobState
+from stickslip_schemas.worker_api import Lease
+from stickslip_services.audit import audit
+from stickslip_services.errors import ConflictError
+from stickslip_services.operations import Coordinator
+from stickslip_services.paging import PageRequest
+from stickslip_services.settings import Settings
+from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rejection, rods
+
+SPECS = (
+    rods(gamma=(1.0,)),
+    rods(gamma=(1.0, 2.0)),  # shares tasks with the first
+    rods(gamma=(2.0,), views=None),  # and with the second
+    rods(gamma=(2.0,), phi1=(1.0,)),  # all of it is rejected
+)
+
+Held = tuple[PretendWorker, Lease]
+
+
+def _judge(task: Any) -> Any:
+    return rejection() if task.stage == "simulate" and task.simulation.gamma == 2.0 else None
+
+
+class QueueMachine(RuleBasedStateMachine):
+    """The model: who holds what until when, what was reported, what is settled."""
+
+    jobs = Bundle("jobs")
+    leases = Bundle("leases")
+    reported = Bundle("reported")
+
+    @initialize()
+    def begin(self) -> None:
+        self.directory = tempfile.TemporaryDirectory()
+        self.clock = ManualClock()
+        self.settings = Settings(data=Path(self.directory.name), durable=False)
+        self.coordinator = Coordinator(self.settings, self.clock)
+        self.coordinator.start()
+        self.workers: dict[str, PretendWorker] = {}
+        self.holders: dict[str, tuple[str, int, float]] = {}  # task -> worker id, token, expiry
+        self.tokens: dict[str, int] = {}
+        self.settled: set[str] = set()
+        self.manifests: dict[tuple[str, int], str] = {}
+        self.ended: dict[str, JobState] = {}
+        self.register("a")
+
+    # --- what happens --------------------------------------------------------------------------------------------
+
+    @rule(target=jobs, which=st.integers(0, len(SPECS) - 1))
+    def submit(self, which: int) -> str:
+        job = self.coordinator.submit(parsed(SPECS[which]), None)
+        return job.id  # type: ignore[union-attr]
+
+    @rule(name=st.sampled_from(("a", "b")))
+    def register(self, name: str) -> None:
+        old = self.workers.get(name)
+        worker = PretendWorker(self.coordinator, self.coordinator.store, name=name, judge=_judge).register()
+        if old is not None:
+            self.holders = {task: held for task, held in self.holders.items() if held[0] != old.id}
+        self.workers[name] = worker
+
+    @rule(target=leases, name=st.sampled_from(("a", "b")), count=st.integers(1, 3))
+    def lease(self, name: str, count: int) -> Any:
+        worker = self.workers.get(name)
+        if worker is None:
+            return multiple()
+        granted = worker.lease(simulate=count, render=count, pack=count, publish=count)
+        self._forget_expired()
+        for lease in granted:
+            assert lease.task_id not in self.holders, "leased twice"
+            assert lease.task_id not in self.settled, "leased although it has a result"
+            assert lease.token == self.tokens.get(lease.task_id, 0) + 1
+            self.tokens[lease.task_id] = lease.token
+            self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
+        return multiple(*((worker, lease) for lease in granted))
+
+    @rule(held=leases, started=st.booleans())
+    def heartbeat(self, held: Held, started: bool) -> None:
+        worker, lease = held
+        dropped = worker.beat(lease, started=started)
+        if dropped:
+            # Either it was not the worker's, or no job needs it: then it is nobody's now.
+            if self._is_held(worker, lease):
+                del self.holders[lease.task_id]
+        else:
+            assert self._is_held(worker, lease) or self._expired_unnoticed(worker, lease)
+            self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
+
+    @rule(target=reported, held=consumes(leases), how=st.sampled_from(("well", "well", "well", "badly", "released")))
+    def report(self, held: Held, how: str) -> Held:
+        worker, lease = held
+        mine = self._is_held(worker, lease) or self._expired_unnoticed(worker, lease)
+        result = {"well": worker.result(lease.task), "badly": failure(), "released": None}[how]
+        verdict = worker.report((lease, result))
+        assert verdict == (["accepted"] if mine else ["stale"])
+        if mine:
+            del self.holders[lease.task_id]
+            if how == "well":
+                self.settled.add(lease.task_id)
+        return held
+
+    @rule(held=reported)
+    def report_again(self, held: Held) -> None:
+        worker, lease = held
+        before = dict(self.holders)
+        assert worker.report((lease, failure())) in (["duplicate"], ["stale"])
+        assert self.holders == before
+
+    @rule(job=jobs)
+    def cancel(self, job: str) -> None:
+        try:
+            shown = self.coordinator.cancel(job)
+        except ConflictError:
+            assert self.ended[job] is not JobState.cancelled
+        else:
+            assert shown.state in (JobState.cancelling, JobState.cancelled)
+
+    @rule(seconds=st.sampled_from((1.0, 5.0, 29.0, 31.0)))
+    def wait(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+
+    @rule()
+    def sweep(self) -> None:
+        self.coordinator.sweep()
+        self._forget_expired()
+
+    @rule()
+    def restart(self) -> None:
+        self.coordinator.close()
+        self.coordinator = Coordinator(self.settings, self.clock)
+        self.coordinator.start()
+        for worker in self.workers.values():
+            worker.api = self.coordinator
+        expiry = self.clock() + self.settings.lease_seconds
+        self.holders = {task: (worker, token, expiry) for task, (worker, token, _) in self.holders.items()}
+
+    # --- what must hold ------------------------------------------------------------------------------------------
+
+    @invariant()
+    def ledger_is_right(self) -> None:
+        with self.coordinator.database.read() as connection:
+            assert audit(connection) == []
+
+    @invariant()
+    def what_has_ended_stays_so(self) -> None:
+        for job in self.coordinator.list_jobs(PageRequest(1000, None)).items:
+            if job.state.is_terminal:
+                assert self.ended.setdefault(job.id, job.state) is job.state
+            else:
+                assert job.id not in self.ended
+        for dataset in self.coordinator.list_datasets(PageRequest(1000, None)).items:
+            for version in dataset.versions:
+                key = (dataset.id, version.version)
+                assert self.manifests.setdefault(key, version.manifest) == version.manifest
+
+    def teardown(self) -> None:
+        if not hasattr(self, "coordinator"):
+            return
+        # However it went: a worker that does its work brings every job to its end.
+        worker = PretendWorker(self.coordinator, self.coordinator.store, name="last", judge=_judge).register()
+        for _ in range(10):
+            self.clock.advance(60)
+            worker.work()
+        for job in self.coordinator.list_jobs(PageRequest(1000, None)).items:
+            assert job.state.is_terminal, f"{job.id} is {job.state}"
+        self.ledger_is_right()
+        self.coordinator.close()
+        self.directory.cleanup()
+
+    def _is_held(self, worker: PretendWorker, lease: Lease) -> bool:
+        held = self.holders.get(lease.task_id)
+        return held is not None and held[:2] == (worker.id, lease.token) and held[2] > self.clock()
+
+    def _expired_unnoticed(self, worker: PretendWorker, lease: Lease) -> bool:
+        """Tell whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""
+        held = self.holders.get(lease.task_id)
+        return held is not None and held[:2] == (worker.id, lease.token)
+
+    def _forget_expired(self) -> None:
+        self.holders = {task: held for task, held in self.holders.items() if held[2] > self.clock()}
+
+
+@contextmanager
+def _no_fsync() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda _descriptor: None)
+        yield
+
+
+def test_the_queue_in_any_order() -> None:
+    from hypothesis.stateful import run_state_machine_as_test
+
+    profile = settings(
+        max_examples=15,
+        stateful_step_count=30,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
+    with _no_fsync():
+        run_state_machine_as_test(QueueMachine, settings=profile)
