@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 OBJECT_STORE_BYTES = 128 * 2**20
 """Tasks and results are small: bulk data goes through the store."""
 
-OWNER = "STICKSLIP_RAYOWNER"
+OWNER = "STICKSLIP_RAY_OWNER"
 """Environment variable of all processes of a cluster of ours: its directory and the dispatcher's pid."""
 
 

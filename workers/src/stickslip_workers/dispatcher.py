@@ -34,6 +34,14 @@ LONGEST_WAIT = 1.0
 
 REPORTS_A_REQUEST = 512
 
+REPORT_SECONDS = 0.5
+"""How long a result waits for others to be reported with, while there is other work to go on with."""
+
+AHEAD_SECONDS = 2.0
+MOST_AHEAD = 16
+"""Tasks that wait here, for each slot: enough for so long, but one at least and not more than so many. A request costs
+the coordinator about 10 ms whatever it asks for."""
+
 LARGEST_BATCH = max(kind.batch for kind in KINDS.values())
 """How many simulations to ask for at once: one call takes them all."""
 
@@ -92,6 +100,8 @@ class Dispatcher:
         self._queues: dict[Stage, deque[Lease]] = {stage: deque() for stage in _PRECEDENCE}
         self._running: dict[Any, Assignment] = {}
         self._reports: deque[Report] = deque()
+        self._reports_due = 0.0
+        self._task_seconds: dict[Stage, float] = {}
         self._next_lease = 0.0
         self._stopping = False
 
@@ -124,7 +134,7 @@ class Dispatcher:
         try:
             if self._session is None or (self._heartbeat is not None and self._heartbeat.session_lost.is_set()):
                 self._open_session()
-            if self._report():
+            if time.monotonic() >= self._report_time() and self._report():
                 self._next_lease = 0.0  # what has ended may have made new tasks possible
             if self._lease():
                 self._start_work()
@@ -141,13 +151,18 @@ class Dispatcher:
 
     def _wait_seconds(self) -> float:
         """Return how long there is nothing to do unless work ends or a process starts."""
-        if self._session is None or self._reports:
-            due = self._backoff.next_try
-        elif self._wanted():
-            due = max(self._next_lease, self._backoff.next_try)
-        else:
-            return LONGEST_WAIT
-        return min(max(due - time.monotonic(), 0.0), LONGEST_WAIT)
+        due = [time.monotonic() + LONGEST_WAIT]
+        if self._session is None:
+            due.append(self._backoff.next_try)
+        if self._reports:
+            due.append(max(self._report_time(), self._backoff.next_try))
+        if self._wanted():
+            due.append(max(self._next_lease, self._backoff.next_try))
+        return max(min(due) - time.monotonic(), 0.0)
+
+    def _report_time(self) -> float:
+        """Return when to report: at once where the coordinator's next tasks may hang on it."""
+        return self._reports_due if any(self._queues.values()) else 0.0
 
     def _collect(self, timeout: float) -> None:
         """Wait until something ends, and take in what has."""
@@ -183,6 +198,8 @@ class Dispatcher:
         else:
             pool.give_back(assignment.process, resident)
             results = _read_results(answer, len(assignment.leases))
+        seconds = time.monotonic() - assignment.started_at
+        self._task_seconds[assignment.stage] = 0.8 * self._task_seconds.get(assignment.stage, seconds) + 0.2 * seconds
         self._settle(assignment, results)
 
     def _settle(self, assignment: Assignment, results: list[TaskResult]) -> None:
@@ -190,6 +207,8 @@ class Dispatcher:
             if result.outcome == "failed":
                 log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
             if self._book.holds(lease):
+                if not self._reports:
+                    self._reports_due = time.monotonic() + REPORT_SECONDS
                 self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
 
     def _enforce_limits(self) -> None:
@@ -309,15 +328,22 @@ class Dispatcher:
         return bool(batch.leases)
 
     def _wanted(self) -> dict[Stage, int]:
-        """Return how many tasks to ask for: what runs and as much again, so that a kill gives little back."""
-        held = len(self._running) + sum(_batch_count(stage, queue) for stage, queue in self._queues.items())
-        free = 2 * self._slots - held
-        if free <= 0:
-            return {}
-        wanted = {Stage.publish: 1, Stage.pack: free, Stage.render: free}
-        if not self._queues[Stage.simulate]:
+        """Return how many tasks to ask for: little more than what can run, so that a kill gives little back."""
+        queued = sum(_batch_count(stage, queue) for stage, queue in self._queues.items())
+        idle = self._slots - len(self._running) - queued
+        wanted = {}
+        for stage in (Stage.publish, Stage.pack, Stage.render):
+            ahead = self._ahead(stage)
+            if idle > 0 or queued <= ahead // 2:  # not for one at a time
+                wanted[stage] = ahead + idle
+        if wanted and not self._queues[Stage.simulate]:
             wanted[Stage.simulate] = LARGEST_BATCH
-        return wanted
+        return {stage: count for stage, count in wanted.items() if count > 0}
+
+    def _ahead(self, stage: Stage) -> int:
+        """Return how many tasks of a stage to keep waiting."""
+        each = AHEAD_SECONDS / max(self._task_seconds.get(stage, AHEAD_SECONDS), 1e-3)
+        return self._slots * round(min(max(each, 1), MOST_AHEAD))
 
     # --- the end --------------------------------------------------------------------------------------------
 
