@@ -99,6 +99,20 @@ def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path
         train_curvature(replace(config, out=tmp_path / "nothing"), resume=True)
 
 
+def test_the_model_is_the_average_of_the_weights_or_the_last_ones(config, tmp_path):
+    def net_of(file):
+        return torch.load(file, weights_only=True)["net"]["head.3.weight"]
+
+    config = replace(config, epochs=1)
+    train_curvature(config)
+    last = replace(config, out=tmp_path / "last", averaging=0.0)
+    train_curvature(last)
+    weights = [net_of(each.out / "checkpoint.pt") for each in (config, last)]
+    assert torch.equal(*weights)  # averaging changes nothing about the training itself
+    assert torch.equal(net_of(last.out / "model.pt"), weights[1])
+    assert not torch.equal(net_of(config.out / "model.pt"), weights[0])
+
+
 def test_a_time_budget_is_kept_also_within_an_epoch(config, monkeypatch):
     clock = iter(np.arange(0.0, 1e6, 10.0))  # ten seconds pass whenever someone looks
     monkeypatch.setattr(module.time, "perf_counter", lambda: float(next(clock)))
@@ -152,6 +166,7 @@ def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
         ({"batch_size": -1}, "batch_size must be more than 0"),
         ({"noise": 1.0}, "noise must be a share of L"),
         ({"decay": 1.0}, "decay must be between 0 and 1"),
+        ({"averaging": 1.0}, "averaging must be from 0"),
         ({"seed": -1}, "seed must be from 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be more than 0 and finite, and is nan"),
     ],
