@@ -131,3 +131,22 @@ def test_a_scratch_folder_makes_the_same_bytes_and_is_left_empty(
         assert np.array_equal(renderer.render(curl, rig, color=ORANGE), views)
         assert len(list(tmp_path.rglob("*.bmp"))) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_idle_renderer_takes_no_processor_time() -> None:
+    """Blender's idle worker threads would spin; a process that waits for its next task must leave the core alone."""
+    script = """
+import time
+import numpy as np
+from stickslip_blender.color import silicone_color
+from stickslip_blender.rods import RodRenderer
+from stickslip_schemas.cameras import load_rig
+line = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 150)
+with RodRenderer(quality="draft") as renderer:
+    renderer.render(line, load_rig("rod-4"), color=silicone_color(0))
+    before = time.process_time()
+    time.sleep(1.0)
+    print(time.process_time() - before)
+"""
+    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert float(answer[-1]) < 0.05
