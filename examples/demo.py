@@ -1,0 +1,93 @@
+"""The main job, from POST /v1/jobs to a training batch, with a service of its own: `make demo`.
+
+Everything is left in demo-out/: the dataset, a contact sheet, the trained network, and the service's data.
+"""
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from stickslip_services.client import Client
+from stickslip_training.datasets import RodDataset
+
+BIN = Path(sys.executable).parent
+SPEC = Path(__file__).with_name("demo-rods.yaml")
+OUT = Path("demo-out")
+START_SECONDS = 60
+
+console = Console()
+
+
+def main() -> None:
+    """Run the demo; raise where anything is not as it should be."""
+    started = time.monotonic()
+    shutil.rmtree(OUT, ignore_errors=True)
+    OUT.mkdir()
+    with service(OUT / "service") as url:
+        run("stickslip", "submit", SPEC, "--watch", "--url", url)
+        with Client(url) as client:
+            (dataset,) = client.datasets()
+            console.rule("the same spec again: nothing to simulate, nothing to render")
+        run("stickslip", "submit", SPEC, "--watch", "--url", url)
+        run("stickslip", "pull", dataset.id, OUT / "dataset", "--url", url)
+        run("stickslip", "verify", OUT / "dataset")
+    look_at(OUT / "dataset")
+    run("stickslip-train", "curvature", OUT / "dataset", "--out", OUT / "training", "--minutes", "1")
+    console.rule(f"done in {time.monotonic() - started:.0f} s")
+    console.print(f"contact sheet  {OUT / 'contact-sheet.png'}")
+    console.print(f"training       {OUT / 'training' / 'curvature.png'}")
+    console.print(f"dataset        {OUT / 'dataset'}")
+
+
+@contextmanager
+def service(data: Path) -> Iterator[str]:
+    """Run `stickslip up` on a free port and yield its URL; stop it and all it started at the end."""
+    console.rule("stickslip up")
+    process = subprocess.Popen([BIN / "stickslip", "up", "--data", data, "--port", "0"])
+    try:
+        yield wait_for_url(data / "url", process)
+    finally:
+        process.terminate()
+        process.wait(timeout=60)
+
+
+def wait_for_url(file: Path, process: subprocess.Popen[bytes]) -> str:
+    """Return the URL that the service writes when it answers."""
+    deadline = time.monotonic() + START_SECONDS
+    while time.monotonic() < deadline and process.poll() is None:
+        if file.exists() and (url := file.read_text().strip()):
+            return url
+        time.sleep(0.1)
+    raise SystemExit(f"the service did not start within {START_SECONDS} s; its logs are in {file.parent / 'logs'}")
+
+
+def run(command: str, *arguments: str | Path) -> None:
+    """Run one of the project's commands as a user would, in sight."""
+    console.rule(" ".join([command, *map(str, arguments)]))
+    subprocess.run([BIN / command, *arguments], check=True)
+
+
+def look_at(directory: Path) -> None:
+    """Draw batches as a training loop does, and lay the pictures out on a sheet, one row a rod."""
+    console.rule("batches")
+    rods = RodDataset(directory, views=True)
+    rows = []
+    for batch in rods.loader(16):
+        console.print({name: tuple(tensor.shape) for name, tensor in batch.items()})
+        rows += [np.concatenate(list(views), axis=1) for views in batch["views"].numpy()]
+    half = -(-len(rows) // 2)
+    rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
+    sheet = np.concatenate([np.concatenate(rows[:half]), np.concatenate(rows[half:])], axis=1)
+    image = Image.fromarray(sheet)
+    image.resize((image.width // 2, image.height // 2), Image.Resampling.LANCZOS).save(OUT / "contact-sheet.png")
+
+
+if __name__ == "__main__":
+    main()
