@@ -70,8 +70,9 @@ class QueueMachine(RuleBasedStateMachine):
             self.holders = {task: held for task, held in self.holders.items() if held[0] != old.id}
         self.workers[name] = worker
 
-    @rule(target=leases, name=st.sampled_from(("a", "b")), count=st.integers(1, 3))
-    def lease(self, name: str, count: int) -> Any:
+    @rule(target=leases, name=st.sampled_from(("a", "b")), count=st.integers(1, 3), pause=st.sampled_from((0.0, 31.0)))
+    def lease(self, name: str, count: int, pause: float) -> Any:
+        self.clock.advance(pause)
         worker = self.workers.get(name)
         if worker is None:
             return multiple()

@@ -37,10 +37,21 @@ def describe(app: FastAPI) -> dict[str, Any]:
         components = document.setdefault("components", {}).setdefault("schemas", {})
         for name, schema in body_components(_DOCUMENTS).items():
             components.setdefault(name, schema)
+        _drop_foreign_errors(document)
         for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
             components.pop(unused, None)
         app.openapi_schema = document
     return app.openapi_schema
+
+
+def _drop_foreign_errors(document: dict[str, Any]) -> None:
+    """Drop what FastAPI says of invalid parameters where the route does not: there they cannot be invalid."""
+    foreign = {"$ref": "#/components/schemas/HTTPValidationError"}
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            content = operation["responses"].get("422", {}).get("content", {})
+            if content.get("application/json", {}).get("schema") == foreign:
+                del operation["responses"]["422"]
 
 
 def document_text() -> str:

@@ -46,7 +46,7 @@ def _read(coordinator: Coordinator, job: int, after: int, *, with_progress: bool
 
 
 async def _events(coordinator: Coordinator, job: int, cursor: int) -> AsyncIterator[bytes]:
-    yield f"retry: {RECONNECT_MILLISECONDS}\n\n".encode()
+    opening = f"retry: {RECONNECT_MILLISECONDS}\n".encode()  # goes with the first event
     told = ""
     told_at = -PROGRESS_SECONDS
     spoken_at = time.monotonic()
@@ -63,9 +63,12 @@ async def _events(coordinator: Coordinator, job: int, cursor: int) -> AsyncItera
         if news.progress is not None and news.progress != told and (last or not news.ended):
             told, told_at = news.progress, now
             messages.append(_message(EventName.job_progress, news.progress, cursor - 1 if last else cursor))
-        if not messages and not last and now - spoken_at >= KEEP_ALIVE_SECONDS:
-            messages.append(b": still here\n\n")
         if messages or last:
+            messages.insert(0, opening)
+            opening = b""
+        elif now - spoken_at >= KEEP_ALIVE_SECONDS:
+            messages.append(b": still here\n\n")
+        if messages:
             spoken_at = now
             yield b"".join([*messages, *last])
         if news.ended:

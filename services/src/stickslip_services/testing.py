@@ -2,14 +2,18 @@
 
 import subprocess
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
+import uvicorn
+from fastapi import FastAPI
 from pydantic import BaseModel
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import job_spec_adapter
@@ -40,6 +44,8 @@ from stickslip_schemas.worker_api import (
     WorkerRegistration,
     WorkerSession,
 )
+
+from stickslip_services.coordinator import listen
 
 A = TypeVar("A", bound=BaseModel)
 
@@ -256,6 +262,23 @@ class HttpApi:
         response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
         response.raise_for_status()
         return answer.model_validate_json(response.content)
+
+
+@contextmanager
+def serving(app: FastAPI) -> Iterator[str]:
+    """Serve an application from a thread of this process; yield its URL."""
+    listener = listen("127.0.0.1", 0)
+    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        wait_until(lambda: server.started or not thread.is_alive())
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
 
 
 def start_server(data: Path, port: int = 0) -> RunningServer:

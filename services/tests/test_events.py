@@ -1,0 +1,117 @@
+"""Event streams: complete, resumable, ending."""
+
+import json
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from httpx_sse import ServerSentEvent, connect_sse
+from stickslip_services import sse
+from stickslip_services.app import make_app
+from stickslip_services.settings import Settings
+from stickslip_services.testing import ManualClock, PretendWorker, failure, rods, serving
+
+
+@pytest.fixture
+def app(settings: Settings, clock: ManualClock) -> FastAPI:
+    return make_app(settings, clock=clock)
+
+
+@pytest.fixture
+def client(app: FastAPI) -> Iterator[httpx.Client]:
+    with serving(app) as url, httpx.Client(base_url=url, timeout=20) as client:
+        yield client
+
+
+@pytest.fixture
+def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
+    return PretendWorker(app.state.coordinator, app.state.coordinator.store).register()
+
+
+def follow(client: httpx.Client, job: str, last_id: str | None = None) -> Iterator[ServerSentEvent]:
+    headers = {} if last_id is None else {"Last-Event-ID": last_id}
+    with connect_sse(client, "GET", f"/v1/jobs/{job}/events", headers=headers) as source:
+        assert source.response.status_code == 200
+        assert source.response.headers["content-type"].startswith("text/event-stream")
+        yield from source.iter_sse()
+
+
+def submit(client: httpx.Client, **spec: Any) -> str:
+    response = client.post("/v1/jobs", json=rods(**spec))
+    return str(response.json()["id"])
+
+
+def words(events: list[ServerSentEvent]) -> list[str]:
+    return [json.loads(event.data)["state"] for event in events if event.event == "job.state"]
+
+
+def test_a_finished_job_is_told_from_the_beginning(client: httpx.Client, worker: PretendWorker) -> None:
+    job = submit(client)
+    worker.work()
+    events = list(follow(client, job))
+    assert words(events) == ["queued", "running", "succeeded"]
+    assert [event.event for event in events[-3:]] == ["dataset.published", "job.progress", "job.state"]
+    ids = [int(event.id) for event in events if event.event != "job.progress"]
+    assert ids == sorted(set(ids))
+    progress = json.loads(events[-2].data)["progress"]
+    assert (progress["done"], progress["total"]) == (11, 11)
+
+
+def test_a_stream_goes_on_after_the_last_event_that_was_seen(
+    client: httpx.Client, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job = submit(client)
+    worker.report((worker.lease(simulate=1)[0], failure()))
+    clock.advance(5)
+    worker.work()
+    everything = [event for event in follow(client, job) if event.event != "job.progress"]
+    for position, event in enumerate(everything):
+        rest = [item for item in follow(client, job, event.id) if item.event != "job.progress"]
+        assert [item.id for item in rest] == [item.id for item in everything[position + 1 :]]
+    problem = client.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": "x"})
+    assert problem.status_code == 422
+    assert client.get("/v1/jobs/job-0/events").status_code == 404
+
+
+def test_news_arrive_while_they_happen(client: httpx.Client, worker: PretendWorker) -> None:
+    job = submit(client)
+    seen: list[ServerSentEvent] = []
+    thread = threading.Thread(target=worker.work)
+    for event in follow(client, job):
+        seen.append(event)
+        if event.event == "job.progress" and thread.ident is None:
+            thread.start()
+    thread.join()
+    assert words(seen) == ["queued", "running", "succeeded"]
+
+
+def test_a_quiet_stream_says_that_it_lives_and_holds_no_connection(
+    app: FastAPI, client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sse, "KEEP_ALIVE_SECONDS", 0.3)
+    job = submit(client)
+    with client.stream("GET", f"/v1/jobs/{job}/events") as response:
+        text = ""
+        for piece in response.iter_text():
+            text += piece
+            if text.count(": still here\n\n") == 2:
+                break
+        pool = app.state.coordinator.database._engine.pool
+        assert pool.checkedout() == 0
+    assert text.startswith("retry: 1000\nid: 1\n")
+    assert text.count("event: job.progress") == 1  # nothing has changed
+
+
+def test_many_watchers_hear_the_end(client: httpx.Client, worker: PretendWorker) -> None:
+    job = submit(client)
+    ends: list[list[str]] = []
+    threads = [threading.Thread(target=lambda: ends.append(words(list(follow(client, job))))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    worker.work()
+    for thread in threads:
+        thread.join(20)
+    assert [end[-1] for end in ends] == ["succeeded"] * 8
