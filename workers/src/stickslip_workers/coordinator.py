@@ -43,7 +43,9 @@ class Coordinator:
     """A client, for any number of threads."""
 
     def __init__(self, url: str) -> None:
-        self._http = httpx.Client(base_url=url.rstrip("/"), timeout=httpx.Timeout(30, connect=5))
+        # A proxy of the environment is for the world outside, not for a service beside this one.
+        timeout = httpx.Timeout(30, connect=5)
+        self._http = httpx.Client(base_url=url.rstrip("/"), timeout=timeout, trust_env=False)
 
     def register(self, registration: WorkerRegistration) -> WorkerSession:
         """Present the dispatcher."""
