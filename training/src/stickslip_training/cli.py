@@ -73,7 +73,7 @@ def curvature(
     epochs: Annotated[int | None, typer.Option(help="passes over the training rods, instead of a time")] = None,
     noise: Annotated[float, typer.Option(help="noise on every coordinate, standard deviation over L")] = 0.005,
     seed: Annotated[int, typer.Option()] = 0,
-    batch_size: Annotated[int, typer.Option()] = 64,
+    batch_size: Annotated[int, typer.Option()] = 16,
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
