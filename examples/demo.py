@@ -21,6 +21,7 @@ BIN = Path(sys.executable).parent
 SPEC = Path(__file__).with_name("demo-rods.yaml")
 OUT = Path("demo-out")
 START_SECONDS = 60
+SHEET_COLUMNS = 4
 
 console = Console()
 
@@ -75,17 +76,16 @@ def run(command: str, *arguments: str | Path) -> None:
 
 
 def look_at(directory: Path) -> None:
-    """Draw batches as a training loop does, and lay the pictures out on a sheet, one row a rod."""
+    """Draw batches as a training loop does, and lay the pictures out on a sheet: four views a rod."""
     console.rule("batches")
     rods = RodDataset(directory, views=True)
     rows = []
     for batch in rods.loader(16):
-        console.print({name: tuple(tensor.shape) for name, tensor in batch.items()})
         rows += [np.concatenate(list(views), axis=1) for views in batch["views"].numpy()]
-    half = -(-len(rows) // 2)
-    rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
-    sheet = np.concatenate([np.concatenate(rows[:half]), np.concatenate(rows[half:])], axis=1)
-    image = Image.fromarray(sheet)
+    console.print(f"{len(rods)} rods in batches of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }")
+    rows += [np.zeros_like(rows[0])] * (-len(rows) % SHEET_COLUMNS)
+    lines = [np.concatenate(rows[i : i + SHEET_COLUMNS], axis=1) for i in range(0, len(rows), SHEET_COLUMNS)]
+    image = Image.fromarray(np.concatenate(lines))
     image.resize((image.width // 2, image.height // 2), Image.Resampling.LANCZOS).save(OUT / "contact-sheet.png")
 
 
