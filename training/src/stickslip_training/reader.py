@@ -76,11 +76,11 @@ class DatasetReader:
         self._chunks: OrderedDict[tuple[str, int], Array] = OrderedDict()
         self._chunk_bytes = 0
         self._cache_bytes = cache_bytes
+        if verify:
+            self.verify()
         self._check_metadata()
         self._check_slots()
         self._check_manifested()
-        if verify:
-            self.verify()
 
     @property
     def spec(self) -> RodHangSpec | ClothDragSpec:
