@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 from rich.table import Table
+from stickslip_schemas.samples import SPLITS
 
 from stickslip_training.errors import DatasetError
 from stickslip_training.reader import DatasetReader
@@ -40,7 +41,7 @@ def info(
         facts.add_row("dataset", f"{manifest.dataset}, version {manifest.version}, {reader.kind}")
         facts.add_row("spec", f"{manifest.spec_digest}")
         facts.add_row("certificate", manifest.certificate or "none: the physics of this build is not vouched for")
-        counts = ", ".join(f"{count} {split}" for split, count in manifest.split_counts.items())
+        counts = ", ".join(f"{manifest.split_counts.get(split, 0)} {split}" for split in SPLITS)
         facts.add_row("samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {counts}")
         reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
         told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
