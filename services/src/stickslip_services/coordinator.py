@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from stickslip_services.app import make_app
 from stickslip_services.logs import configure_logging
 from stickslip_services.settings import DEFAULT_PORT, Settings
+from stickslip_services.sockets import listen
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +47,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")
+    parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
+    descriptor = chosen.pop("fd", None)
     try:
         settings = Settings(**chosen)
     except ValidationError as error:
@@ -54,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     configure_logging()
     try:
-        listener = listen(settings.host, settings.port)
+        listener = listen(settings.host, settings.port) if descriptor is None else socket.socket(fileno=descriptor)
     except OSError as error:
         sys.stderr.write(f"error: cannot listen on {settings.host}:{settings.port}: {error.strerror}\n")
         return 2
@@ -65,19 +68,6 @@ def main(arguments: list[str] | None = None) -> int:
     server = _Server(config, settings.url)
     server.run(sockets=[listener])
     return 0 if server.started else 1
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Bind a port, so that it is ours from here on."""
-    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    listener = socket.socket(family, kind, protocol)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind(address)
-    except OSError:
-        listener.close()
-        raise
-    return listener
 
 
 if __name__ == "__main__":

@@ -26,7 +26,6 @@ from stickslip_services.client import Client, ClientError, UnreachableError, rai
 
 CONNECTIONS = 4
 TRIES = 5
-BLOCK = 1 << 20
 PART = ".part"
 
 
@@ -201,7 +200,7 @@ def _fetch(
             raise_for_problem(response)
         mode = "ab" if response.status_code == 206 else "wb"
         with part.open(mode) as target:
-            for block in response.iter_bytes(BLOCK):
+            for block in response.iter_raw():  # as it comes: what has arrived is kept if the rest does not
                 target.write(block)
                 on_bytes(len(block))
                 if stop.is_set():

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -25,6 +25,7 @@ import httpx
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.settings import Settings, is_loopback
+from stickslip_services.sockets import listen
 
 START_SECONDS = 60.0
 """How long the coordinator may take until it answers [s]; a migration may be slow."""
@@ -88,6 +89,7 @@ class _Child:
             return
         self._kill_group()  # what it has left behind would be in the way of its successor
         status = self.process.wait()
+        self.process = None
         lived = time.monotonic() - self.started_at
         self.failed_starts = self.failed_starts + 1 if lived < SOON_SECONDS else 0
         how = f"was killed by signal {-status}" if status < 0 else f"exited with status {status}"
@@ -98,7 +100,6 @@ class _Child:
             )
         wait = 0.0 if self.failed_starts == 0 else 0.25 * 2**self.failed_starts
         say(f"the {self.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
-        self.process = None
         self.start_again_at = time.monotonic() + wait
 
     def stop(self, is_urgent: Callable[[], bool]) -> None:
@@ -142,9 +143,19 @@ def run(plan: Plan, *, on_ready: Callable[[str], None], say: Callable[[str], Non
         )
     data = plan.data.absolute()
     (data / "logs").mkdir(parents=True, exist_ok=True)
-    with _locked(data / "lock") as lock, _stop_signals() as signals:
-        settings = Settings(data=data, host=plan.host, port=plan.port or _free_port(plan.host))
-        coordinator = _Child("coordinator", _coordinator_command(settings), data / "logs" / "coordinator.log", (lock,))
+    with ExitStack() as stack:
+        lock = stack.enter_context(_locked(data / "lock"))
+        signals = stack.enter_context(_stop_signals())
+        # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
+        listener = _listen(plan.host, plan.port)
+        stack.callback(listener.close)
+        settings = Settings(data=data, host=plan.host, port=listener.getsockname()[1])
+        coordinator = _Child(
+            "coordinator",
+            _coordinator_command(settings, listener.fileno()),
+            data / "logs" / "coordinator.log",
+            (lock, listener.fileno()),
+        )
         dispatcher = _Child("dispatcher", _dispatcher_command(plan, settings), data / "logs" / "dispatcher.log")
         children = [coordinator, dispatcher]
         try:
@@ -171,9 +182,9 @@ def print_line(stream: IO[str], message: str) -> None:
     stream.flush()
 
 
-def _coordinator_command(settings: Settings) -> list[str]:
+def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     module = "stickslip_services.coordinator"
-    place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port)]
+    place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
     return [sys.executable, "-m", module, *place]
 
 
@@ -254,11 +265,16 @@ def _stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _free_port(host: str) -> int:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        listener = listen(host, port)
+    except OSError as error:
+        raise SupervisorError(
+            f"cannot listen on {host}:{port}: {error.strerror}. `--port 0` takes any free port."
+        ) from error
+    listener.listen(512)
+    listener.set_inheritable(True)
+    return listener
 
 
 def _die_with_parent() -> None:

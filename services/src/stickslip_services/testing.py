@@ -45,7 +45,7 @@ from stickslip_schemas.worker_api import (
     WorkerSession,
 )
 
-from stickslip_services.coordinator import listen
+from stickslip_services.sockets import listen
 
 A = TypeVar("A", bound=BaseModel)
 

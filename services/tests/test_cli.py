@@ -1,0 +1,142 @@
+"""The command line against a real coordinator."""
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from stickslip_services.cli import app
+from stickslip_services.testing import PretendWorker, RunningServer, rejection, rods, start_server, wait_until
+from typer.testing import CliRunner, Result
+
+
+@pytest.fixture
+def cli(shared_server: RunningServer) -> Any:
+    runner = CliRunner()
+
+    def run(*arguments: object) -> Result:
+        words = [str(argument) for argument in arguments]
+        return runner.invoke(app, words, env={"STICKSLIP_URL": shared_server.url, "COLUMNS": "200"})
+
+    return run
+
+
+def write(path: Path, spec: Any) -> Path:
+    path.write_text(yaml.safe_dump(spec) if path.suffix == ".yaml" else json.dumps(spec))
+    return path
+
+
+def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningServer, tmp_path: Path) -> None:
+    spec = write(tmp_path / "spec.yaml", rods(name="cli", gamma=(1.0, 2.0)))
+    worker = shared_server.worker()
+    rejected: list[str] = []
+
+    def reject_the_first_render(task: Any) -> Any:
+        if task.stage != "render" or rejected:
+            return None
+        rejected.append(task.record.digest)
+        return rejection("it [fell] off")
+
+    worker.judge = reject_the_first_render
+    counts = json.loads(cli("validate", spec, "--json").stdout)
+    assert (counts["sample_count"], counts["cached_count"]) == (4, 0)
+    assert "4" in cli("validate", spec).stdout
+    done = threading.Thread(target=wait_until, args=(lambda: worker.work() > 0,))
+    done.start()
+    submitted = cli("submit", spec, "--watch")
+    done.join()
+    assert submitted.exit_code == 0, submitted.output
+    job = submitted.stdout.split()[0]
+    assert "published ds-" in submitted.stdout
+    assert "succeeded_with_rejects" in submitted.stdout
+    assert cli("watch", job).exit_code == 0
+    shown = cli("show", job).stdout
+    assert "3 of 4 samples (75.0%)" in shown
+    assert "it [fell] off" in shown
+    assert json.loads(cli("show", job, "--json").stdout)["state"] == "succeeded_with_rejects"
+    assert job in cli("jobs").stdout
+    assert [item["id"] for item in json.loads(cli("jobs", "--json").stdout)] == [job]
+    (dataset,) = json.loads(cli("datasets", "--json").stdout)
+    assert f"{dataset['id']}:v1" in cli("datasets").stdout
+    pulled = cli("pull", dataset["id"], tmp_path / "d")
+    assert "5 files loaded" in pulled.stdout, pulled.output
+    assert "0 files loaded" in cli("pull", f"{dataset['id']}:v1", tmp_path / "d").stdout
+    assert cli("verify", tmp_path / "d").exit_code == 0
+    (tmp_path / "d" / "views/c/0/0").write_bytes(b"")
+    wrong = cli("verify", tmp_path / "d")
+    assert wrong.exit_code == 1
+    assert "views/c/0/0" in wrong.stdout
+    assert cli("pull", f"{dataset['id']}:v7", tmp_path / "e").exit_code == 1
+    assert cli("pull", f"{dataset['id']}:vx", tmp_path / "e").exit_code == 1
+    assert "has ended" in cli("cancel", job).stderr
+
+
+def test_a_cancelled_job_is_no_success(cli: Any, tmp_path: Path, shared_server: RunningServer) -> None:
+    job = cli("submit", write(tmp_path / "spec.json", rods(gamma=(31.0,)))).stdout.strip()
+    assert "cancelled" in cli("cancel", job).stdout
+    watched = cli("watch", job)
+    assert watched.exit_code == 1
+    assert "is cancelled" in watched.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "kind: rod_hang\naxes: {gamma: -1e0, phi0: 0.0, phi1: 0.0}",
+            ["axes.gamma", "greater than or equal to 0", "-1.0"],
+        ),
+        ("kind: rod_hang\naxes: {gamma: .nan, phi0: 0.0, phi1: 0.0}", ["axes.gamma must be a finite number", "nan"]),
+        ("kind: rod_hang\nkind: rod_hang", ["the key 'kind' is there twice"]),
+        ("kind: [", ["is not YAML"]),
+        ("- 1", ["must hold a mapping"]),
+        ("kind: rod_hang\naxes: 2020-01-01", ["axes must be a number"]),
+        ("1: 2", ["the key 1 is no word"]),
+    ],
+)
+def test_a_bad_file_is_refused_in_words(cli: Any, tmp_path: Path, text: str, words: list[str]) -> None:
+    (tmp_path / "spec.yaml").write_text(text)
+    result = cli("submit", tmp_path / "spec.yaml")
+    assert result.exit_code == 1
+    for word in words:
+        assert word in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_other_errors_are_words_too(cli: Any, tmp_path: Path) -> None:
+    assert "there is no file" in cli("submit", tmp_path / "none.yaml").stderr
+    assert "there is no job" in cli("show", "job-0").stderr
+    assert "job-0" in cli("watch", "job-0").stderr
+    assert "no dataset" in cli("verify", tmp_path).stdout
+    assert cli("--version").stdout.startswith("stickslip 0.")
+    up = cli("up", "--host", "0.0.0.0", "--data", tmp_path / "data")
+    assert up.exit_code == 1
+    assert "loopback" in up.stderr
+
+
+def test_watching_survives_a_restart_of_the_coordinator(tmp_path: Path) -> None:
+    server = start_server(tmp_path / "data")
+    port = int(server.url.rsplit(":", 1)[1])
+    worker: PretendWorker = server.worker()
+    spec = write(tmp_path / "spec.yaml", rods())
+    results: list[Result] = []
+
+    def watch() -> None:
+        results.append(CliRunner().invoke(app, ["submit", str(spec), "--watch", "--url", server.url]))
+
+    watching = threading.Thread(target=watch)
+    watching.start()
+    wait_until(lambda: bool(worker.lease(simulate=1)))
+    server.process.kill()
+    server.process.wait()
+    server.stop()
+    again = start_server(tmp_path / "data", port)
+    wait_until(lambda: worker.work() > 0)  # the one that was leased is given back: its holder is alive
+    worker.register()
+    wait_until(lambda: worker.work() > 0 or bool(results))
+    watching.join(30)
+    again.stop()
+    assert results[0].exit_code == 0, results[0].output
+    assert results[0].stdout.count("is succeeded") == 1

@@ -1,0 +1,226 @@
+"""Pulling and verifying: every byte checked, interruptions survived, nothing written outside."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.manifest import Manifest
+from stickslip_services.app import make_app
+from stickslip_services.client import Client, ProblemError, UnexpectedError, UnreachableError
+from stickslip_services.pull import DamagedError, UnsafePathError, pull, safe_path, verify
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, rods, serving
+
+
+@pytest.fixture(scope="module")
+def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """URL and dataset of a coordinator that has published something."""
+    app = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
+    with serving(app) as url, Client(url) as client:
+        worker = PretendWorker(app.state.coordinator, app.state.coordinator.store).register()
+        job = client.submit(rods(), idempotency_key="one")
+        worker.work()
+        reference = client.job(job.id).dataset
+        assert reference is not None
+        yield url, reference.dataset
+
+
+class Meddler(httpx.BaseTransport):
+    """Passes requests on, and meddles with the answers to downloads of one file."""
+
+    def __init__(self, path: str, meddle: Callable[[httpx.Request, httpx.Response], httpx.Response]) -> None:
+        self._inner = httpx.HTTPTransport()
+        self._path = path
+        self._meddle = meddle
+        self.requests: list[httpx.Request] = []
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.requests.append(request)
+        response = self._inner.handle_request(request)
+        if not request.url.path.endswith(self._path):
+            return response
+        response.read()
+        meddled = self._meddle(request, response)
+        if isinstance(meddled.stream, Breaks):
+            return meddled
+        stream = httpx.ByteStream(meddled.content)  # it is to be read once more, as a stream
+        return httpx.Response(meddled.status_code, headers=meddled.headers, stream=stream)
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+PATH = "/files/views/c/0/0"
+
+
+class Breaks(httpx.SyncByteStream):
+    """Sends some bytes, and then the connection is gone."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield self._data
+        raise httpx.ReadError("the connection is gone")
+
+
+def test_a_pull_brings_everything_and_a_second_one_nothing(origin: tuple[str, str], tmp_path: Path) -> None:
+    url, dataset = origin
+    meddler = Meddler("nothing", lambda _request, response: response)
+    with Client(url, transport=meddler) as client:
+        loaded: list[int] = []
+        first = pull(client, dataset, 1, tmp_path / "d", on_bytes=loaded.append)
+        assert first.files == first.downloaded_files == 5
+        assert sum(loaded) == first.downloaded_bytes
+        assert verify(tmp_path / "d") == []
+        before = len(meddler.requests)
+        second = pull(client, dataset, 1, tmp_path / "d")
+        assert (second.downloaded_files, second.downloaded_bytes) == (0, 0)
+        assert len(meddler.requests) - before == 2  # the version and its manifest
+    assert not list((tmp_path / "d").rglob("*.part"))
+
+
+def test_a_download_that_breaks_goes_on_where_it_stopped(origin: tuple[str, str], tmp_path: Path) -> None:
+    ranges: list[str | None] = []
+
+    def meddle(request: httpx.Request, response: httpx.Response) -> httpx.Response:
+        ranges.append(request.headers.get("range"))
+        if len(ranges) <= 2:
+            return httpx.Response(response.status_code, headers=response.headers, stream=Breaks(response.content[:100]))
+        return response
+
+    with Client(origin[0], transport=Meddler(PATH, meddle), patience=0) as client:
+        pull(client, origin[1], 1, tmp_path)
+    assert ranges == [None, "bytes=100-", "bytes=200-"]
+    assert verify(tmp_path) == []
+
+
+def test_an_interrupted_pull_is_resumed_by_the_next(origin: tuple[str, str], tmp_path: Path) -> None:
+    def cut(request: httpx.Request, response: httpx.Response) -> httpx.Response:
+        data = b"" if "range" in request.headers else response.content[:50]
+        return httpx.Response(response.status_code, headers=response.headers, stream=Breaks(data))
+
+    with Client(origin[0], transport=Meddler(PATH, cut), patience=0) as client, pytest.raises(UnreachableError):
+        pull(client, origin[1], 1, tmp_path)
+    assert (tmp_path / "views/c/0/0.part").stat().st_size == 50
+    assert not (tmp_path / "views/c/0/0").exists()
+    assert [fault.path for fault in verify(tmp_path)] == ["manifest.json"]
+    meddler = Meddler("nothing", lambda _request, response: response)
+    with Client(origin[0], transport=meddler) as client:
+        pull(client, origin[1], 1, tmp_path)
+    resumed = [request for request in meddler.requests if request.url.path.endswith(PATH)]
+    assert [request.headers.get("range") for request in resumed] == ["bytes=50-"]
+    assert verify(tmp_path) == []
+
+
+@pytest.mark.parametrize("left", [b"something else", b"x" * 100_000])
+def test_a_part_of_something_else_is_thrown_away(origin: tuple[str, str], tmp_path: Path, left: bytes) -> None:
+    part = tmp_path / "views/c/0/0.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(left)
+    with Client(origin[0]) as client:
+        pull(client, origin[1], 1, tmp_path)
+    assert verify(tmp_path) == []
+
+
+def test_a_damaged_file_is_loaded_again(origin: tuple[str, str], tmp_path: Path) -> None:
+    with Client(origin[0]) as client:
+        pull(client, origin[1], 1, tmp_path)
+        file = tmp_path / "views/c/0/0"
+        data = bytearray(file.read_bytes())
+        data[7] ^= 1
+        file.write_bytes(data)
+        (tmp_path / "zarr.json").unlink()
+        (tmp_path / "extra").write_text("mine")
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [
+            ("extra", "extra"),
+            ("views/c/0/0", "sha256"),
+            ("zarr.json", "missing"),
+        ]
+        assert pull(client, origin[1], 1, tmp_path).downloaded_files == 2
+        assert [fault.fault for fault in verify(tmp_path)] == ["extra"]
+
+
+def test_what_arrives_damaged_gets_no_name(origin: tuple[str, str], tmp_path: Path) -> None:
+    def corrupt(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
+        return httpx.Response(200, content=b"\0" * len(response.content))
+
+    with Client(origin[0], transport=Meddler(PATH, corrupt), patience=0) as client, pytest.raises(DamagedError):
+        pull(client, origin[1], 1, tmp_path)
+    assert not (tmp_path / "views/c/0/0").exists()
+    assert not (tmp_path / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    "path", ["a/../../b", "../b", "a/..", "a/./b", "/b", "a\\..\\b", "manifest.json", "a.part", ""]
+)
+def test_a_path_that_leaves_the_dataset_is_refused(tmp_path: Path, path: str) -> None:
+    with pytest.raises(UnsafePathError):
+        safe_path(tmp_path / "d", path)
+
+
+def test_a_link_that_leaves_the_dataset_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "views").symlink_to(tmp_path)
+    with pytest.raises(UnsafePathError):
+        safe_path(tmp_path / "d", "views/x")
+
+
+def test_a_malicious_manifest_writes_nothing(origin: tuple[str, str], tmp_path: Path) -> None:
+    """The manifest's own model allows `a/../../b`; the client does not."""
+    with Client(origin[0]) as client:
+        manifest, _ = client.manifest(origin[1], 1)
+    evil_file = manifest.files[0].model_copy(update={"path": "a/../../evil"})
+    evil = manifest.model_copy(update={"files": (evil_file,)}).model_dump_json().encode()
+    assert Manifest.model_validate_json(evil)
+
+    def lie(request: httpx.Request, response: httpx.Response) -> httpx.Response:
+        if request.url.path.endswith("/manifest"):
+            return httpx.Response(200, content=evil)
+        if request.url.path.endswith("/versions/1"):
+            return httpx.Response(200, content=response.content.replace(sha256_of(response), sha256(evil).encode()))
+        return response
+
+    def sha256_of(response: httpx.Response) -> bytes:
+        return str(response.json()["manifest"]).encode()
+
+    with Client(origin[0], transport=Meddler("", lie)) as client, pytest.raises(UnsafePathError):
+        pull(client, origin[1], 1, tmp_path / "d")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_manifest_other_than_promised_is_refused(origin: tuple[str, str], tmp_path: Path) -> None:
+    def lie(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
+        return httpx.Response(200, content=response.content.replace(b"rod_hang", b"rod_hang", 1) + b"\n")
+
+    with Client(origin[0], transport=Meddler("/manifest", lie)) as client, pytest.raises(DamagedError):
+        pull(client, origin[1], 1, tmp_path)
+
+
+def test_a_coordinator_that_is_away_is_waited_for() -> None:
+    answers: Iterator[httpx.Response | Exception] = iter(
+        [httpx.ConnectError("refused"), httpx.Response(503), httpx.Response(200, json=[])]
+    )
+    slept: list[float] = []
+
+    def answer(_request: httpx.Request) -> httpx.Response:
+        item = next(answers)
+        if isinstance(item, httpx.Response):
+            return item
+        raise item
+
+    with Client(transport=httpx.MockTransport(answer), sleep=slept.append) as client:
+        assert client.workers() == []
+    assert len(slept) == 2
+    always = httpx.MockTransport(lambda _request: httpx.Response(503))
+    with Client(transport=always, patience=0) as client, pytest.raises(UnexpectedError, match="503"):
+        client.workers()
+
+
+def test_a_problem_is_an_exception_with_all_it_says(origin: tuple[str, str]) -> None:
+    with Client(origin[0]) as client, pytest.raises(ProblemError) as caught:
+        client.submit({"kind": "rod_hang", "axes": {"gamma": -1.0, "phi0": 0.0, "phi1": 0.0}}, idempotency_key="bad")
+    (field,) = caught.value.problem.errors
+    assert (field.pointer, field.value) == ("/axes/gamma", "-1.0")

@@ -1,0 +1,129 @@
+"""`stickslip up` with real processes; the dispatcher is a stub that says what it was told and waits."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from stickslip_services.testing import wait_until
+
+STUB = """
+import os, signal, sys, time
+with open({log!r}, "a") as log:
+    log.write(f"{{os.getpid()}} {{' '.join(sys.argv[1:])}}\\n")
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+while True:
+    time.sleep(0.05)
+"""
+
+
+class Up:
+    def __init__(self, directory: Path, *, stub: str | None = None, data: str = "data", port: str = "0") -> None:
+        self.data = directory / data
+        self.log = directory / "dispatchers.log"
+        program = directory / "stub.py"
+        program.write_text(STUB.format(log=str(self.log)) if stub is None else stub)
+        command = [sys.executable, "-m", "stickslip_services.cli", "up", "--data", str(self.data), "--port", port]
+        command += ["--slots", "3", "--dispatcher", f"{sys.executable} {program}"]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    @property
+    def url(self) -> str:
+        return (self.data / "url").read_text().strip()
+
+    def answers(self) -> bool:
+        try:
+            return httpx.get(f"{self.url}/readyz").is_success
+        except (OSError, httpx.TransportError):
+            return False
+
+    def dispatchers(self) -> list[int]:
+        return [int(line.split()[0]) for line in self.log.read_text().splitlines()] if self.log.exists() else []
+
+    def coordinator(self) -> int:
+        needle = f"stickslip_services.coordinator\0--data\0{self.data}\0".encode()
+        for entry in Path("/proc").iterdir():
+            try:
+                if entry.name.isdecimal() and needle in (entry / "cmdline").read_bytes():
+                    return int(entry.name)
+            except OSError:
+                continue
+        return 0
+
+    def stop(self, number: int = signal.SIGTERM) -> str:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.communicate(timeout=20)[0]
+
+
+@pytest.fixture
+def up(tmp_path: Path) -> Iterator[Up]:
+    running = Up(tmp_path)
+    yield running
+    running.stop()
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return b") Z " not in Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return False
+
+
+def test_up_starts_both_and_stops_both(up: Up) -> None:
+    wait_until(lambda: bool(up.dispatchers()) and up.answers())
+    port = up.url.rsplit(":", 1)[1]
+    assert port != "0"
+    words = up.log.read_text().split()[1:]
+    expected = ["dispatch", "--url", up.url, "--store", str(up.data / "store"), "--name", "local", "--slots", "3"]
+    assert words == expected
+    pids = [*up.dispatchers(), up.coordinator()]
+    second = Up(up.data.parent)
+    assert "in use by another" in second.process.communicate(timeout=20)[0]
+    assert second.process.returncode == 1
+    output = up.stop(signal.SIGINT)
+    assert up.process.returncode == 0, output
+    assert not any(is_running(pid) for pid in pids)
+    assert not (up.data / "url").exists()
+    assert (up.data / "logs" / "coordinator.log").exists()
+
+
+def test_children_that_are_killed_come_back(up: Up) -> None:
+    wait_until(lambda: bool(up.dispatchers()) and up.answers())
+    url, first = up.url, up.coordinator()
+    os.kill(first, signal.SIGKILL)
+    os.kill(up.dispatchers()[0], signal.SIGKILL)
+    wait_until(lambda: up.coordinator() not in (0, first) and up.answers() and len(up.dispatchers()) == 2)
+    assert up.url == url
+
+
+def test_children_do_not_outlive_the_supervisor(up: Up) -> None:
+    wait_until(lambda: bool(up.dispatchers()) and up.answers())
+    pids = [*up.dispatchers(), up.coordinator()]
+    up.process.kill()
+    wait_until(lambda: not any(is_running(pid) for pid in pids))
+    again = Up(up.data.parent)
+    wait_until(lambda: again.answers() and len(again.dispatchers()) == 2)
+    again.stop()
+    assert again.process.returncode == 0
+
+
+def test_a_child_that_keeps_dying_ends_the_whole(tmp_path: Path) -> None:
+    failing = Up(tmp_path, stub="import sys; sys.exit('no blender here')")
+    output = failing.process.communicate(timeout=60)[0]
+    assert failing.process.returncode == 1
+    assert "no blender here" in output
+    assert "the dispatcher exited with status 1" in output
+    assert failing.coordinator() == 0
+
+
+def test_a_port_that_is_taken_is_an_error(up: Up, tmp_path: Path) -> None:
+    wait_until(up.answers)
+    other = Up(tmp_path, data="other", port=up.url.rsplit(":", 1)[1])
+    output = other.process.communicate(timeout=30)[0]
+    assert other.process.returncode == 1
+    assert "cannot listen on" in output
