@@ -15,6 +15,7 @@
 
 #include "build_info.hpp"
 #include "rod_derivatives.hpp"
+#include "rod_relax.hpp"
 #include "rods.hpp"
 
 namespace nb = nanobind;
@@ -91,7 +92,7 @@ std::vector<std::string> rod_kernels() {
   return names;
 }
 
-using Quaternions = Eigen::Matrix<double, -1, 4, Eigen::RowMajor>;
+using sim_core::Quaternions;
 
 std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0, double phi1,
                                                                      double twist_stiffness,
@@ -99,6 +100,14 @@ std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamm
   const Quaternions chain = quaternions;
   auto result = sim_core::rod_derivatives(gamma, phi0, phi1, twist_stiffness, chain);
   return {result.energy, std::move(result.gradient), std::move(result.hessian)};
+}
+
+std::tuple<Quaternions, double, bool, bool, int, double> relax_rod(double gamma, double phi0, double phi1,
+                                                                   double twist_stiffness,
+                                                                   const nb::DRef<const Quaternions>& quaternions) {
+  const Quaternions chain = quaternions;
+  sim_core::RelaxedRod rod = sim_core::relax_rod(gamma, phi0, phi1, twist_stiffness, chain);
+  return {std::move(rod.quaternions), rod.energy, rod.stable, rod.converged, rod.iterations, rod.residual};
 }
 
 }  // namespace
@@ -129,4 +138,8 @@ NB_MODULE(_sim_core, m) {
   m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
         "Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by "
         "world rotations of nodes 1 ... N.");
+  m.def(
+      "relax_rod", &relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
+      "Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one "
+      "level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.");
 }

@@ -49,3 +49,8 @@ def rod_derivatives(gamma: float, phi0: float, phi1: float, twist_stiffness: flo
     """
     Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by world rotations of nodes 1 ... N.
     """
+
+def relax_rod(gamma: float, phi0: float, phi1: float, twist_stiffness: float, quaternions: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), writable=False)]) -> tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')], float, bool, bool, int, float]:
+    """
+    Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.
+    """
