@@ -1,0 +1,147 @@
+"""Master curves against scipy's solvers, against limits, and against their own definitions."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_bvp, solve_ivp
+from scipy.optimize import brentq
+from scipy.special import jv
+
+from stickslip_sim_core import boundary_value, master_curves
+
+Floats = NDArray[np.float64]
+
+
+class TestCantilever:
+    @pytest.mark.parametrize("gamma", [0.5, 30.0, 300.0, 3000.0])
+    def test_against_scipy(self, gamma: float) -> None:
+        def rate(s: Floats, y: Floats) -> Floats:
+            return np.stack([y[1], gamma * (1 - s) * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])])
+
+        def ends(a: Floats, b: Floats) -> Floats:
+            return np.array([a[0] - np.pi / 2, b[1], a[2], a[3]])
+
+        s = np.linspace(0, 1, 200)
+        psi = np.pi / 2 * np.exp(-s * np.sqrt(gamma))
+        guess = np.stack([psi, -psi * np.sqrt(gamma), s, s])
+        found = solve_bvp(rate, ends, s, guess, tol=1e-10, max_nodes=100_000)
+        assert found.success
+        assert master_curves.cantilever(gamma) == pytest.approx(found.y[2, -1] / found.y[3, -1], rel=1e-9)
+
+    def test_light_rod_is_a_beam(self) -> None:
+        assert master_curves.cantilever(1e-3) == pytest.approx(1e-3 / 8, rel=1e-6)
+
+    def test_heavy_rod(self) -> None:
+        """Short of sqrt(gamma / 2) by 4.6 % at 1e3 and 0.45 % at 1e5."""
+        ratio = master_curves.cantilever([1e3, 1e5]) / np.sqrt([1e3 / 2, 1e5 / 2])
+        np.testing.assert_allclose(ratio - 1, [-0.046, -0.0045], rtol=0.02)
+
+    def test_refined(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Four orders less change nothing above 1e-9: what is left at full order is far below."""
+        gamma = 10.0 ** np.arange(-3.0, 5.1)
+        fine = master_curves.cantilever(gamma)
+        monkeypatch.setattr(boundary_value, "STAGES", 6)
+        boundary_value.gauss_method.cache_clear()
+        coarse = master_curves.cantilever(gamma)
+        boundary_value.gauss_method.cache_clear()
+        np.testing.assert_allclose(coarse, fine, rtol=1e-9)
+        assert (coarse != fine).any()
+
+    def test_grows(self) -> None:
+        assert (np.diff(master_curves.cantilever(np.geomspace(1e-3, 1e5, 30))) > 0).all()
+
+
+def test_lateral_buckling_rod() -> None:
+    zero = brentq(lambda z: jv(-1 / 6, z), 2.0, 2.3, xtol=1e-15)
+    assert master_curves.lateral_buckling_rod() == pytest.approx(6 * zero, rel=1e-14)
+    assert master_curves.lateral_buckling_rod() == pytest.approx(12.8538, abs=5e-5)
+
+
+def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Floats]:
+    """Shoot from the free end: (eta, in-plane field) along the planar rod, from free end to clamp.
+
+    Written in the arc length from the Kirchhoff equations of the design, not in the scaled form of master_curves.
+    """
+    C = 1 / (1 + poisson)
+
+    def rate(x: float, y: Floats) -> Floats:  # x = 1 - s
+        theta, m, mu0, mu1, eta, u, du = y
+        along = [
+            phi + m,
+            gamma * x * np.sin(theta),
+            phi * mu1,
+            m * mu0 / C - (phi + m) * mu0 + gamma * x * eta,
+            np.cos(theta) * mu1 + np.sin(theta) * mu0 / C,
+        ]
+        return np.array([*(-d for d in along), du, gamma * x * np.cos(theta) * u])
+
+    def shoot(tip: float) -> Any:
+        start = [tip, 0, 0, 0, 1, 1, 0]
+        return solve_ivp(rate, (0, 1), start, method="DOP853", rtol=3e-14, atol=1e-13, dense_output=True)
+
+    # The branch from large weights: the angle at the free end is the least that brings the clamp upright.
+    tips = np.linspace(0.5, 5.0, 46)
+    ends = [shoot(tip).y[0, -1] for tip in tips]
+    first = next(i for i in range(45) if ends[i] < 0 < ends[i + 1])
+    found = shoot(brentq(lambda tip: shoot(tip).y[0, -1], tips[first], tips[first + 1], xtol=1e-15, rtol=1e-15))
+    x = np.linspace(0, 1, 401)
+    return found.sol(x)[4], found.sol(x)[5]
+
+
+class TestBendTwist:
+    @pytest.mark.parametrize(("phi", "poisson"), [(6.5, 0.0), (6.0, 0.3), (6.0, 0.5)])
+    def test_definition(self, phi: float, poisson: float) -> None:
+        """Jacobi's field out of the plane has its first zero at the clamp, the one in the plane none."""
+        gamma = float(master_curves.bend_twist(phi, poisson))
+        for change, sign in ((1e-8, 1), (-1e-8, -1)):
+            eta, in_plane = jacobi_fields(gamma * (1 + change), phi, poisson)
+            assert np.sign(eta[-1]) == sign
+            assert (eta[:-1] > 0).all()
+            assert (in_plane > 0).all()
+
+    def test_long_rods_are_alike(self) -> None:
+        """Gamma^(1/3) / phi tends to a constant of Poisson's ratio."""
+        for poisson, constant in ((0.0, 0.516542), (0.3, 0.580823), (0.5, 0.620688)):
+            gamma = master_curves.bend_twist([40.0, 25 * np.pi, 1000.0], poisson)
+            scaled = np.cbrt(gamma) / [40.0, 25 * np.pi, 1000.0]
+            np.testing.assert_allclose(scaled, constant, atol=1e-6)
+            np.testing.assert_allclose(scaled, scaled[0], rtol=1e-10)
+
+    def test_nothing_below_the_onset(self) -> None:
+        phi, gamma = master_curves.bend_twist_onset(0.5)
+        assert phi / np.pi == pytest.approx(1.767, abs=1e-3)
+        values = master_curves.bend_twist([phi * (1 - 1e-9), phi * (1 + 1e-9), phi * 1.001], 0.5)
+        assert np.isnan(values[0])
+        assert values[1] == pytest.approx(gamma, rel=1e-3)
+        assert values[2] > values[1] > gamma
+
+    def test_stiffer_in_twist_is_planar_longer(self) -> None:
+        onsets = [master_curves.bend_twist_onset(nu)[0] for nu in (0.0, 0.3, 0.5)]
+        assert onsets[0] > onsets[1] > onsets[2]
+
+    def test_independent_of_what_was_asked_before(self) -> None:
+        master_curves._boundary.cache_clear()
+        first = master_curves.bend_twist(10.0, 0.4)
+        master_curves._boundary.cache_clear()
+        master_curves.bend_twist([8.0, 12.0, 6.0], 0.4)
+        assert first.tobytes() == master_curves.bend_twist(10.0, 0.4).tobytes()
+
+
+def test_shapes() -> None:
+    assert master_curves.cantilever(1.0).shape == ()
+    assert master_curves.cantilever(np.ones((2, 3))).shape == (2, 3)
+    assert master_curves.cantilever([]).shape == (0,)
+    assert master_curves.bend_twist([[8.0], [9.0]], 0.5).shape == (2, 1)
+
+
+def test_arguments() -> None:
+    with pytest.raises(ValueError, match=r"gamma: must be finite and > 0, got 0\.0"):
+        master_curves.cantilever([1.0, 0.0])
+    with pytest.raises(ValueError, match="phi: must be finite and > 0, got nan"):
+        master_curves.bend_twist(np.nan, 0.5)
+    with pytest.raises(ValueError, match="phi: must be real numbers"):
+        master_curves.bend_twist(["six"], 0.5)
+    with pytest.raises(ValueError, match=r"poisson: must be in \[0, 0\.5\], got 0\.6"):
+        master_curves.bend_twist(6.0, 0.6)
