@@ -1,0 +1,87 @@
+"""Pictures of protocol results: what was measured, over the master curve.
+
+They need matplotlib: `pip install stickslip-sim-core[plots]`.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stickslip_sim_core import master_curves
+from stickslip_sim_core.protocols.bend_twist import POISSON, lower_boundary, upper_boundary
+from stickslip_sim_core.protocols.result import ProtocolResult
+from stickslip_sim_core.protocols.rod_chain import extrapolated
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, which the colour-blind tell apart.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+SIZE = (6.0, 5.0)  # inches
+DPI = 110
+
+
+def plot(result: ProtocolResult) -> "Figure":
+    """Draw the measured curves over their master curves, and the relative errors below."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import ScalarFormatter
+
+    figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    for curve, colour in zip(result.curves, COLOURS, strict=False):
+        label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items())
+        above.plot(curve.x, curve.master, color=colour, label=f"master curve {label}".strip())
+        above.plot(curve.x, curve.measured, "o", color=colour, markerfacecolor="none", label="measured")
+        below.plot(curve.x, np.maximum(np.abs(curve.errors), 1e-16), "o", color=colour, markersize=3)
+    above.set(xscale="log", yscale="log", ylabel=result.y_name, title=f"{result.protocol}: {_verdict(result)}")
+    above.legend(fontsize="small")
+    below.axhline(result.tolerance, color="black", linestyle="--", linewidth=1)
+    below.text(
+        0.01, result.tolerance, "tolerance", transform=below.get_yaxis_transform(), va="bottom", fontsize="small"
+    )
+    below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(1e-16, 50 * result.tolerance))
+    if max(result.curves[0].x) < 100.0 * min(result.curves[0].x):
+        below.xaxis.set_major_formatter(ScalarFormatter())
+        below.xaxis.set_minor_formatter(ScalarFormatter())
+    return figure
+
+
+def _verdict(result: ProtocolResult) -> str:
+    return f"largest error {result.error:.1e}, {'passed' if result.passed else 'FAILED'}"
+
+
+def plot_bend_twist_phases(*, poisson: Sequence[float] = POISSON, points: int = 40, elements: int = 512) -> "Figure":
+    """Draw where a hanging curly rod is planar and where three-dimensional, phi = 0.25 pi ... 25 pi.
+
+    Lines from above are master curves, dots are measured; the lower boundary, where the rod of natural shape leaves its
+    plane as its weight grows, is measured.
+    """
+    from matplotlib.figure import Figure
+
+    phi = np.geomspace(0.25 * np.pi, 25.0 * np.pi, points)
+    figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    for nu, colour in zip(poisson, COLOURS, strict=False):
+        onset, onset_gamma = master_curves.bend_twist_onset(nu)
+        start = np.cbrt(onset_gamma) / onset
+        inside = phi[phi > onset]
+        fine = np.concatenate([onset * (1.0 + np.geomspace(1e-6, 0.2, 25)), np.geomspace(1.25 * onset, phi[-1], 12)])
+        master = np.cbrt(master_curves.bend_twist(fine, nu)) / fine
+        measured = np.array([extrapolated(partial(upper_boundary, f, nu), elements) for f in phi])
+        lower = np.array([extrapolated(partial(lower_boundary, f, nu), elements) for f in inside])
+        axes.plot(np.append(onset, fine) / np.pi, np.append(start, master), color=colour, label=f"poisson = {nu:g}")
+        axes.plot(phi / np.pi, np.cbrt(measured) / phi, "o", color=colour, markersize=4, markerfacecolor="none")
+        axes.plot(np.append(onset, inside) / np.pi, np.append(start, np.cbrt(lower) / inside), ":", color=colour)
+        axes.plot(onset / np.pi, start, "*", color=colour, markersize=10)
+    axes.set(xscale="log", xlabel="phi / pi", ylabel="Gamma^(1/3) / phi", xlim=(0.25, 25.0), ylim=(0.0, 0.8))
+    axes.set_xticks([0.25, 0.5, 1, 2, 5, 10, 25], labels=["0.25", "0.5", "1", "2", "5", "10", "25"])
+    axes.minorticks_off()
+    axes.text(6.0, 0.72, "planar, hanging", ha="center")
+    axes.text(8.0, 0.33, "three-dimensional", ha="center")
+    axes.text(8.0, 0.02, "planar, curled", ha="center")
+    axes.text(0.55, 0.4, "planar\nat every weight", ha="center")
+    axes.set_title("Bend-Twist: master curve (line), measured (dots),\nmeasured from the natural shape (dotted)")
+    axes.legend(loc="upper left", fontsize="small")
+    return figure

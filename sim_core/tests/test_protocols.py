@@ -1,0 +1,125 @@
+"""The rod solver on the physical protocols, and what a result says."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
+from stickslip_sim_core.protocols import Curve, ProtocolResult, bend_twist, rod_cantilever
+from stickslip_sim_core.protocols.rod_chain import extrapolated, planar_frames, round_rod, tip
+
+
+class TestBendTwist:
+    def test_passes(self) -> None:
+        result = protocols.run("bend-twist", phi=(6.0, 10.0, 25 * np.pi))
+        assert result.passed
+        assert result.error < 1e-7  # asked: 1e-4; aim: 1e-6
+        assert [curve.parameters["poisson"] for curve in result.curves] == [0.0, 0.3, 0.5]
+
+    def test_rod_that_is_always_planar(self) -> None:
+        """At poisson = 0 a rod of phi = 6 is below the onset: solver and master curve agree that there is nothing."""
+        result = bend_twist.run(phi=(6.0,), poisson=(0.0,), elements=128)
+        assert math.isnan(result.curves[0].measured[0])
+        assert math.isnan(result.curves[0].master[0])
+        assert result.passed
+
+    def test_error_falls_with_the_square_before_extrapolation(self) -> None:
+        limit = bend_twist.upper_boundary(10.0, 0.5, 1024)
+        errors = [bend_twist.upper_boundary(10.0, 0.5, n) - limit for n in (64, 128)]
+        assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
+
+    def test_lower_boundary_meets_the_upper_at_the_onset(self) -> None:
+        upper, lower = (f(5.57, 0.5, 256) for f in (bend_twist.upper_boundary, bend_twist.lower_boundary))
+        assert 0.75 * upper < lower < upper
+
+    def test_certificate_is_that_of_solve_rods(self) -> None:
+        """Just above and below the measured boundary, solve_rods says the same of the planar rod."""
+        boundary = bend_twist.upper_boundary(6.0, 0.5, 128)
+        rods = solve_rods([boundary * 0.999, boundary * 1.001], [0.0, 0.0], [6.0, 6.0])
+        assert rods.converged.all()
+        assert rods.stable.tolist() == [False, True]
+
+
+class TestRodCantilever:
+    def test_passes(self) -> None:
+        result = protocols.run("rod-cantilever")
+        assert result.passed
+        assert result.error < 1e-6
+
+    def test_coarse_chain_fails(self) -> None:
+        assert not rod_cantilever.run(elements=64).passed
+
+
+class TestRelax:
+    def test_agrees_with_solve_rods(self) -> None:
+        """From its own natural shape a chain relaxes to the rod that solve_rods extrapolates to."""
+
+        def height(n: int) -> float:
+            natural = planar_frames(6.0 * np.linspace(0, 1, n + 1))
+            return float(tip(round_rod(6.0, 0.5)(300.0, natural).frames)[2])
+
+        limit = solve_rods([300.0], [0.0], [6.0], elements=512).centerline[0, -1, 2]
+        assert extrapolated(height, 512) == pytest.approx(limit, abs=1e-9)
+
+    def test_saddle_is_not_stable(self) -> None:
+        assert not round_rod(12.0, 0.5)(100.0, planar_frames(np.zeros(129))).stable
+
+    def test_clamp_stays(self) -> None:
+        frames = planar_frames(np.full(33, 1.0))
+        assert (round_rod(0.0, 0.5)(5.0, frames).frames[0] == frames[0]).all()
+
+    def test_single_frame_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="quaternions: must have at least 2 rows, got 1"):
+            _sim_core.relax_rod(1.0, 0.0, 0.0, 1.0, np.array([[1.0, 0.0, 0.0, 0.0]]))
+
+
+class TestResult:
+    RESULT = ProtocolResult(
+        "bend-twist",
+        "phi",
+        "Gamma",
+        (Curve({}, (1.0, 2.0), (1.1, math.nan), (1.0, math.nan)),),
+        0.2,
+        {"n": 4},
+        "0" * 64,
+    )
+
+    def test_errors(self) -> None:
+        assert self.RESULT.curves[0].errors == pytest.approx((0.1, 0.0))
+        assert self.RESULT.passed
+        assert not replace(self.RESULT, tolerance=0.05).passed
+
+    def test_missing_measurement_fails(self) -> None:
+        one_sided = Curve({}, (1.0,), (math.nan,), (1.0,))
+        result = replace(self.RESULT, curves=(one_sided,))
+        assert not result.passed
+        assert result.as_dict()["error"] is None
+
+    def test_json(self) -> None:
+        text = json.dumps(protocols.run("rod-cantilever", gamma=(1.0,), elements=64).as_dict(), allow_nan=False)
+        assert json.loads(text)["build_hash"] == build_info().build_hash
+        assert json.loads(json.dumps(self.RESULT.as_dict(), allow_nan=False))["curves"][0]["measured"] == [1.1, None]
+
+    @pytest.mark.parametrize("name", sorted(protocols.PROTOCOLS))
+    def test_plot(self, name: str, tmp_path: Path) -> None:
+        pytest.importorskip("matplotlib")
+        from stickslip_sim_core.protocols import plots
+
+        few: dict[str, dict[str, Any]] = {
+            "bend-twist": {"phi": (6.5, 8.0), "poisson": (0.5,)},
+            "rod-cantilever": {"gamma": (1.0, 300.0)},
+        }
+        plots.plot(protocols.run(name, elements=128, **few.get(name, {}))).savefig(tmp_path / "figure.png")
+
+    def test_unknown_names_and_settings(self) -> None:
+        with pytest.raises(ValueError, match=r"protocol: must be one of bend-twist, .* got 'stick'"):
+            protocols.run("stick")
+        with pytest.raises(TypeError):
+            protocols.run("rod-cantilever", speed=1)
+        with pytest.raises(ValueError, match="elements: must be a multiple of 4"):
+            protocols.run("rod-cantilever", elements=33)
