@@ -18,7 +18,8 @@ from stickslip_services.client import Client
 from stickslip_training.datasets import RodDataset
 
 BIN = Path(sys.executable).parent
-SPEC = Path(__file__).with_name("demo-rods.yaml")
+RODS = Path(__file__).with_name("demo-rods.yaml")
+MORE_RODS = Path(__file__).with_name("sampled-rods.yaml")
 OUT = Path("demo-out")
 START_SECONDS = 60
 SHEET_COLUMNS = 4
@@ -32,19 +33,30 @@ def main() -> None:
     shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir()
     with service(OUT / "service") as url:
-        run("stickslip", "submit", SPEC, "--watch", "--url", url)
-        with Client(url) as client:
-            (dataset,) = client.datasets()
-            console.rule("the same spec again: nothing to simulate, nothing to render")
-        run("stickslip", "submit", SPEC, "--watch", "--url", url)
-        run("stickslip", "pull", dataset.id, OUT / "dataset", "--url", url)
+        rods = submit(RODS, url)
+        console.rule("the same spec again: nothing is simulated, nothing is rendered")
+        assert submit(RODS, url) == rods
+        run("stickslip", "pull", rods, OUT / "dataset", "--url", url)
         run("stickslip", "verify", OUT / "dataset")
-    look_at(OUT / "dataset")
-    run("stickslip-train", "curvature", OUT / "dataset", "--out", OUT / "training", "--minutes", "1")
+        look_at(OUT / "dataset")
+        console.rule("2,500 more rods, without pictures, to learn from")
+        more_rods = submit(MORE_RODS, url)
+        run("stickslip", "pull", more_rods, OUT / "training-dataset", "--url", url)
+    run("stickslip-train", "curvature", OUT / "training-dataset", "--out", OUT / "training", "--minutes", "1")
     console.rule(f"done in {time.monotonic() - started:.0f} s")
     console.print(f"contact sheet  {OUT / 'contact-sheet.png'}")
     console.print(f"training       {OUT / 'training' / 'curvature.png'}")
-    console.print(f"dataset        {OUT / 'dataset'}")
+    console.print(f"datasets       {OUT / 'dataset'}, {OUT / 'training-dataset'}")
+
+
+def submit(spec: Path, url: str) -> str:
+    """Run a job, in sight, and return the id of its dataset."""
+    run("stickslip", "submit", spec, "--watch", "--url", url)
+    with Client(url) as client:
+        job = next(client.jobs())
+    if job.dataset is None:
+        raise SystemExit(f"{job.id} is {job.state}: {job.message}")
+    return job.dataset.dataset
 
 
 @contextmanager

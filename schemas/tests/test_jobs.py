@@ -57,7 +57,7 @@ def test_short_and_long_forms_are_one_spec() -> None:
         ("thesis-cloth", ClothDragSpec, 3_840),
         ("demo-rods", RodHangSpec, 48),
         ("demo-cloth", ClothDragSpec, 4),
-        ("sampled-rods", RodHangSpec, 1_000),
+        ("sampled-rods", RodHangSpec, 2_500),
     ],
 )
 def test_examples_are_specs(name: str, kind: type, count: int) -> None:
