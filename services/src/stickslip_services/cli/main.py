@@ -1,6 +1,7 @@
 """The commands of `stickslip`."""
 
 import json
+import sys
 import secrets
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,7 +40,8 @@ SHOWN_REJECTS = 50
 
 
 def _console() -> Console:
-    return Console(soft_wrap=True, highlight=False)
+    """Return a console as wide as the terminal, or wide enough for any table where there is none to fit into."""
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
 def _print_json(value: BaseModel | list[Any]) -> None:
@@ -124,7 +126,7 @@ def jobs(
         return _print_json(found)
     table = Table(box=None, header_style="bold")
     for column in ("job", "name", "kind", "state", "samples", "rejected", "tasks", "time left", "dataset"):
-        table.add_column(column, overflow="fold", no_wrap=column == "job")
+        table.add_column(column, overflow="fold", no_wrap=column in ("job", "dataset"))
     for job in found:
         table.add_row(
             job.id,
@@ -217,7 +219,7 @@ def datasets(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
         return _print_json(found)
     table = Table(box=None, header_style="bold")
     for column in ("dataset", "name", "kind", "samples", "valid", "size", "made"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold", no_wrap=column == "dataset")
     for dataset in found:
         for version in dataset.versions:
             table.add_row(
