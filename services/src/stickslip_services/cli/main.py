@@ -1,8 +1,8 @@
 """The commands of `stickslip`."""
 
 import json
-import sys
 import secrets
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
