@@ -62,7 +62,7 @@ from stickslip_services.jobs import (
 from stickslip_services.leasing import grant_leases, has_ready_task, renew_leases
 from stickslip_services.ledger import Ledger, ledger, set_job_state
 from stickslip_services.paging import PageRequest
-from stickslip_services.planning import Plan, Spec, count_settled, expand
+from stickslip_services.planning import Plan, Spec, collector_at_rest, count_settled, expand
 from stickslip_services.reports import take_reports
 from stickslip_services.retrying import find_held, lose
 from stickslip_services.settings import Settings
@@ -134,6 +134,10 @@ class Coordinator:
 
     def submit(self, spec: Spec, idempotency_key: str | None) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
+        with collector_at_rest():
+            return self._submit(spec, idempotency_key)
+
+    def _submit(self, spec: Spec, idempotency_key: str | None) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
         while True:

@@ -6,9 +6,11 @@ wait for it, where it failed or was cancelled the new job starts it again.
 `expand` is pure and slow and runs outside any transaction; `insert_plan` writes what it found in one.
 """
 
+import gc
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -68,6 +70,21 @@ class Plan:
     def simulation_count(self) -> int:
         """Number of different simulations."""
         return sum(task.stage == _SIMULATE for task in self.tasks.values())
+
+
+@contextmanager
+def collector_at_rest() -> Iterator[None]:
+    """Keep the garbage collector from walking through a plan while it grows.
+
+    A plan is a million small objects and no cycles; looking for some takes a fifth of the time.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def stage_builds(builds: Builds) -> dict[Stage, str]:
