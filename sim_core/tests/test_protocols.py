@@ -100,6 +100,9 @@ class TestResult:
         assert not result.passed
         assert result.as_dict()["error"] is None
 
+    def test_nothing_measured_fails(self) -> None:
+        assert not protocols.run("rod-cantilever", gamma=()).passed
+
     def test_json(self) -> None:
         text = json.dumps(protocols.run("rod-cantilever", gamma=(1.0,), elements=64).as_dict(), allow_nan=False)
         assert json.loads(text)["build_hash"] == build_info().build_hash

@@ -43,8 +43,8 @@ class ProtocolResult:
 
     @property
     def error(self) -> float:
-        """Largest |relative error| over all curves."""
-        return max(abs(e) for curve in self.curves for e in curve.errors)
+        """Largest |relative error| over all curves; infinite if nothing was measured."""
+        return max((abs(e) for curve in self.curves for e in curve.errors), default=math.inf)
 
     @property
     def passed(self) -> bool:
