@@ -121,7 +121,9 @@ class Coordinator:
         """Tell what a job would be."""
         with self.database.read() as connection:
             builds = builds_for(connection, spec.kind)
+        with collector_at_rest():
             plan = expand(spec, builds or _NO_BUILDS)
+        with self.database.read() as connection:
             cached = None if builds is None else count_settled(connection, plan.tasks)
         return Validation(
             spec=spec,
@@ -244,7 +246,7 @@ class Coordinator:
 
     def lease(self, request: LeaseRequest) -> LeaseBatch:
         """Lease tasks to a worker."""
-        self.sweep()
+        self._take_back()
         worker = self._meet(request.worker_id)
         if worker.superseded:
             raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
@@ -308,12 +310,15 @@ class Coordinator:
 
     def sweep(self) -> None:
         """Take back expired leases, let due retries go on, and let jobs that nobody serves say so."""
+        self._take_back()
+        self._note_stranded()
+
+    def _take_back(self) -> None:
         with self.database.read() as connection:
             due = is_sweep_due(connection, self.clock())
         if due:
             with self._book() as book:
                 sweep(book, self.settings)
-        self._note_stranded()
 
     def plan_waiting_jobs(self) -> None:
         """Plan the jobs that came before the first worker."""
