@@ -14,6 +14,8 @@
 #include <vector>
 
 #include "build_info.hpp"
+#include "general_rods.hpp"
+#include "rod_chain.hpp"
 #include "rod_derivatives.hpp"
 #include "rod_relax.hpp"
 #include "rods.hpp"
@@ -24,6 +26,9 @@ using namespace nb::literals;
 namespace {
 
 using Input = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+template <int columns>
+using InputRows = nb::ndarray<const double, nb::shape<-1, columns>, nb::c_contig, nb::device::cpu>;
+using InputVectors = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 template <class Scalar, class... Shape>
 using Output = nb::ndarray<nb::numpy, Scalar, nb::c_contig, Shape...>;
 
@@ -56,6 +61,49 @@ sim_core::RodKernelChoice kernel_named(const std::string& name) {
 // Rods between two looks at pending signals: a few milliseconds of work.
 constexpr std::int64_t rods_between_signals = 256;
 
+// The arrays of a solution, and where a kernel writes.
+struct RodArrays {
+  Vectors centerline, curvature;
+  Frames frame;
+  Numbers energy, residual, refinement;
+  Truths converged, stable;
+  Counts iterations;
+
+  RodArrays(std::size_t n, std::size_t points)
+      : centerline(allocate<Vectors>({n, points, 3})),
+        curvature(allocate<Vectors>({n, points, 3})),
+        frame(allocate<Frames>({n, points, 3, 3})),
+        energy(allocate<Numbers>({n})),
+        residual(allocate<Numbers>({n})),
+        refinement(allocate<Numbers>({n})),
+        converged(allocate<Truths>({n})),
+        stable(allocate<Truths>({n})),
+        iterations(allocate<Counts>({n})) {}
+
+  sim_core::RodOutput output() {
+    return {centerline.data(), curvature.data(),  frame.data(),     energy.data(), residual.data(),
+            refinement.data(), iterations.data(), converged.data(), stable.data()};
+  }
+
+  Solution solution() const {
+    return {centerline, curvature, frame, energy, stable, converged, iterations, residual, refinement};
+  }
+};
+
+template <class Batch, class Kernel>
+void solve_in_parts(Kernel solve, const Batch& batch, const sim_core::RodSettings& settings, int points,
+                    std::size_t n) {
+  const auto samples = sim_core::sample_points(points, settings.elements);
+  const auto total = static_cast<std::int64_t>(n);
+  for (std::int64_t begin = 0; begin < total; begin += rods_between_signals) {
+    {
+      nb::gil_scoped_release unlocked;
+      solve(batch, settings, samples, begin, std::min(begin + rods_between_signals, total));
+    }
+    if (PyErr_CheckSignals() != 0) throw nb::python_error();
+  }
+}
+
 Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness, int elements, int points,
                     int start_level, const std::string& kernel_name) {
   const std::size_t n = gamma.size(), p = static_cast<std::size_t>(points);
@@ -64,24 +112,32 @@ Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness,
                                        start_level < 0 ? sim_core::default_start_level(elements) : start_level};
   sim_core::check_rods(settings, points, phi0.data(), phi1.data(), static_cast<std::int64_t>(n));
   const sim_core::RodKernelChoice kernel = kernel_named(kernel_name);
-  auto centerline = allocate<Vectors>({n, p, 3}), curvature = allocate<Vectors>({n, p, 3});
-  auto frame = allocate<Frames>({n, p, 3, 3});
-  auto energy = allocate<Numbers>({n}), residual = allocate<Numbers>({n}), refinement = allocate<Numbers>({n});
-  auto converged = allocate<Truths>({n}), stable = allocate<Truths>({n});
-  auto iterations = allocate<Counts>({n});
-  const sim_core::RodBatch batch{gamma.data(),      phi0.data(),       phi1.data(),      centerline.data(),
-                                 curvature.data(),  frame.data(),      energy.data(),    residual.data(),
-                                 refinement.data(), iterations.data(), converged.data(), stable.data()};
-  const auto samples = sim_core::sample_points(points, elements);
-  const auto total = static_cast<std::int64_t>(n);
-  for (std::int64_t begin = 0; begin < total; begin += rods_between_signals) {
-    {
-      nb::gil_scoped_release unlocked;
-      kernel.solve(batch, settings, samples, begin, std::min(begin + rods_between_signals, total));
-    }
-    if (PyErr_CheckSignals() != 0) throw nb::python_error();
+  RodArrays arrays(n, p);
+  const sim_core::RodBatch batch{gamma.data(), phi0.data(), phi1.data(), arrays.output()};
+  solve_in_parts(kernel.solve, batch, settings, points, n);
+  return arrays.solution();
+}
+
+Solution solve_general_rods(Input gamma, InputRows<3> stiffness, InputRows<4> clamp, InputVectors natural,
+                            InputVectors start, InputVectors slope, InputVectors natural_at_points, int elements,
+                            double curvature_max, int start_level, const std::string& kernel_name) {
+  const std::size_t n = gamma.size(), p = natural_at_points.shape(1), N = static_cast<std::size_t>(elements);
+  const int points = static_cast<int>(p);
+  const sim_core::RodSettings settings{0.0, elements,
+                                       start_level < 0 ? sim_core::default_start_level(elements) : start_level};
+  sim_core::check_settings(settings, points, curvature_max);
+  if (stiffness.shape(0) != n || clamp.shape(0) != n || natural.shape(0) != n || start.shape(0) != n ||
+      slope.shape(0) != n || natural_at_points.shape(0) != n || natural.shape(1) != 2 * N + 1 ||
+      start.shape(1) != 2 * N + 1 || slope.shape(1) != N / 2 + 1) {
+    throw std::invalid_argument("solve_general_rods: shapes disagree");
   }
-  return {centerline, curvature, frame, energy, stable, converged, iterations, residual, refinement};
+  const sim_core::RodKernelChoice kernel = kernel_named(kernel_name);
+  RodArrays arrays(n, p);
+  const sim_core::GeneralRodBatch batch{
+      gamma.data(), stiffness.data(),         clamp.data(),   natural.data(), start.data(),
+      slope.data(), natural_at_points.data(), arrays.output()};
+  solve_in_parts(kernel.solve_general, batch, settings, points, n);
+  return arrays.solution();
 }
 
 std::vector<std::string> rod_kernels() {
@@ -110,6 +166,20 @@ std::tuple<Quaternions, double, bool, bool, int, double> relax_rod(double gamma,
   return {std::move(rod.quaternions), rod.energy, rod.stable, rod.converged, rod.iterations, rod.residual};
 }
 
+std::tuple<sim_core::Rows4, double, bool, bool> relax_chain(double gamma, const Eigen::Vector3d& stiffness,
+                                                            const sim_core::Rows3& natural,
+                                                            const sim_core::Rows4& quaternions) {
+  nb::gil_scoped_release unlocked;
+  auto chain = sim_core::relax_chain({gamma, stiffness, natural}, quaternions);
+  return {std::move(chain.quaternions), chain.energy, chain.converged, chain.stable};
+}
+
+sim_core::RowMajor chain_jacobian(double gamma, const Eigen::Vector3d& stiffness, const sim_core::Rows3& natural,
+                                  const sim_core::Rows4& quaternions, const sim_core::RowMajor& basis, int stride) {
+  nb::gil_scoped_release unlocked;
+  return sim_core::chain_jacobian({gamma, stiffness, natural}, quaternions, basis, stride);
+}
+
 }  // namespace
 
 NB_MODULE(_sim_core, m) {
@@ -134,6 +204,17 @@ NB_MODULE(_sim_core, m) {
   m.def("solve_rods", &solve_rods, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "elements"_a, "points"_a,
         "start_level"_a = -1, "kernel"_a = "",
         "Internal: see stickslip_sim_core.solve_rods. Level -1 and kernel '' leave the choice to the solver.");
+  m.def("solve_general_rods", &solve_general_rods, "gamma"_a, "stiffness"_a, "clamp"_a, "natural"_a, "start"_a,
+        "slope"_a, "natural_at_points"_a, "elements"_a, "curvature_max"_a, "start_level"_a = -1, "kernel"_a = "",
+        "Internal: see stickslip_sim_core.solve_general_rods; arrays as in general_rods.hpp.");
+  m.def("relax_chain", &relax_chain, "gamma"_a, "stiffness"_a, "natural"_a, "quaternions"_a,
+        "Internal: equilibrium of one chain: quaternions (N + 1, 4), energy, converged, stable. See rod_chain.hpp.");
+  m.def("chain_frames", &sim_core::chain_frames, "curvature"_a, "clamp"_a,
+        "Internal: quaternions (N + 1, 4) of the chain with curvature (N, 3) in its elements.");
+  m.def("chain_centerline", &sim_core::chain_centerline, "quaternions"_a,
+        "Internal: positions (N + 1, 3) of the nodes of a chain, L.");
+  m.def("chain_jacobian", &chain_jacobian, "gamma"_a, "stiffness"_a, "natural"_a, "quaternions"_a, "basis"_a,
+        "stride"_a, "Internal: derivatives of nodal positions by gamma and natural curvature. See rod_chain.hpp.");
   m.def("rod_kernels", &rod_kernels, "Internal: rod kernels this processor can run, narrowest first.");
   m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
         "Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by "

@@ -22,6 +22,19 @@ struct Rod {
   T twist_stiffness;  // C = GJ/EI
 };
 
+// What element i of n is made of: a uniform rod is its own section everywhere. general_rod.hpp overloads this and the
+// other functions of a rod and its sections.
+template <class T>
+const Rod<T>& section(const Rod<T>& rod, int, int) {
+  return rod;
+}
+
+// The size of the rod's energies, for rounding noise.
+template <class T>
+T energy_scale(const Rod<T>& rod) {
+  return T(1.0) + rod.gamma + rod.phi0 * rod.phi0 + rod.phi1 * rod.phi1;
+}
+
 template <class T>
 struct Element {
   T energy;
@@ -35,7 +48,8 @@ struct ElementMoment {
   Vec3<T> tangent;   // of frame b
   Vec3<T> moment;    // R_b K (kappa - kappa_bar)
   T energy;
-  T cosine;  // of half the rotation over the element; the logarithm holds for cosine >= 0
+  T cosine;          // of half the rotation over the element; the logarithm holds for cosine >= 0
+  Vec3<T> second{};  // d2 of frame b, where the two bending stiffnesses differ
 };
 
 template <class T>
@@ -54,24 +68,30 @@ Vec3<T> jacobian_transposed(const Logarithm<T>& log, Vec3<T> v) {
   return v + T(0.5) * cross(v, log.theta) + log.c * (dot(log.theta, v) * log.theta - log.x * v);
 }
 
-// S = J^T (K/h) J + sym(d(J^T m)/d theta J), expanded with [theta]x^3 = -x [theta]x.
+// S = J^T k J + sym(d(J^T m)/d theta J) for a stiffness k = K/h that is a number, expanded with
+// [theta]x^3 = -x [theta]x.
 template <class T>
-Sym3<T> element_stiffness(const Rod<T>& rod, const ElementMoment<T>& e, T inverse_h) {
+Sym3<T> isotropic_stiffness(const ElementMoment<T>& e, T k) {
   const Vec3<T> theta = e.log.theta;
   const T x = e.log.x, c = e.log.c, tm = dot(theta, e.moment);
-  const Vec3<T> u = jacobian_transposed(e.log, e.tangent);
   // J^T J = (1 - a x) I + a theta theta^T
   const T a = T(2.0) * c - T(0.25) - c * c * x;
   const Vec3<T> v =
       (T(0.25) - c) * e.moment + c * cross(e.moment, theta) + (c * c + T(2.0) * e.log.dc) * (tm * theta - x * e.moment);
-  const T identity = inverse_h * (T(1.0) - a * x) + tm * (c - T(0.25) - c * c * x);
-  return scaled_identity_plus_symmetric_product(identity, theta, v + (inverse_h * a + c * c * tm) * theta) +
-         scaled_identity_plus_symmetric_product(T(0.0), inverse_h * (rod.twist_stiffness - T(1.0)) * u, u);
+  const T identity = k * (T(1.0) - a * x) + tm * (c - T(0.25) - c * c * x);
+  return scaled_identity_plus_symmetric_product(identity, theta, v + (k * a + c * c * tm) * theta);
 }
 
 template <class T>
-Element<T> element(const Rod<T>& rod, const ElementMoment<T>& e, T inverse_h) {
-  return {e.energy, jacobian_transposed(e.log, e.moment), element_stiffness(rod, e, inverse_h)};
+Sym3<T> element_stiffness(const Rod<T>& rod, const ElementMoment<T>& e, T inverse_h) {
+  const Vec3<T> u = jacobian_transposed(e.log, e.tangent);
+  return isotropic_stiffness(e, inverse_h) +
+         scaled_identity_plus_symmetric_product(T(0.0), inverse_h * (rod.twist_stiffness - T(1.0)) * u, u);
+}
+
+template <class T, class Section>
+Element<T> element(const Section& section, const ElementMoment<T>& e, T inverse_h) {
+  return {e.energy, jacobian_transposed(e.log, e.moment), element_stiffness(section, e, inverse_h)};
 }
 
 // Torque of the weight lumped at a node, dE/d omega = w t x e_z, with w = gamma (1 - s) h.

@@ -3,6 +3,7 @@
 
 #include <vector>
 
+#include "general_rod.hpp"
 #include "rod_levels.hpp"
 #include "rod_sampling.hpp"
 #include "rods.hpp"
@@ -23,11 +24,11 @@ Level<W> level_of(int elements) {
   return {elements, std::vector<Quat<Lanes<W>>>(elements + 1), std::vector<Vec3<Lanes<W>>>(elements + 1)};
 }
 
-// Reads lane l from rod begin + l; lanes past the end repeat the last rod.
+// Reads lane l from rod begin + l, each `stride` numbers after the one before; lanes past the end repeat the last rod.
 template <int W>
-Lanes<W> gather(const double* from, std::int64_t begin, int count) {
+Lanes<W> gather(const double* from, std::int64_t begin, int count, std::int64_t stride = 1) {
   Lanes<W> lanes;
-  for (int lane = 0; lane < W; ++lane) lanes.v[lane] = from[begin + (lane < count ? lane : count - 1)];
+  for (int lane = 0; lane < W; ++lane) lanes.v[lane] = from[stride * (begin + (lane < count ? lane : count - 1))];
   return lanes;
 }
 
@@ -47,7 +48,8 @@ struct Solver {
   explicit Solver(int elements)
       : levels{level_of<W>(elements / 4), level_of<W>(elements / 2), level_of<W>(elements)}, work(elements) {}
 
-  void relax(const Rod<T>& rod, int k, double tolerance) {
+  template <class AnyRod>
+  void relax(const AnyRod& rod, int k, double tolerance) {
     minimise(rod, levels[k], work, tolerance);
     balance(rod, levels[k]);
     sweeps = sweeps + levels[k].sweeps;
@@ -55,7 +57,8 @@ struct Solver {
   }
 
   // From the natural shape on one level to all three and to their limit.
-  void solve(const Rod<T>& rod, int start) {
+  template <class AnyRod>
+  void solve(const AnyRod& rod, int start) {
     converged = Mask<W>(true);
     start_natural(rod, levels[start]);
     relax(rod, start, tolerance_start);
@@ -73,21 +76,19 @@ struct Solver {
 };
 
 // A rod without a solution gets no numbers that could be taken for one.
-void mark_failed(const RodBatch& batch, std::int64_t points, std::int64_t i) {
+void mark_failed(const RodOutput& output, std::int64_t points, std::int64_t i) {
   const double nan = __builtin_nan("");
-  for (std::int64_t j = 3 * points * i; j < 3 * points * (i + 1); ++j) batch.centerline[j] = batch.curvature[j] = nan;
-  for (std::int64_t j = 9 * points * i; j < 9 * points * (i + 1); ++j) batch.frame[j] = nan;
-  batch.energy[i] = batch.refinement[i] = batch.residual[i] = nan;
+  for (std::int64_t j = 3 * points * i; j < 3 * points * (i + 1); ++j) output.centerline[j] = output.curvature[j] = nan;
+  for (std::int64_t j = 9 * points * i; j < 9 * points * (i + 1); ++j) output.frame[j] = nan;
+  output.energy[i] = output.refinement[i] = output.residual[i] = nan;
 }
 
 // Solve rods begin ... begin + count, count <= W. A rod that fails starts again on a finer level; whether it does
 // depends on itself alone, and rods that are done are not touched.
-template <int W>
-void solve_pack(const RodBatch& batch, const RodSettings& settings, const std::vector<SamplePoint>& points,
-                Solver<W>& solver, std::int64_t begin, int count) {
+template <int W, class AnyRod>
+void solve_pack(const AnyRod& rod, const RodOutput& output, const RodSettings& settings,
+                const std::vector<SamplePoint>& points, Solver<W>& solver, std::int64_t begin, int count) {
   using T = Lanes<W>;
-  const Rod<T> rod{gather<W>(batch.gamma, begin, count), gather<W>(batch.phi0, begin, count),
-                   gather<W>(batch.phi1, begin, count), T(settings.twist_stiffness)};
   Mask<W> pending(true);
   solver.sweeps = T(0.0);
   for (int start = settings.start_level; start < 3 && any(pending); ++start) {
@@ -95,30 +96,89 @@ void solve_pack(const RodBatch& batch, const RodSettings& settings, const std::v
     const Level<W>& fine = solver.levels[2];
     const Mask<W> converged = solver.converged & less_equal(solver.limit.refinement, T(refinement_max));
     const Mask<W> stable = converged & fine.stable;
-    sample(rod, solver.nodes, points, batch, pending, begin, count);
+    sample(rod, solver.nodes, points, output, pending, begin, count);
     for (int lane = 0; lane < count; ++lane) {
       if (pending.v[lane] == 0) continue;
       const std::int64_t i = begin + lane;
-      batch.energy[i] = solver.limit.energy.v[lane];
-      batch.refinement[i] = solver.limit.refinement.v[lane];
-      batch.residual[i] = fine.residual.v[lane];
-      batch.iterations[i] = static_cast<std::int32_t>(solver.sweeps.v[lane]);
-      batch.converged[i] = converged.v[lane] != 0;
-      batch.stable[i] = stable.v[lane] != 0;
+      output.energy[i] = solver.limit.energy.v[lane];
+      output.refinement[i] = solver.limit.refinement.v[lane];
+      output.residual[i] = fine.residual.v[lane];
+      output.iterations[i] = static_cast<std::int32_t>(solver.sweeps.v[lane]);
+      output.converged[i] = converged.v[lane] != 0;
+      output.stable[i] = stable.v[lane] != 0;
     }
     pending = pending & !converged;
   }
   for (int lane = 0; lane < count; ++lane) {
-    if (pending.v[lane] != 0) mark_failed(batch, static_cast<std::int64_t>(points.size()), begin + lane);
+    if (pending.v[lane] != 0) mark_failed(output, static_cast<std::int64_t>(points.size()), begin + lane);
   }
 }
 
+// Reads a uniform rod per lane.
 template <int W>
-void solve_range(const RodBatch& batch, const RodSettings& settings, const std::vector<SamplePoint>& points,
+struct RodReader {
+  const RodBatch& batch;
+  double twist_stiffness;
+
+  RodReader(const RodBatch& rods, const RodSettings& settings, int)
+      : batch(rods), twist_stiffness(settings.twist_stiffness) {}
+
+  Rod<Lanes<W>> read(std::int64_t begin, int count) const {
+    return {gather<W>(batch.gamma, begin, count), gather<W>(batch.phi0, begin, count),
+            gather<W>(batch.phi1, begin, count), Lanes<W>(twist_stiffness)};
+  }
+};
+
+// Reads a general rod per lane; the pack's fields lie here until the next.
+template <int W>
+struct GeneralRodReader {
+  using T = Lanes<W>;
+
+  const GeneralRodBatch& batch;
+  int intervals;
+  std::vector<Vec3<T>> natural, start, slope, points;
+
+  GeneralRodReader(const GeneralRodBatch& rods, const RodSettings& settings, int count)
+      : batch(rods),
+        intervals(2 * settings.elements),
+        natural(intervals + 1),
+        start(intervals + 1),
+        slope(intervals / 4 + 1),
+        points(count) {}
+
+  GeneralRod<T> read(std::int64_t begin, int count) {
+    const auto gather_field = [&](const double* from, std::vector<Vec3<T>>& to) {
+      const std::int64_t stride = 3 * static_cast<std::int64_t>(to.size());
+      for (std::size_t k = 0; k < to.size(); ++k) to[k] = gather_vector(from + 3 * k, stride, begin, count);
+    };
+    gather_field(batch.natural, natural);
+    gather_field(batch.start, start);
+    gather_field(batch.slope, slope);
+    gather_field(batch.natural_at_points, points);
+    return {gather<W>(batch.gamma, begin, count),
+            gather_vector(batch.stiffness, 3, begin, count),
+            {gather<W>(batch.clamp, begin, count, 4), gather_vector(batch.clamp + 1, 4, begin, count)},
+            intervals,
+            natural.data(),
+            start.data(),
+            slope.data(),
+            points.data()};
+  }
+
+  static Vec3<T> gather_vector(const double* from, std::int64_t stride, std::int64_t begin, int count) {
+    return {gather<W>(from, begin, count, stride), gather<W>(from + 1, begin, count, stride),
+            gather<W>(from + 2, begin, count, stride)};
+  }
+};
+
+template <int W, template <int> class Reader, class Batch>
+void solve_range(const Batch& batch, const RodSettings& settings, const std::vector<SamplePoint>& points,
                  std::int64_t begin, std::int64_t end) {
   Solver<W> solver(settings.elements);
+  Reader<W> reader(batch, settings, static_cast<int>(points.size()));
   for (std::int64_t i = begin; i < end; i += W) {
-    solve_pack(batch, settings, points, solver, i, end - i < W ? static_cast<int>(end - i) : W);
+    const int count = end - i < W ? static_cast<int>(end - i) : W;
+    solve_pack<W>(reader.read(i, count), batch.output, settings, points, solver, i, count);
   }
 }
 

@@ -1,6 +1,8 @@
-// One entry per instruction set that the rod solver is compiled for; rod_kernel.hpp is the code of all of them.
+// Two entries, uniform and general rods, per instruction set that the rod solver is compiled for; rod_kernel.hpp is the
+// code of all of them.
 #pragma once
 
+#include "general_rods.hpp"
 #include "rods.hpp"
 
 namespace sim_core {
@@ -9,9 +11,17 @@ namespace sim_core {
   void name(const RodBatch& batch, const RodSettings& settings, const std::vector<SamplePoint>& samples, \
             std::int64_t begin, std::int64_t end)
 
+#define SIM_CORE_GENERAL_ROD_KERNEL(name)                                                                       \
+  void name(const GeneralRodBatch& batch, const RodSettings& settings, const std::vector<SamplePoint>& samples, \
+            std::int64_t begin, std::int64_t end)
+
 SIM_CORE_ROD_KERNEL(solve_rods_scalar);
 SIM_CORE_ROD_KERNEL(solve_rods_baseline);
 SIM_CORE_ROD_KERNEL(solve_rods_x86_64_v3);
 SIM_CORE_ROD_KERNEL(solve_rods_x86_64_v4);
+SIM_CORE_GENERAL_ROD_KERNEL(solve_general_rods_scalar);
+SIM_CORE_GENERAL_ROD_KERNEL(solve_general_rods_baseline);
+SIM_CORE_GENERAL_ROD_KERNEL(solve_general_rods_x86_64_v3);
+SIM_CORE_GENERAL_ROD_KERNEL(solve_general_rods_x86_64_v4);
 
 }  // namespace sim_core

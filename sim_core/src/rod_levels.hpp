@@ -12,10 +12,27 @@
 namespace sim_core {
 namespace {
 
+// The section at node i of n, and at output point j.
+template <class T>
+const Rod<T>& node_section(const Rod<T>& rod, int, int) {
+  return rod;
+}
+
+template <class T>
+const Rod<T>& point_section(const Rod<T>& rod, int) {
+  return rod;
+}
+
 // kappa = kappa_bar + K^{-1} m, the balance of moments.
 template <class T>
 Vec3<T> curvature(const Rod<T>& rod, Vec3<T> m) {
   return {rod.phi0 + m.x / rod.twist_stiffness, m.y, rod.phi1 + m.z};
+}
+
+// kappa' = kappa_bar' + K^{-1} m'
+template <class T>
+Vec3<T> curvature_rate(const Rod<T>& rod, Vec3<T> dm) {
+  return {dm.x / rod.twist_stiffness, dm.y, dm.z};
 }
 
 // q' = q kappa / 2
@@ -40,14 +57,14 @@ Vec3<T> rotation_between(Quat<T> a, Quat<T> b) {
 //
 // The moment at a node is the discrete Legendre transform of the element after it, f - tau / 2 with tau the weight's
 // torque on the node [Marsden and West 2001, Sec. 1.5]; being symmetric it keeps the even expansion in h.
-template <int W>
-[[gnu::flatten]] void balance(const Rod<Lanes<W>>& rod, Level<W>& level) {
+template <int W, class AnyRod>
+[[gnu::flatten]] void balance(const AnyRod& rod, Level<W>& level) {
   using T = Lanes<W>;
   const int n = level.elements;
   const double h = level.h();
   level.energy = T(0.0);
   for (int i = 0; i < n; ++i) {
-    const auto e = element_moment(rod, level.frame[i], level.frame[i + 1], T(h), T(double(n)));
+    const auto e = element_moment(section(rod, i, n), level.frame[i], level.frame[i + 1], T(h), T(double(n)));
     const T weight = rod.gamma * T((1.0 - i * h) * h);
     const Vec3<T> t = direction1(level.frame[i]);
     const Vec3<T> world = jacobian_transposed(e.log, e.moment) - T(0.5) * weight_torque(weight, t);
@@ -106,9 +123,9 @@ void fill_odd_nodes(std::vector<Difference<T>>& field) {
 
 // Start a level from the one of half as many elements: cubic Hermite interpolation of the frames. Where a still coarser
 // level is known, the error it shows is taken off first: y_h = y_2h - (y_4h - y_2h) / 4 + O(h^4).
-template <int W>
-[[gnu::flatten]] void start_from(const Rod<Lanes<W>>& rod, const Level<W>& coarse, const Level<W>* coarser,
-                                 Level<W>& level, std::vector<Difference<Lanes<W>>>& error) {
+template <int W, class AnyRod>
+[[gnu::flatten]] void start_from(const AnyRod& rod, const Level<W>& coarse, const Level<W>* coarser, Level<W>& level,
+                                 std::vector<Difference<Lanes<W>>>& error) {
   using T = Lanes<W>;
   const int n = coarse.elements;
   const T eighth(0.125 * coarse.h());
@@ -121,7 +138,7 @@ template <int W>
   Quat<T> spin_before{};
   for (int i = 0; i <= n; ++i) {
     const Quat<T> q = renormalized(coarse.frame[i] * retraction(T(-0.25) * error[i].turn));
-    const Quat<T> spin_here = spin(q, curvature(rod, coarse.moment[i] - T(0.25) * error[i].moment));
+    const Quat<T> spin_here = spin(q, curvature(node_section(rod, i, n), coarse.moment[i] - T(0.25) * error[i].moment));
     level.frame[2 * i] = q;
     if (i > 0) {
       const Quat<T> before = level.frame[2 * i - 2];

@@ -63,8 +63,8 @@ struct Sweep {
 //
 // What makes the Hessian indefinite far from equilibrium is the weight of the parts that point up: at a node of weight
 // w its least curvature is -w (1 + t_z) / 2. That much, times `shift`, is added to the node's diagonal.
-template <int W>
-[[gnu::flatten]] Sweep<W> eliminate(const Rod<Lanes<W>>& rod, int elements, Lanes<W> shift, NewtonWorkspace<W>& work) {
+template <int W, class AnyRod>
+[[gnu::flatten]] Sweep<W> eliminate(const AnyRod& rod, int elements, Lanes<W> shift, NewtonWorkspace<W>& work) {
   using T = Lanes<W>;
   const double h = 1.0 / elements, inverse_h = elements;
   Sweep<W> sweep{T(0.0), T(0.0), T(0.0), Mask<W>(true), Mask<W>(true)};
@@ -86,8 +86,9 @@ template <int W>
 
   for (int i = 0; i < elements; ++i) {
     const Quat<T> a = work.trial[i], b = work.trial[i + 1];
-    const auto moment = element_moment(rod, a, b, T(h), T(inverse_h));
-    const Element<T> e = element(rod, moment, T(inverse_h));
+    const auto& here = section(rod, i, elements);
+    const auto moment = element_moment(here, a, b, T(h), T(inverse_h));
+    const Element<T> e = element(here, moment, T(inverse_h));
     sweep.energy = sweep.energy + e.energy;
     cosine_least = select(less(moment.cosine, cosine_least), moment.cosine, cosine_least);
 
@@ -126,15 +127,15 @@ template <int W>
 // Minimise the energy from level.frame until a Newton step turns no node by more than `tolerance` [rad], and take that
 // step too: the error left is of the order of its square. A start that symmetry holds on a saddle (a planar rod that
 // would rather leave its plane) ends balanced: converged, but not stable.
-template <int W>
-void minimise(const Rod<Lanes<W>>& rod, Level<W>& level, NewtonWorkspace<W>& work, double tolerance) {
+template <int W, class AnyRod>
+void minimise(const AnyRod& rod, Level<W>& level, NewtonWorkspace<W>& work, double tolerance) {
   using T = Lanes<W>;
   const int n = level.elements;
   for (int i = 0; i <= n; ++i) work.trial[i] = level.frame[i];
   for (int i = 0; i <= n; ++i) work.step[i] = Vec3<T>{T(0.0), T(0.0), T(0.0)};
 
   // Rounding noise of an energy of this size must not look like an ascent.
-  const T scale = T(1.0) + rod.gamma + rod.phi0 * rod.phi0 + rod.phi1 * rod.phi1;
+  const T scale = energy_scale(rod);
   const T slack = T(1e-12) * scale;
   const T balance = T(1e-11) * scale;
   T base_energy(1e300), slope(0.0), length(0.0), shift(1.0);

@@ -27,18 +27,17 @@ struct NodeJets {
 };
 
 // Everything but the position, which is a sum over the nodes before.
-template <class T>
-NodeJets<T> node_jet(const Rod<T>& rod, double s, Quat<T> q, Vec3<T> m) {
+template <class T, class Section>
+NodeJets<T> node_jet(const Section& section, T gamma, double s, Quat<T> q, Vec3<T> m) {
   const Vec3<T> d1 = direction1(q), d2 = direction2(q), d3 = direction3(q);
   const Vec3<T> g{-d1.z, -d2.z, -d3.z};
-  const Vec3<T> kappa = curvature(rod, m);
-  const T load = rod.gamma * T(1.0 - s);
+  const Vec3<T> kappa = curvature(section, m);
+  const T load = gamma * T(1.0 - s);
   const auto turned_by_tangent = [](Vec3<T> v) { return Vec3<T>{T(0.0), -v.z, v.y}; };  // e_x x v
   const Vec3<T> dm = cross(m, kappa) - load * turned_by_tangent(g);
-  const Vec3<T> dkappa{dm.x / rod.twist_stiffness, dm.y, dm.z};
+  const Vec3<T> dkappa = curvature_rate(section, dm);
   const Vec3<T> dg = cross(g, kappa);
-  const Vec3<T> ddm =
-      cross(dm, kappa) + cross(m, dkappa) + rod.gamma * turned_by_tangent(g) - load * turned_by_tangent(dg);
+  const Vec3<T> ddm = cross(dm, kappa) + cross(m, dkappa) + gamma * turned_by_tangent(g) - load * turned_by_tangent(dg);
   const Quat<T> dq = spin(q, kappa);
   const Quat<T> ddq = spin(dq, kappa) + spin(q, dkappa);
   // t' = R (kappa x e_x), t'' = R (kappa x (kappa x e_x) + kappa' x e_x)
@@ -54,14 +53,14 @@ Field hermite(const SamplePoint& p, const Jet<Field>& a, const Jet<Field>& b) {
          (T(p.weight[3]) * b.y + T(p.weight[4]) * b.d1 + T(p.weight[5]) * b.d2);
 }
 
-template <int W>
-[[gnu::flatten]] void node_jets(const Rod<Lanes<W>>& rod, const Limit<W>& limit,
-                                std::vector<NodeJets<Lanes<W>>>& nodes) {
+template <int W, class AnyRod>
+[[gnu::flatten]] void node_jets(const AnyRod& rod, const Limit<W>& limit, std::vector<NodeJets<Lanes<W>>>& nodes) {
   using T = Lanes<W>;
   const int n = static_cast<int>(limit.frame.size()) - 1;
   const double h = 1.0 / n;
   nodes.resize(n + 1);
-  for (int i = 0; i <= n; ++i) nodes[i] = node_jet(rod, i * h, limit.frame[i], limit.moment[i]);
+  for (int i = 0; i <= n; ++i)
+    nodes[i] = node_jet(node_section(rod, i, n), rod.gamma, i * h, limit.frame[i], limit.moment[i]);
   // Quintic Hermite quadrature of the tangent, error O(h^7) per interval.
   for (int i = 0; i < n; ++i) {
     const NodeJets<T>&a = nodes[i], &b = nodes[i + 1];
@@ -84,9 +83,9 @@ void scatter(Vec3<Lanes<W>> v, double* out, std::int64_t stride, int step, Mask<
 }
 
 // Sample the masked ones of the first `count` lanes into rods begin ... begin + count of the batch.
-template <int W>
-[[gnu::flatten]] void sample(const Rod<Lanes<W>>& rod, const std::vector<NodeJets<Lanes<W>>>& nodes,
-                             const std::vector<SamplePoint>& points, const RodBatch& batch, Mask<W> mask,
+template <int W, class AnyRod>
+[[gnu::flatten]] void sample(const AnyRod& rod, const std::vector<NodeJets<Lanes<W>>>& nodes,
+                             const std::vector<SamplePoint>& points, const RodOutput& output, Mask<W> mask,
                              std::int64_t begin, int count) {
   using T = Lanes<W>;
   const std::int64_t stride = 3 * static_cast<std::int64_t>(points.size());
@@ -94,11 +93,11 @@ template <int W>
     const SamplePoint& p = points[j];
     const NodeJets<T>&a = nodes[p.node], &b = nodes[p.node + 1];
     const Quat<T> q = normalized(hermite<T>(p, a.frame, b.frame));
-    const Vec3<T> kappa = curvature(rod, hermite<T>(p, a.moment, b.moment));
+    const Vec3<T> kappa = curvature(point_section(rod, static_cast<int>(j)), hermite<T>(p, a.moment, b.moment));
     const std::int64_t at = begin * stride + 3 * static_cast<std::int64_t>(j);
-    scatter(hermite<T>(p, a.centerline, b.centerline), batch.centerline + at, stride, 1, mask, count);
-    scatter(kappa, batch.curvature + at, stride, 1, mask, count);
-    double* frame = batch.frame + 3 * at;
+    scatter(hermite<T>(p, a.centerline, b.centerline), output.centerline + at, stride, 1, mask, count);
+    scatter(kappa, output.curvature + at, stride, 1, mask, count);
+    double* frame = output.frame + 3 * at;
     scatter(direction1(q), frame, 3 * stride, 3, mask, count);
     scatter(direction2(q), frame + 1, 3 * stride, 3, mask, count);
     scatter(direction3(q), frame + 2, 3 * stride, 3, mask, count);

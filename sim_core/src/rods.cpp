@@ -16,11 +16,14 @@ constexpr int start_elements_min = 24;
 }  // namespace
 
 std::vector<RodKernelChoice> rod_kernels() {
-  std::vector<RodKernelChoice> kernels{{"scalar", solve_rods_scalar, true}, {"baseline", solve_rods_baseline, true}};
+  std::vector<RodKernelChoice> kernels{{"scalar", solve_rods_scalar, solve_general_rods_scalar, true},
+                                       {"baseline", solve_rods_baseline, solve_general_rods_baseline, true}};
 #ifdef SIM_CORE_X86_64_KERNELS
   __builtin_cpu_init();
-  kernels.push_back({"x86-64-v3", solve_rods_x86_64_v3, __builtin_cpu_supports("x86-64-v3") != 0});
-  kernels.push_back({"x86-64-v4", solve_rods_x86_64_v4, __builtin_cpu_supports("x86-64-v4") != 0});
+  kernels.push_back(
+      {"x86-64-v3", solve_rods_x86_64_v3, solve_general_rods_x86_64_v3, __builtin_cpu_supports("x86-64-v3") != 0});
+  kernels.push_back(
+      {"x86-64-v4", solve_rods_x86_64_v4, solve_general_rods_x86_64_v4, __builtin_cpu_supports("x86-64-v4") != 0});
 #endif
   return kernels;
 }
@@ -39,7 +42,7 @@ int default_start_level(int elements) {
   return level;
 }
 
-void check_rods(const RodSettings& settings, int points, const double* phi0, const double* phi1, std::int64_t n) {
+void check_settings(const RodSettings& settings, int points, double curvature_max) {
   if (points < 2) throw std::invalid_argument("points: must be at least 2, got " + std::to_string(points));
   if (settings.elements < elements_min || settings.elements % 4 != 0) {
     throw std::invalid_argument("elements: must be a multiple of 4 and at least " + std::to_string(elements_min) +
@@ -48,15 +51,19 @@ void check_rods(const RodSettings& settings, int points, const double* phi0, con
   if (settings.start_level < 0 || settings.start_level > 2) {
     throw std::invalid_argument("start_level: must be 0, 1 or 2, got " + std::to_string(settings.start_level));
   }
-  double turn = 0.0;
-  for (std::int64_t i = 0; i < n; ++i) turn = std::max(turn, std::hypot(phi0[i], phi1[i]));
-  if (turn > element_turn_max * (settings.elements / 4)) {
+  if (curvature_max > element_turn_max * (settings.elements / 4)) {
     std::ostringstream message;
-    message << "elements: must be at least 4 |(phi0, phi1)| / " << element_turn_max
+    message << "elements: must be at least 4 |natural curvature| / " << element_turn_max
             << " so that every element turns by less than half a turn, got " << settings.elements
-            << " for |(phi0, phi1)| = " << turn;
+            << " for |natural curvature| = " << curvature_max;
     throw std::invalid_argument(message.str());
   }
+}
+
+void check_rods(const RodSettings& settings, int points, const double* phi0, const double* phi1, std::int64_t n) {
+  double curvature = 0.0;
+  for (std::int64_t i = 0; i < n; ++i) curvature = std::max(curvature, std::hypot(phi0[i], phi1[i]));
+  check_settings(settings, points, curvature);
 }
 
 std::vector<SamplePoint> sample_points(int points, int elements) {

@@ -19,27 +19,37 @@ struct SamplePoint {
   double weight[6];  // of y, y', y'' at node, then at node + 1
 };
 
-// Inputs and outputs of n rods, all row-major; see rods.py for the conventions.
+// What is computed of n rods, row-major; see rods.py for the conventions.
+struct RodOutput {
+  double* centerline;        // (n, points, 3), L
+  double* curvature;         // (n, points, 3), 1/L
+  double* frame;             // (n, points, 3, 3): row-major R, whose columns are d1, d2, d3
+  double* energy;            // (n), EI/L
+  double* residual;          // (n), EI/L: largest out-of-balance nodal moment before the last step
+  double* refinement;        // (n), rad: largest turn of a frame by the extrapolation's last term
+  std::int32_t* iterations;  // (n)
+  bool *converged, *stable;  // (n)
+};
+
+// n uniform rods.
 struct RodBatch {
   const double *gamma, *phi0, *phi1;  // (n): weight, natural twist, natural bend
-  double* centerline;                 // (n, points, 3), L
-  double* curvature;                  // (n, points, 3), 1/L
-  double* frame;                      // (n, points, 3, 3): row-major R, whose columns are d1, d2, d3
-  double* energy;                     // (n), EI/L
-  double* residual;                   // (n), EI/L: largest out-of-balance nodal moment before the last step
-  double* refinement;                 // (n), rad: largest turn of a frame by the extrapolation's last term
-  std::int32_t* iterations;           // (n)
-  bool *converged, *stable;           // (n)
+  RodOutput output;
 };
 
 // A solver of the rods [begin, end) of a batch.
 using RodKernel = void (*)(const RodBatch&, const RodSettings&, const std::vector<SamplePoint>&, std::int64_t begin,
                            std::int64_t end);
 
+struct GeneralRodBatch;  // general_rods.hpp
+using GeneralRodKernel = void (*)(const GeneralRodBatch&, const RodSettings&, const std::vector<SamplePoint>&,
+                                  std::int64_t begin, std::int64_t end);
+
 // A kernel compiled for one instruction set. All of them return the same bits.
 struct RodKernelChoice {
   const char* name;
   RodKernel solve;
+  GeneralRodKernel solve_general;
   bool supported;  // by this processor
 };
 
@@ -52,7 +62,11 @@ RodKernelChoice best_rod_kernel();
 // phi0 0.2 ... 12, phi1 6 ... 20: 16 elements fail in 0.4 % of the rods, 24 in none.
 int default_start_level(int elements);
 
-// Throw std::invalid_argument for settings that the solver cannot run, or cannot run for these n rods.
+// Throw std::invalid_argument for settings that the solver cannot run, or cannot run for a natural curvature this
+// large.
+void check_settings(const RodSettings& settings, int points, double curvature_max);
+
+// The same for n uniform rods.
 void check_rods(const RodSettings& settings, int points, const double* phi0, const double* phi1, std::int64_t n);
 
 // `points` points of uniform arc length from s = 0 to s = 1, both included.

@@ -7,7 +7,17 @@ import stickslip_sim_core
 
 
 def test_exported_names() -> None:
-    assert set(stickslip_sim_core.__all__) == {"BuildInfo", "RodSolution", "build_info", "solve_rods"}
+    assert set(stickslip_sim_core.__all__) == {
+        "BuildInfo",
+        "OtherMinima",
+        "RodSolution",
+        "build_info",
+        "other_minima",
+        "reach",
+        "self_contact_distance",
+        "solve_general_rods",
+        "solve_rods",
+    }
 
 
 def test_import_needs_numpy_only() -> None:

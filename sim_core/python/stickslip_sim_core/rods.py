@@ -87,8 +87,8 @@ def solve_rods(
         raise ValueError(f"gamma: must be >= 0, got {gamma.min()}")
     if not -1.0 < poisson <= 0.5:
         raise ValueError(f"poisson: must be in (-1, 0.5], got {poisson}")
-    _check_count("elements", elements)
-    _check_count("points", points)
+    check_count("elements", elements)
+    check_count("points", points)
     result = _sim_core.solve_rods(gamma, phi0, phi1, 1.0 / (1.0 + poisson), elements, points)
     return RodSolution(*result)
 
@@ -98,16 +98,26 @@ def _finite_vector(name: str, values: ArrayLike) -> Floats:
     vector = np.asarray(values)
     if vector.ndim != 1:
         raise ValueError(f"{name}: must be one-dimensional, got shape {vector.shape}")
-    if vector.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: must be real numbers, got dtype {vector.dtype}")
-    vector = np.ascontiguousarray(vector, dtype=np.float64)
-    wrong = np.flatnonzero(~np.isfinite(vector))
+    return finite_array(name, vector, (None,))
+
+
+def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
+    """Return `values` as contiguous float64 of this shape, None standing for any extent."""
+    array = np.asarray(values)
+    if array.ndim != len(shape) or any(b not in (None, a) for a, b in zip(array.shape, shape, strict=True)):
+        asked = ", ".join("any" if extent is None else str(extent) for extent in shape)
+        raise ValueError(f"{name}: must have shape ({asked}), got shape {array.shape}")
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: must be real numbers, got dtype {array.dtype}")
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    wrong = np.argwhere(~np.isfinite(array))
     if wrong.size:
-        raise ValueError(f"{name}: must be finite, got {vector[wrong[0]]} at index {wrong[0]}")
-    return vector
+        index = ", ".join(map(str, wrong[0]))
+        raise ValueError(f"{name}: must be finite, got {array[tuple(wrong[0])]} at index {index}")
+    return array
 
 
-def _check_count(name: str, value: int) -> None:
+def check_count(name: str, value: int) -> None:
     """Refuse what is no integer; its range is the C++ core's rule."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"{name}: must be an integer, got {value!r}")
