@@ -9,9 +9,15 @@ import stickslip_sim_core
 def test_exported_names() -> None:
     assert set(stickslip_sim_core.__all__) == {
         "BuildInfo",
+        "NaturalCurvature",
+        "NaturalFit",
         "OtherMinima",
+        "ParameterFit",
         "RodSolution",
         "build_info",
+        "fit_natural_curvature",
+        "fit_parameters",
+        "natural_curvature",
         "other_minima",
         "reach",
         "self_contact_distance",
