@@ -1,6 +1,8 @@
 #include "rod_chain.hpp"
 
 #include <Eigen/LU>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "general_rod.hpp"
@@ -33,10 +35,18 @@ Quat<T> frame(const Rows4& q, Eigen::Index i) { return {q(i, 0), {q(i, 1), q(i, 
 
 void set_frame(Rows4& rows, Eigen::Index i, Quat<T> q) { rows.row(i) << q.w.v[0], q.v.x.v[0], q.v.y.v[0], q.v.z.v[0]; }
 
+void check_rows(const char* name, Eigen::Index rows, Eigen::Index asked) {
+  if (rows != asked || asked < 1) {
+    throw std::invalid_argument(std::string(name) + ": must have " + std::to_string(asked) + " rows, got " +
+                                std::to_string(rows));
+  }
+}
+
 }  // namespace
 
 ChainEquilibrium relax_chain(const RodChain& chain, const Rows4& quaternions) {
   const int n = static_cast<int>(chain.natural.rows());
+  check_rows("quaternions", quaternions.rows(), n + 1);
   // A chain reads the middles of its elements only: every second value of the grid.
   std::vector<Vec3<T>> natural(2 * n + 1, Vec3<T>{T(0.0), T(0.0), T(0.0)});
   for (int i = 0; i < n; ++i) natural[2 * i + 1] = lanes(chain.natural.row(i));
@@ -78,6 +88,8 @@ Rows3 chain_centerline(const Rows4& quaternions) {
 
 RowMajor chain_jacobian(const RodChain& chain, const Rows4& quaternions, const RowMajor& basis, int stride) {
   const int n = static_cast<int>(chain.natural.rows());
+  check_rows("quaternions", quaternions.rows(), n + 1);
+  check_rows("basis", basis.rows(), n);
   const Eigen::Index columns = 1 + 3 * basis.cols();
   const double h = 1.0 / n;
   std::vector<Eigen::Matrix3d> diagonal(n + 1, Eigen::Matrix3d::Zero()), upper(n);

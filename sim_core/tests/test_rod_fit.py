@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import RodSolution, fit_natural_curvature, fit_parameters, solve_general_rods, solve_rods
+from stickslip_sim_core import (
+    RodSolution,
+    _sim_core,
+    fit_natural_curvature,
+    fit_parameters,
+    solve_general_rods,
+    solve_rods,
+)
 from stickslip_sim_core.general_rods import CLAMP_FRAME
 from stickslip_sim_core.rod_fit import _Model, _parameters, _State
 from stickslip_sim_core.splines import bspline_matrix
@@ -68,6 +75,13 @@ class TestModel:
             values = [m.centerline.ravel() for m in moved if m is not None]
             difference = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
             np.testing.assert_allclose(jacobian[:, column], difference, atol=2e-9)
+
+    def test_core_refuses_rows_that_disagree(self) -> None:
+        clamp, natural = np.array([[0.5, 0.5, 0.5, -0.5]]), np.zeros((4, 3))
+        with pytest.raises(ValueError, match=r"quaternions: must have 5 rows, got 1"):
+            _sim_core.relax_chain(1.0, np.ones(3), natural, clamp)
+        with pytest.raises(ValueError, match=r"basis: must have 4 rows, got 3"):
+            _sim_core.chain_jacobian(1.0, np.ones(3), natural, np.tile(clamp, (5, 1)), np.ones((3, 1)), 1)
 
     def test_a_step_out_of_reach_is_no_state(self) -> None:
         model, state, _ = self.hung(20)

@@ -120,6 +120,7 @@ def fit_parameters(
 
     Raises:
         ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
     model = _Model.of(len(data), stiffness, clamp_frame, intervals=None)
@@ -173,6 +174,7 @@ def fit_natural_curvature(
 
     Raises:
         ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
     check_count("intervals", intervals)
