@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
-from stickslip_sim_core.protocols import Curve, ProtocolResult, bend_twist, rod_cantilever
+from stickslip_sim_core.protocols import Curve, ProtocolResult, bend_twist, rod_cantilever, rod_lateral_buckling
 from stickslip_sim_core.protocols.rod_chain import extrapolated, planar_frames, round_rod, tip
 
 
@@ -53,6 +53,17 @@ class TestRodCantilever:
 
     def test_coarse_chain_fails(self) -> None:
         assert not rod_cantilever.run(elements=64).passed
+
+
+class TestRodLateralBuckling:
+    def test_passes(self) -> None:
+        result = protocols.run("rod-lateral-buckling")
+        assert result.passed
+        assert result.error < 1e-8
+
+    def test_strip_that_bends_in_its_plane_buckles_later(self) -> None:
+        weights = [rod_lateral_buckling.buckling_weight(0.3, ratio, 64) for ratio in (1e2, 1e3, 1e4)]
+        assert weights[0] > weights[1] > weights[2]
 
 
 class TestRelax:

@@ -4,13 +4,14 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_sim_core.protocols import bend_twist, rod_cantilever
+from stickslip_sim_core.protocols import bend_twist, rod_cantilever, rod_lateral_buckling
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 
 PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
     {
         "bend-twist": bend_twist.run,
         "rod-cantilever": rod_cantilever.run,
+        "rod-lateral-buckling": rod_lateral_buckling.run,
     }
 )
 

@@ -35,14 +35,17 @@ def plot(result: ProtocolResult) -> "Figure":
         above.plot(curve.x, curve.master, color=colour, label=f"master curve {label}".strip())
         above.plot(curve.x, curve.measured, "o", color=colour, markerfacecolor="none", label="measured")
         below.plot(curve.x, np.maximum(np.abs(curve.errors), 1e-16), "o", color=colour, markersize=3)
-    above.set(xscale="log", yscale="log", ylabel=result.y_name, title=f"{result.protocol}: {_verdict(result)}")
+    scale = "log" if min(result.curves[0].x) > 0.0 else "linear"
+    above.set(xscale=scale, yscale=scale, ylabel=result.y_name, title=f"{result.protocol}: {_verdict(result)}")
+    if scale == "linear":
+        above.set_ylim(0.0, 1.3 * max(y for curve in result.curves for y in curve.master))
     above.legend(fontsize="small")
     below.axhline(result.tolerance, color="black", linestyle="--", linewidth=1)
     below.text(
         0.01, result.tolerance, "tolerance", transform=below.get_yaxis_transform(), va="bottom", fontsize="small"
     )
     below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(1e-16, 50 * result.tolerance))
-    if max(result.curves[0].x) < 100.0 * min(result.curves[0].x):
+    if scale == "log" and max(result.curves[0].x) < 100.0 * min(result.curves[0].x):
         below.xaxis.set_major_formatter(ScalarFormatter())
         below.xaxis.set_minor_formatter(ScalarFormatter())
     return figure
