@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from stickslip_sim_core import _sim_core, build_info, master_curves
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.result import Curve, ProtocolResult, Setting
 from stickslip_sim_core.protocols.rod_chain import (
     Equilibrium,
     Floats,
@@ -38,7 +38,7 @@ def run(*, poisson: Sequence[float] = POISSON, elements: int = 128, tolerance: f
     measured = tuple(rigid_limit(nu, elements) for nu in poisson)
     master = (master_curves.lateral_buckling_rod(),) * len(measured)
     curve = Curve({}, tuple(float(nu) for nu in poisson), measured, master)
-    settings = {"elements": elements, "stiffness_ratios": STIFFNESS_RATIOS}
+    settings: dict[str, Setting] = {"elements": elements, "stiffness_ratios": STIFFNESS_RATIOS}
     return ProtocolResult(
         "rod-lateral-buckling",
         "poisson",
