@@ -1,6 +1,8 @@
 """A made-up dataset of rods: its tasks, and what its arrays must hold."""
 
+import gc
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -29,6 +31,7 @@ from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
 from stickslip_workers.stages.records import encode_records
 
+os.environ["RAY_AUTH_MODE"] = "token"  # Ray looks once, when it is first imported, and test_failures imports it
 HERE = str(Path(__file__).parent)
 sys.path.append(HERE)  # coordinator_double, fake_renderer
 
@@ -147,5 +150,8 @@ def cluster_cpus() -> Iterator[int]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", HERE)
-        with ray_cluster(name=f"tests-{os.getpid()}", address=None, cpus=2) as cpus:
+        with ray_cluster(name="tests", address=None, cpus=2) as cpus:
+            processes = [thing for thing in gc.get_objects() if isinstance(thing, subprocess.Popen)]
             yield cpus
+        for process in processes:
+            process.wait(timeout=30)  # Ray ends its processes and does not wait, of which Python warns

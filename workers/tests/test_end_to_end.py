@@ -1,7 +1,6 @@
 """The command line against the real coordinator and the real renderer, each in its own process."""
 
 import contextlib
-import os
 import re
 import signal
 import subprocess
@@ -55,7 +54,7 @@ class Services:
         return _wait_for(f"{pattern!r} in {log}.log", lambda: re.search(pattern, path.read_text()))
 
     def dispatch(self, log: str) -> subprocess.Popen[bytes]:
-        name = f"end-to-end-{os.getpid()}"
+        name = "end-to-end"
         process = self._start(
             log, "stickslip_workers", "dispatch", "--url", self.url, "--store", self.store, "--name", name
         )

@@ -68,11 +68,6 @@ class Pool:
         """Number of processes, whatever they do."""
         return len(self._starting) + len(self._idle) + len(self._busy)
 
-    @property
-    def idle_count(self) -> int:
-        """Number of processes that could take a task at once."""
-        return len(self._idle)
-
     def waiting_refs(self) -> list[Any]:
         """Return the references that tell when processes have started."""
         return [process.described for process in self._starting]
