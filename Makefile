@@ -44,7 +44,7 @@ test: setup check
 check: setup
 	$(PY) -m ruff format --check .
 	$(PY) -m ruff check .
-	$(PY) -m clang_format --dry-run --Werror $(CPP_FILES)
+	.venv/bin/clang-format --dry-run --Werror $(CPP_FILES)
 	$(PY) -m mypy $(wildcard */src) sim_core/python workers/blender/src examples benchmarks
 	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
 
