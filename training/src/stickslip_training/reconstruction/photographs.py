@@ -1,0 +1,125 @@
+"""A user's photographs: a folder with one picture for each camera of a calibration file, named as the camera."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+from stickslip_schemas.cameras import Camera, read_rigs
+
+from stickslip_training.reconstruction.overlay import import_pillow, save_overlay
+from stickslip_training.reconstruction.reconstruct import Reconstruction, ReconstructionError, reconstruct
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, slots=True)
+class FolderReconstruction:
+    """What came of a folder: the reconstruction, and what it was made from."""
+
+    reconstruction: Reconstruction
+    cameras: tuple[Camera, ...]
+    views: list[npt.NDArray[np.uint8]]
+    """Pictures (y, x, rgb) in the order of the cameras."""
+    length: float
+    """In the unit of the calibration."""
+
+
+def reconstruct_folder(
+    folder: str | Path,
+    calibration: str | Path,
+    *,
+    length: float,
+    clamp: npt.ArrayLike = (0.0, 0.0, 0.0),
+    direction: npt.ArrayLike = (0.0, 0.0, -1.0),
+    rig: str | None = None,
+    points: int = 150,
+    radius: float | None = None,
+) -> FolderReconstruction:
+    """Reconstruct the rod in the photographs of a folder.
+
+    The calibration is laid out as stickslip_schemas/cameras.toml; `rig` says which of its rigs, if there are several.
+    Lengths and positions are in its unit. Photographs must have been freed of lens distortion.
+    """
+    cameras = read_calibration(calibration, rig)
+    views = [read_photograph(Path(folder), camera) for camera in cameras]
+    found = reconstruct(views, cameras, length=length, clamp=clamp, direction=direction, points=points, radius=radius)
+    return FolderReconstruction(found, cameras, views, length)
+
+
+def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, ...]:
+    """Return the cameras of a rig of a calibration file; errors name the field, the rule and the value."""
+    try:
+        rigs = read_rigs(path)
+    except ValidationError as error:
+        told = [
+            f"{'.'.join(map(str, item['loc']))}: {item['msg']}; got {item['input']!r}"
+            for item in error.errors(include_url=False)
+        ]
+        raise ReconstructionError(f"{path}: " + "\n  ".join(told)) from error
+    except tomllib.TOMLDecodeError as error:
+        raise ReconstructionError(f"{path}: not TOML: {error}") from error
+    names = ", ".join(rigs)
+    if rig is None:
+        if len(rigs) != 1:
+            raise ReconstructionError(f"rig must be given where a calibration has several; {path} has {names}")
+        return next(iter(rigs.values()))
+    if rig not in rigs:
+        raise ReconstructionError(f"rig must be one of {names} in {path}; got {rig!r}")
+    return rigs[rig]
+
+
+def read_photograph(folder: Path, camera: Camera) -> npt.NDArray[np.uint8]:
+    """Return the one picture of a folder that is named as the camera, upright as its EXIF says, (y, x, rgb)."""
+    image = import_pillow()
+    from PIL import ImageOps
+
+    named = [path for path in sorted(folder.glob("*")) if path.stem == camera.name and path.suffix.lower() in ENDINGS]
+    if len(named) != 1:
+        wanted = " or ".join(camera.name + ending for ending in ENDINGS)
+        raise ReconstructionError(f"{folder} must hold one picture {wanted}; found {len(named)}")
+    with image.open(named[0]) as photograph:
+        return np.asarray(ImageOps.exif_transpose(photograph).convert("RGB"))
+
+
+def write_results(result: FolderReconstruction, out: Path) -> list[str]:
+    """Write centerline.csv, centerline.npz, overlay.png and report.json; return their names."""
+    out.mkdir(parents=True, exist_ok=True)
+    found = result.reconstruction
+    s = np.linspace(0.0, result.length, len(found.centerline))
+    table = np.column_stack([s, found.centerline, found.deviation, found.views_seen])
+    header = "arc_length,x,y,z,deviation,views_seen"
+    np.savetxt(out / "centerline.csv", table, fmt=["%.9g"] * 5 + ["%d"], delimiter=",", header=header, comments="")
+    np.savez(
+        out / "centerline.npz",
+        arc_length=s,
+        centerline=found.centerline,
+        deviation=found.deviation,
+        residual=found.residual,
+        views_seen=found.views_seen,
+    )
+    save_overlay(out / "overlay.png", result.views, result.cameras, found.centerline)
+    report = {
+        "verdict": found.verdict.value,
+        "reasons": list(found.reasons),
+        "length": result.length,
+        "radius": found.radius,
+        "points": len(found.centerline),
+        "misfit": found.misfit,
+        "unexplained": found.unexplained,
+        "unsupported": found.unsupported,
+        "rival": found.rival if np.isfinite(found.rival) else None,
+        "residual_rms_px": found.residual_rms,
+        "residual_rms_px_by_view": {
+            camera.name: float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else None
+            for camera, row in zip(result.cameras, found.residual, strict=True)
+        },
+        "median_deviation": float(np.median(found.deviation)),
+    }
+    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return ["centerline.csv", "centerline.npz", "overlay.png", "report.json"]

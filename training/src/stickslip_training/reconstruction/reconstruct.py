@@ -1,0 +1,296 @@
+"""From calibrated views of a hanging rod to its centreline.
+
+1. Silhouettes: the coverage of each pixel [silhouette].
+2. Starts: ways through all silhouettes at once, from the clamp, as long as the rod [tracking], and the centroid of a
+   cylinder that moves through the visual hull, as in the thesis [hull].
+3. Each start is moved until a tube about it looks as the views do [refinement]; the one that does so best wins.
+4. The winner is judged: what it leaves unexplained, what it claims that is not there, and whether another curve would
+   do as well.
+
+Nothing of rods' physics is used but that they do not stretch and bend smoothly, so hair and tendrils will do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.cameras import Camera
+
+from stickslip_training.reconstruction import curve
+from stickslip_training.reconstruction.hull import HullTooLargeError, moving_cylinder, visual_hull
+from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
+from stickslip_training.reconstruction.silhouette import NoRodError, silhouette_of_light, to_linear
+from stickslip_training.reconstruction.tracking import follow
+from stickslip_training.reconstruction.view import View, shrink_image
+
+Floats = npt.NDArray[np.float64]
+
+CONTROL_POINTS = 44
+STARTS = 4  # ways of the tracking that are refined
+APART = 0.02  # [L]: curves that are farther apart anywhere are different curves
+HOPELESS = 10.0  # a start whose coarse fit costs so many times the best one's is given up
+LARGEST_IMAGE = 1600  # [px]: larger pictures are averaged down
+WIDEST_ROD = 4.0  # half width [px]: of a rod that is wider, pictures are averaged down too
+SLENDER = (0.0005, 0.05)  # radius over length that is believed
+
+
+class Verdict(StrEnum):
+    """What a reconstruction is worth."""
+
+    good = "good"
+    ambiguous = "ambiguous"
+    """Another curve explains the views about as well."""
+    failed = "failed"
+    """The curve does not explain the views."""
+
+
+# Shares of the silhouettes' area; benchmarks/reconstruction.py says how they tell good from bad.
+MISFIT_MAX = 0.25
+UNEXPLAINED_MAX = 0.03
+UNSUPPORTED_MAX = 0.03
+STRETCH_MAX = 0.02
+RIVAL = 1.1  # a different curve whose misfit is less than so many times the winner's is a rival
+
+
+@dataclass(frozen=True, slots=True)
+class Reconstruction:
+    """A centreline, and how far to trust it. Lengths are in the unit of the cameras."""
+
+    centerline: Floats
+    """Positions at uniform arc length, clamp first, (points, 3)."""
+    deviation: Floats
+    """Standard deviation of each position, if pixels err independently, (points,). Wrong turns are not in it."""
+    residual: Floats
+    """By how much each view would still move each point sideways [px], (views, points); NaN where it is hidden."""
+    views_seen: npt.NDArray[np.int64]
+    """Number of views in which each point lies open, (points,)."""
+    radius: float
+    """Of the rod, given or found."""
+    misfit: float
+    """Sum of |seen - drawn| over the sum of what is seen."""
+    unexplained: float
+    """Share of the silhouettes' area where nothing is drawn."""
+    unsupported: float
+    """Share of the drawn area where nothing is seen."""
+    rival: float
+    """Misfit of the best other curve over this one's; infinite if there is none."""
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """Why the verdict is not good."""
+
+    @property
+    def residual_rms(self) -> float:
+        """Root mean square of the residuals [px]."""
+        return float(np.sqrt(np.nanmean(self.residual**2)))
+
+
+class ReconstructionError(ValueError):
+    """The views do not hold what a reconstruction needs; the message names the view."""
+
+
+def reconstruct(
+    views: npt.ArrayLike | Sequence[npt.ArrayLike],
+    cameras: Sequence[Camera],
+    *,
+    length: float = 1.0,
+    clamp: npt.ArrayLike = (0.0, 0.0, 0.0),
+    direction: npt.ArrayLike = (0.0, 0.0, -1.0),
+    points: int = 150,
+    radius: float | None = None,
+) -> Reconstruction:
+    """Return the centreline of the rod that `views` show, one picture (y, x, rgb) for each camera.
+
+    `length`, `clamp` (where the rod leaves its clamp), `direction` (of the rod there) and `radius` are in the unit and
+    the axes of the cameras. A radius that is not given is found. Pictures must be free of lens distortion.
+    """
+    if not length > 0.0:
+        raise ValueError(f"length must be positive; got {length}")
+    if radius is not None and not SLENDER[0] <= radius / length <= SLENDER[1]:
+        raise ValueError(f"radius must be {SLENDER[0]} to {SLENDER[1]} of the length; got {radius} of {length}")
+    if points < 2:
+        raise ValueError(f"points must be at least 2; got {points}")
+    origin, heading = _vector("clamp", clamp), _vector("direction", direction)
+    if not np.linalg.norm(heading) > 0.0:
+        raise ValueError("direction must not be zero")
+    heading = heading / np.linalg.norm(heading)
+    seen = _silhouettes(views, cameras, length, origin)
+    size = radius / length if radius is not None else _radius(seen)
+    fits = _refined(seen, size, heading, radius is not None)
+    judged = sorted(((_Match.of(seen, fit), fit) for fit in fits), key=lambda item: item[0].misfit)
+    match, fit = judged[0]
+    shape = curve.at_uniform_arc_length(fit.control, points)
+    rivals = [
+        other.misfit / match.misfit for other, rival in judged[1:] if _distance(rival.control, fit.control) > APART
+    ]
+    rival = min(rivals, default=float("inf"))
+    residual = _residual(seen, fit, points)
+    stretch = abs(curve.arc_length(shape)[-1] - 1.0)
+    verdict, reasons = _judge(match, rival, stretch)
+    return Reconstruction(
+        centerline=origin + length * shape,
+        deviation=length * _deviation(fit, points),
+        residual=residual,
+        views_seen=np.isfinite(residual).sum(axis=0),
+        radius=length * fit.radius,
+        misfit=match.misfit,
+        unexplained=match.unexplained,
+        unsupported=match.unsupported,
+        rival=rival,
+        verdict=verdict,
+        reasons=reasons,
+    )
+
+
+def _vector(name: str, value: npt.ArrayLike) -> Floats:
+    vector = np.asarray(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} must be three finite numbers; got {value!r}")
+    return vector
+
+
+def _silhouettes(
+    pictures: npt.ArrayLike | Sequence[npt.ArrayLike], cameras: Sequence[Camera], length: float, clamp: Floats
+) -> list[View]:
+    images = [np.asarray(picture) for picture in pictures]  # type: ignore[union-attr]
+    if len(images) != len(cameras) or len(images) < 2:
+        raise ValueError(f"there must be one view for each of at least 2 cameras; got {len(images)} for {len(cameras)}")
+    seen = []
+    for image, camera in zip(images, cameras, strict=True):
+        if image.shape[:2] != (camera.height, camera.width):
+            raise ReconstructionError(
+                f"view {camera.name!r} must be {camera.width} x {camera.height} pixels as its camera; "
+                f"got {image.shape[1]} x {image.shape[0]}"
+            )
+        try:
+            seen.append(_view(image, camera, length, clamp))
+        except NoRodError as error:
+            raise ReconstructionError(f"view {camera.name!r}: {error}") from error
+    return seen
+
+
+def _view(image: npt.NDArray[np.generic], camera: Camera, length: float, clamp: Floats) -> View:
+    factor = int(np.ceil(max(image.shape[:2]) / LARGEST_IMAGE))
+    light = shrink_image(to_linear(image), factor)
+    coverage = silhouette_of_light(light)
+    again = int(_half_width(coverage) / WIDEST_ROD * 2.0)
+    if again > 1:
+        factor, coverage = factor * again, silhouette_of_light(shrink_image(light, again))
+    return View.of(camera, coverage, length=length, clamp=clamp, factor=factor)
+
+
+def _half_width(coverage: Floats) -> float:
+    """Estimate the rod's half width [px]: a strip's is its area over half its outline."""
+    solid = np.minimum(coverage, 1.0)
+    return float(2.0 * solid.sum() / max(float(np.hypot(*np.gradient(solid)).sum()), 1e-9))
+
+
+def _radius(views: Sequence[View]) -> float:
+    """Estimate the radius [L]."""
+    found = [_half_width(view.coverage) * float(np.linalg.norm(view.t)) / view.focal for view in views]
+    return float(np.clip(np.median(found), *SLENDER))
+
+
+def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radius: bool) -> list[Fit]:
+    """Return the fits of all different starts."""
+    lines = [track.points for track in follow(views, radius, direction, STARTS)]
+    try:
+        by_hull = moving_cylinder(visual_hull(views), radius, direction)
+    except HullTooLargeError:
+        by_hull = np.zeros((1, 3))
+    if 0.8 < curve.arc_length(by_hull)[-1] < 1.2:
+        lines.append(by_hull)
+    coarse_views = [view.shrunk(2) for view in views]
+    coarse = [
+        refine(
+            coarse_views,
+            start(curve.fit(line, CONTROL_POINTS), radius, len(views)),
+            direction,
+            extra_blur=1.2,
+            shading=False,
+            fixed_radius=True,
+            iterations=10,
+        )
+        for line in lines
+    ]
+    kept: list[Fit] = []
+    for fit in sorted(coarse, key=lambda fit: fit.cost):
+        hopeless = bool(kept) and fit.cost > HOPELESS * kept[0].cost
+        if not hopeless and all(_distance(fit.control, other.control) > 0.5 * APART for other in kept):
+            kept.append(fit)
+    return [refine(views, fit, direction, fixed_radius=fixed_radius) for fit in kept]
+
+
+def _distance(one: Floats, other: Floats) -> float:
+    """Return the largest distance of two curves at the same arc length [L]."""
+    a, b = (curve.at_uniform_arc_length(control, 100) for control in (one, other))
+    return float(np.linalg.norm(a - b, axis=1).max())
+
+
+@dataclass(frozen=True, slots=True)
+class _Match:
+    """How a fit and the views agree, by area."""
+
+    misfit: float
+    unexplained: float
+    unsupported: float
+
+    @classmethod
+    def of(cls, views: Sequence[View], fit: Fit) -> _Match:
+        s = samples(views, fit)
+        seen_sum = drawn_sum = difference = unexplained = unsupported = 0.0
+        for index, view in enumerate(views):
+            image = draw(view, index, fit, s)
+            drawn = np.zeros(view.coverage.size)
+            drawn[image.pixel] = image.value
+            known = np.ones(view.coverage.size, dtype=bool)
+            known[image.left_out] = False
+            seen, drawn = np.minimum(view.coverage.ravel(), 1.5)[known], drawn[known]
+            seen_sum += seen.sum()
+            drawn_sum += drawn.sum()
+            difference += np.abs(seen - drawn).sum()
+            unexplained += seen[(drawn < 0.1 * seen) & (seen > 0.3)].sum()
+            unsupported += drawn[(seen < 0.1 * drawn) & (drawn > 0.3)].sum()
+        return cls(difference / seen_sum, unexplained / seen_sum, unsupported / max(drawn_sum, 1e-9))
+
+
+def _judge(match: _Match, rival: float, stretch: float) -> tuple[Verdict, tuple[str, ...]]:
+    limits = (
+        ("misfit", match.misfit, MISFIT_MAX),
+        ("unexplained share", match.unexplained, UNEXPLAINED_MAX),
+        ("unsupported share", match.unsupported, UNSUPPORTED_MAX),
+        ("stretch", stretch, STRETCH_MAX),
+    )
+    reasons = tuple(f"{name} {value:.3f} is above {limit}" for name, value, limit in limits if value > limit)
+    if reasons:
+        return Verdict.failed, reasons
+    if rival < RIVAL:
+        return Verdict.ambiguous, (f"another curve has {rival:.2f} times the misfit; less than {RIVAL} is too close",)
+    return Verdict.good, ()
+
+
+def _deviation(fit: Fit, points: int) -> Floats:
+    B = curve.basis(np.linspace(0.0, 1.0, points), len(fit.control))
+    assert fit.covariance is not None
+    variance = sum(np.einsum("ij,jk,ik->i", B, fit.covariance[axis::3, axis::3], B) for axis in range(3))
+    deviation: Floats = np.sqrt(variance)
+    return deviation
+
+
+def _residual(views: Sequence[View], fit: Fit, points: int) -> Floats:
+    """Return, in each view, the sideways shift [px] that would fit the pixels about each point best."""
+    s = samples(views, fit)
+    residual = np.full((len(views), points), np.nan)
+    for index, view in enumerate(views):
+        image = draw(view, index, fit, s)
+        error = view.coverage.ravel()[image.pixel] - image.value
+        front = image.sides[0]
+        point = np.rint(s[front.sample] * (points - 1)).astype(np.int64)
+        pull = np.bincount(point, front.by_normal * error, points)
+        hold = np.bincount(point, front.by_normal**2, points)
+        open_ = hold > 0.05
+        residual[index, open_] = pull[open_] / hold[open_]
+    return residual

@@ -1,0 +1,278 @@
+"""Move a curve until the tube about it looks as the views do (analysis by synthesis).
+
+Unknown are the control points of the curve, the radius, the blur, and how light falls on the rod in each view. The sum
+of squares
+
+    rho((seen - drawn) / 0.05) over the pixels near the rod
+    + length, clamp and smoothness, each against what it may be off (the constants below)
+
+is reduced by Levenberg-Marquardt steps with exact derivatives of the drawing; rho is Cauchy's, so that dirt, highlights
+and specks pull little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from stickslip_training.reconstruction.curve import basis
+from stickslip_training.reconstruction.tube_image import Shading, TubeImage, tube_image
+from stickslip_training.reconstruction.view import View
+
+Floats = npt.NDArray[np.float64]
+
+PIXEL = 0.12  # of the brightness of the rod: what a pixel may be off
+ROBUST = 3.0  # in units of PIXEL: beyond it a pixel's pull falls again
+CLAMP = 1e-4  # [L]
+CLAMP_TANGENT = 0.01  # [rad]
+STRETCH = 1e-3  # of the length of each piece between two samples of the prior
+JERK = 2000.0  # third derivative of the curve [1/L^2]: a curl of radius L/20 has 400
+LIGHT = 0.3  # of the brightness of the rod about it
+SLOPE = 0.4
+LIGHT_BEND = 0.15  # second difference of light and slope from one of their nodes to the next
+LIGHT_NODES = 24
+BLUR = 0.45  # [px], to start with
+LOG_RADIUS = 0.5  # of a radius that is only estimated
+LOG_BLUR = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A curve with all that its picture needs."""
+
+    control: Floats
+    """Control points [L], (K, 3)."""
+    radius: float
+    """[L]."""
+    blur: float
+    """Standard deviation [px]."""
+    light: Floats
+    """Brightness in the middle at LIGHT_NODES places along the rod, (views, nodes)."""
+    slope: Floats
+    """What it gains from the middle to the edge, (views, nodes)."""
+    cost: float = np.inf
+    """Half the sum of squares."""
+    steps: int = 0
+    covariance: Floats | None = None
+    """Of the control points [L^2], (3 K, 3 K), if pixels err independently by what they do err."""
+
+
+def start(control: Floats, radius: float, views: int) -> Fit:
+    """Return the fit to begin with: even light."""
+    light = np.ones((views, LIGHT_NODES))
+    return Fit(control, radius, BLUR, light, np.zeros_like(light))
+
+
+def samples(views: Sequence[View], fit: Fit) -> Floats:
+    """Return the parameters at which the curve is drawn: half a pixel apart in every view, (n,)."""
+    span = max(view.focal / view.project(fit.control)[1].min() for view in views)  # [px / L]
+    return np.linspace(0.0, 1.0, int(np.clip(2.2 * span, 200, 4000)))
+
+
+def draw(view: View, index: int, fit: Fit, s: Floats, extra_blur: float = 0.0) -> TubeImage:
+    """Draw the fit as view number `index` sees it, at parameters s half a pixel apart."""
+    N = _hats(s)
+    shading = Shading(N @ fit.light[index], N @ fit.slope[index])
+    blur = float(np.hypot(fit.blur, extra_blur))
+    return tube_image(view, basis(s, len(fit.control)) @ fit.control, fit.radius, blur, shading)
+
+
+def refine(
+    views: Sequence[View],
+    fit: Fit,
+    direction: Floats | None,
+    *,
+    extra_blur: float = 0.0,
+    shading: bool = True,
+    fixed_radius: bool = False,
+    iterations: int = 30,
+    tolerance: float = 1e-4,
+) -> Fit:
+    """Minimise; `extra_blur` [px] blurs the views first, which makes the curve findable from farther off."""
+    if extra_blur > 0.0:
+        views = [replace(view, coverage=ndimage.gaussian_filter(view.coverage, extra_blur)) for view in views]
+    problem = _Problem(views, fit, direction, extra_blur, shading, fixed_radius)
+    x = problem.pack(fit)
+    system = problem.system(x)
+    damping, taken = 1e-3, 0
+    for _ in range(iterations):
+        step = system.step(damping)
+        tried = problem.system(x + step)
+        if tried.cost < system.cost:
+            gain = system.cost - tried.cost
+            x, system, damping, taken = x + step, tried, max(damping / 5.0, 1e-9), taken + 1
+            if gain < tolerance * system.cost:
+                break
+        else:
+            damping *= 8.0
+            if damping > 1e4:
+                break
+    K = len(fit.control)
+    spread = system.inverse()[: 3 * K, : 3 * K] * system.pixel_variance
+    return replace(problem.unpack(x), cost=system.cost, steps=taken, covariance=spread)
+
+
+@dataclass(frozen=True, slots=True)
+class _System:
+    cost: float
+    normal: Floats
+    gradient: Floats
+    pixel_variance: float
+
+    def step(self, damping: float) -> Floats:
+        H = self.normal + damping * np.diag(np.diag(self.normal) + 1e-9)
+        try:
+            step: Floats = -cho_solve(cho_factor(H), self.gradient)
+        except LinAlgError:
+            step = -self.gradient / (np.diag(H) + 1.0)
+        return step
+
+    def inverse(self) -> Floats:
+        H = self.normal + 1e-9 * np.diag(np.diag(self.normal) + 1e-9)
+        inverse: Floats = cho_solve(cho_factor(H), np.eye(len(H)))
+        return inverse
+
+
+class _Problem:
+    """Unknowns x = (control points, log radius, log blur, light and slope of each view) and their sum of squares."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        fit: Fit,
+        direction: Floats | None,
+        extra_blur: float,
+        shading: bool,
+        fixed_radius: bool,
+    ) -> None:
+        self._views, self._extra = views, extra_blur
+        self._K = K = len(fit.control)
+        self._s = samples(views, fit)
+        self._B = basis(self._s, K)
+        self._N = _hats(self._s)
+        self._shape = shape = fit.light.shape
+        own = np.arange(fit.light.size).reshape(shape)
+        shared = np.arange(3 * K + 2)
+        self._columns = [np.concatenate([shared, 3 * K + 2 + row, 3 * K + 2 + own.size + row]) for row in own]
+        self._free = np.ones(3 * K + 2 + 2 * fit.light.size, dtype=bool)
+        self._free[3 * K] = not fixed_radius
+        self._free[3 * K + 1] = shading
+        self._free[3 * K + 2 :] = shading
+        self._start = fit
+        self._prior_rows, self._prior_target = self._linear_priors(direction)
+        t = np.linspace(0.0, 1.0, 3 * K)
+        self._speed = basis(t, K, 1)
+
+    def pack(self, fit: Fit) -> Floats:
+        return np.concatenate(
+            [fit.control.ravel(), [np.log(fit.radius), np.log(fit.blur)], fit.light.ravel(), fit.slope.ravel()]
+        )
+
+    def unpack(self, x: Floats) -> Fit:
+        K, n = self._K, self._shape[0] * self._shape[1]
+        return Fit(
+            control=x[: 3 * K].reshape(K, 3),
+            radius=float(np.exp(x[3 * K])),
+            blur=float(np.exp(x[3 * K + 1])),
+            light=x[3 * K + 2 : 3 * K + 2 + n].reshape(self._shape),
+            slope=x[3 * K + 2 + n :].reshape(self._shape),
+        )
+
+    def system(self, x: Floats) -> _System:
+        """Return the cost at x with its gradient and Gauss-Newton matrix."""
+        fit = self.unpack(x)
+        size = len(x)
+        normal, gradient = self._prior_rows.T @ self._prior_rows, np.zeros(size)
+        error = self._prior_rows @ x - self._prior_target
+        gradient += self._prior_rows.T @ error
+        cost = 0.5 * float(error @ error)
+
+        velocity = self._speed @ fit.control
+        speed = np.linalg.norm(velocity, axis=1)
+        stretch = (speed - 1.0) / STRETCH / np.sqrt(3.0)  # three of them to a control point
+        J = (velocity / speed[:, None])[:, None, :] * self._speed[:, :, None] / STRETCH / np.sqrt(3.0)
+        J = J.reshape(len(speed), -1)
+        end = 3 * self._K
+        normal[:end, :end] += J.T @ J
+        gradient[:end] += J.T @ stretch
+        cost += 0.5 * float(stretch @ stretch)
+
+        squares, count = 0.0, 0
+        for index, view in enumerate(self._views):
+            image = draw(view, index, fit, self._s, self._extra)
+            error = (image.value - view.coverage.ravel()[image.pixel]) / PIXEL
+            weight = 1.0 / (1.0 + (error / ROBUST) ** 2)
+            cost += 0.5 * ROBUST**2 * float(np.log1p((error / ROBUST) ** 2).sum())
+            squares, count = squares + float(weight @ error**2), count + len(error)
+            J = self._derivatives(image, fit) / PIXEL
+            columns = self._columns[index]
+            normal[np.ix_(columns, columns)] += (J * weight[:, None]).T @ J
+            gradient[columns] += J.T @ (weight * error)
+        fixed = ~self._free
+        normal[fixed], normal[:, fixed], gradient[fixed] = 0.0, 0.0, 0.0
+        normal[fixed, fixed] = 1.0
+        return _System(cost, normal, gradient, squares / max(count, 1))
+
+    def _derivatives(self, image: TubeImage, fit: Fit) -> Floats:
+        """Return d I / d (control points, log radius, log blur, this view's light and slope)."""
+        K, nodes = self._K, self._shape[1]
+        J = np.zeros((len(image.pixel), 3 * K + 2 + 2 * nodes))
+        for side in image.sides:
+            B, N = self._B[side.sample], self._N[side.sample]
+            for axis in range(3):
+                J[:, axis : 3 * K : 3] += B * side.by_point[:, axis, None]
+            J[:, 3 * K] += side.by_radius
+            J[:, 3 * K + 1] += side.by_blur * fit.blur**2 / (fit.blur**2 + self._extra**2)
+            J[:, 3 * K + 2 : 3 * K + 2 + nodes] += N * side.by_light[:, None]
+            J[:, 3 * K + 2 + nodes :] += N * side.by_slope[:, None]
+        return J
+
+    def _linear_priors(self, direction: Floats | None) -> tuple[Floats, Floats]:
+        """Return rows A and targets b of the priors |A x - b|^2 that are linear in x."""
+        K, (views, nodes) = self._K, self._shape
+        size = len(self._free)
+        blocks: list[tuple[Floats, Floats]] = []
+
+        def add(rows: Floats, target: Floats | float = 0.0) -> None:
+            blocks.append((rows, np.broadcast_to(np.asarray(target, dtype=np.float64), (len(rows),))))
+
+        def on_axes(row: Floats) -> Floats:  # one row for each of x, y and z
+            rows = np.zeros((3, size))
+            for axis in range(3):
+                rows[axis, axis : 3 * K : 3] = row
+            return rows
+
+        add(on_axes(basis(np.zeros(1), K)[0] / CLAMP))
+        if direction is not None:
+            add(on_axes(basis(np.zeros(1), K, 1)[0] / CLAMP_TANGENT), direction / CLAMP_TANGENT)
+        intervals = K - 3
+        for row in basis((np.arange(intervals) + 0.5) / intervals, K, 3):
+            add(on_axes(row / JERK))
+        for place, value, spread in (
+            (3 * K, np.log(self._start.radius), LOG_RADIUS),
+            (3 * K + 1, np.log(self._start.blur), LOG_BLUR),
+        ):
+            row = np.zeros((1, size))
+            row[0, place] = 1.0 / spread
+            add(row, value / spread)
+        bend = np.diff(np.eye(nodes), 2, axis=0) / LIGHT_BEND
+        for group, (value, spread) in enumerate(((1.0, LIGHT), (0.0, SLOPE))):
+            for view in range(views):
+                at = 3 * K + 2 + (group * views + view) * nodes
+                rows = np.zeros((nodes + len(bend), size))
+                rows[:nodes, at : at + nodes] = np.eye(nodes) / spread
+                rows[nodes:, at : at + nodes] = bend
+                add(rows, np.concatenate([np.full(nodes, value / spread), np.zeros(len(bend))]))
+        return np.concatenate([rows for rows, _ in blocks]), np.concatenate([target for _, target in blocks])
+
+
+def _hats(s: Floats) -> Floats:
+    """Return hat functions on evenly spaced nodes, (n, LIGHT_NODES)."""
+    place = s * (LIGHT_NODES - 1)
+    hats: Floats = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(LIGHT_NODES)))
+    return hats
