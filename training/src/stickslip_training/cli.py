@@ -15,11 +15,13 @@ from stickslip_schemas.samples import SPLITS
 
 from stickslip_training.errors import DatasetError
 from stickslip_training.reader import DatasetReader
+from stickslip_training.reconstruct_command import reconstruct
 
 if TYPE_CHECKING:
     from stickslip_training.train_curvature import TrainingReport
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Read stickslip datasets and train on them.")
+app.command()(reconstruct)
 
 DatasetArgument = Annotated[
     str, typer.Argument(metavar="DATASET", help="directory or URL of a dataset version, .../versions/1")
