@@ -1,5 +1,6 @@
 """Which code runs here: the digests that go into content keys."""
 
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -8,30 +9,33 @@ from stickslip_schemas.keys import content_key, sha256
 
 import stickslip_workers
 
+_SIMULATING = ("rods.py", "records.py")
 _PACKING = ("pack.py", "publish.py", "metadata.py", "records.py")
 _CONTRACT = ("chunks.py", "layout.py", "manifest.py")
+_STAGES = Path(stickslip_workers.__file__).parent / "stages"
 _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 
 
 def packer_build() -> str:
     """Return the digest of everything that decides on the bytes of a packed dataset."""
-    stages = Path(stickslip_workers.__file__).parent / "stages"
     contract = Path(stickslip_schemas.__file__).parent
-    sources = [stages / name for name in _PACKING] + [contract / name for name in _CONTRACT]
-    return content_key(
-        "packer",
-        {
-            "sources": {path.name: sha256(path.read_bytes()) for path in sources},
-            "libraries": {name: metadata.version(name) for name in _LIBRARIES},
-        },
-    )
+    sources = [_STAGES / name for name in _PACKING] + [contract / name for name in _CONTRACT]
+    libraries = {name: metadata.version(name) for name in _LIBRARIES}
+    return content_key("packer", {"sources": _digests(sources), "libraries": libraries})
 
 
 def sim_core_build() -> str:
-    """Return the digest of the simulation core: sources, compiler and settings."""
-    from stickslip_sim_core import build_info
+    """Return the digest of everything that decides on a trajectory: the compiled core, its face, and our stage."""
+    import stickslip_sim_core
 
-    return str(build_info().build_hash)
+    face = Path(stickslip_sim_core.__file__).parent / "rods.py"
+    sources = {f"stage/{name}": digest for name, digest in _digests([_STAGES / name for name in _SIMULATING]).items()}
+    core = str(stickslip_sim_core.build_info().build_hash)
+    return content_key("sim_core", {"core": core, "sources": sources | _digests([face])})
+
+
+def _digests(sources: Iterable[Path]) -> dict[str, str]:
+    return {path.name: sha256(path.read_bytes()) for path in sources}
 
 
 def versions() -> dict[str, str]:
