@@ -22,10 +22,11 @@ setup: .venv/core.stamp .venv-blender/setup.stamp
 	@touch $@ .venv/core.stamp
 
 # The editable install builds the C++ core once: a changed source builds it again.
-.venv/core.stamp: .venv/setup.stamp $(CORE_SOURCES)
-	@echo "building sim_core"
-	@$(PY) -m pip install $(PIP_FLAGS) --no-deps --editable sim_core
-	@touch $@
+.venv/core.stamp: $(CORE_SOURCES) | .venv/setup.stamp
+	@if [ -n "$$(find $(CORE_SOURCES) -newer $@ 2>&1)" ]; then \
+	  echo "building sim_core"; \
+	  $(PY) -m pip install $(PIP_FLAGS) --no-deps --editable sim_core && touch $@; \
+	fi
 
 .venv-blender/setup.stamp: constraints-blender.txt requirements-blender.txt $(PYPROJECTS)
 	@tools/check_system.sh $(PYTHON)
