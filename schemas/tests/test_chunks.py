@@ -31,6 +31,15 @@ def test_no_flipped_bit_goes_unseen() -> None:
             decode_chunk(bytes(flipped))
 
 
+@pytest.mark.parametrize("size", [1, 255, 256, 5000, 70_000])
+def test_a_chunk_of_another_size_is_refused(size: int) -> None:
+    chunk = encode_chunk(np.zeros(size, dtype=np.uint8))
+    decode_chunk(chunk, np.empty(size, dtype=np.uint8))
+    for wrong in (size - 1, size + 1):
+        with pytest.raises(CorruptChunkError, match=f"decodes to {size} bytes, and {wrong} are expected"):
+            decode_chunk(chunk, np.empty(wrong, dtype=np.uint8))
+
+
 def test_shard_index_points_at_the_chunks() -> None:
     chunks = [b"one", None, b"three"]
     shard = encode_shard(chunks)

@@ -34,7 +34,7 @@ def test_changed_bytes_are_found(tmp_path: Path) -> None:
         store.read(digest, offset=1, length=9)
 
 
-@pytest.mark.parametrize("name", ["../../etc/passwd", "", "A" * 64, "0" * 63])
+@pytest.mark.parametrize("name", ["../../etc/passwd", "", "A" * 64, "0" * 63, "0" * 64 + "\n"])
 def test_a_path_is_a_digest_and_nothing_else(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="64 lower-case hexadecimal"):
         Store(tmp_path).path(name)

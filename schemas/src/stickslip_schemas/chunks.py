@@ -18,7 +18,7 @@ _CRC_BYTES = 4
 
 
 class CorruptChunkError(ValueError):
-    """A checksum does not hold."""
+    """A checksum does not hold, or a chunk is not of the size that it should have."""
 
 
 def encode_chunk(data: bytes | np.ndarray) -> bytes:
@@ -27,8 +27,12 @@ def encode_chunk(data: bytes | np.ndarray) -> bytes:
 
 
 def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:
-    """Return the decoded bytes of a chunk, into `out` where it is given; raise CorruptChunkError."""
-    return Zstd().decode(_without_crc(chunk, "chunk"), out)  # type: ignore[no-any-return]  # untyped library
+    """Return the decoded bytes of a chunk, into all of `out` where it is given; raise CorruptChunkError."""
+    frame = _without_crc(chunk, "chunk")
+    if out is not None and (size := _content_size(frame)) != out.nbytes:
+        # The decoder would fill a part of `out` and leave the rest as it was, without a word.
+        raise CorruptChunkError(f"the chunk decodes to {size} bytes, and {out.nbytes} are expected")
+    return Zstd().decode(frame, out)  # type: ignore[no-any-return]  # untyped library
 
 
 def check_chunk(chunk: bytes) -> None:
@@ -67,3 +71,16 @@ def _without_crc(data: bytes, what: str) -> bytes:
     if len(data) < _CRC_BYTES or int(google_crc32c.value(payload)).to_bytes(_CRC_BYTES, "little") != crc:
         raise CorruptChunkError(f"the crc32c of the {what} does not hold")
     return payload
+
+
+def _content_size(frame: bytes) -> int | None:
+    """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None where it states none."""
+    if len(frame) < 6 or frame[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    descriptor = frame[4]
+    single_segment = descriptor >> 5 & 1
+    width = (single_segment, 2, 4, 8)[descriptor >> 6]
+    start = 5 + (1 - single_segment) + (0, 1, 2, 4)[descriptor & 3]
+    if width == 0 or len(frame) < start + width:
+        return None
+    return int.from_bytes(frame[start : start + width], "little") + (256 if width == 2 else 0)

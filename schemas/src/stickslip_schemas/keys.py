@@ -47,7 +47,7 @@ def sha256(data: bytes) -> str:
 
 def is_sha256(text: str) -> bool:
     """Tell whether `text` is a SHA-256 in lower-case hexadecimal."""
-    return re.match(KEY_PATTERN, text) is not None
+    return re.fullmatch(KEY_PATTERN, text) is not None
 
 
 def _normalised(value: Any) -> Any:

@@ -320,24 +320,7 @@ def _parse_manifest(data: bytes) -> Manifest:
 
 def _decode(chunk: bytes, out: Array, what: str) -> None:
     """Decode a chunk into all of `out`, or raise."""
-    size = _zstd_content_size(chunk)
-    if size != out.nbytes:
-        # The decoder would fill a part of the buffer and leave the rest as it was, without a word.
-        raise CorruptDataError(f"{what}: the chunk decodes to {size} bytes, and {out.nbytes} are expected")
     try:
         decode_chunk(chunk, out)
     except (CorruptChunkError, RuntimeError, ValueError) as error:
         raise CorruptDataError(f"{what}: {error}") from error
-
-
-def _zstd_content_size(frame: bytes) -> int | None:
-    """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None where it states none."""
-    if len(frame) < 6 or frame[:4] != b"\x28\xb5\x2f\xfd":
-        return None
-    descriptor = frame[4]
-    single_segment = descriptor >> 5 & 1
-    width = (single_segment, 2, 4, 8)[descriptor >> 6]
-    start = 5 + (1 - single_segment) + (0, 1, 2, 4)[descriptor & 3]
-    if width == 0 or len(frame) < start + width:
-        return None
-    return int.from_bytes(frame[start : start + width], "little") + (256 if width == 2 else 0)
