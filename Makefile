@@ -5,7 +5,9 @@ PY = .venv/bin/python
 BLENDER_PY = .venv-blender/bin/python
 PIP_FLAGS = --quiet --disable-pip-version-check
 
-COMPONENTS = schemas sim_core workers services training
+SOURCES = $(addsuffix /src,schemas services training workers workers/blender) sim_core/python examples benchmarks
+# One by one: test modules of different components have the same names. The other tests are not typed.
+TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
 CORE_SOURCES = $(wildcard sim_core/src/*) sim_core/CMakeLists.txt sim_core/pyproject.toml
 # reconstruction.py calls render_rod_set.py with Blender's interpreter.
@@ -48,7 +50,8 @@ check: setup
 	$(PY) -m ruff format --check .
 	$(PY) -m ruff check .
 	.venv/bin/clang-format --dry-run --Werror $(CPP_FILES)
-	$(PY) -m mypy $(wildcard */src) sim_core/python workers/blender/src examples benchmarks
+	$(PY) -m mypy $(SOURCES)
+	@for tests in $(TESTS); do $(PY) -m mypy $$tests || exit 1; done
 	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
 
 bench: setup
