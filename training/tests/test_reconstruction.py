@@ -68,6 +68,7 @@ def tight():
     return line, [coverage(line, camera) for camera in RIG]
 
 
+@pytest.mark.slow
 def test_a_curl_that_crosses_itself_in_views_is_found_to_a_thousandth(tight):
     line, shares = tight
     found = reconstruct([picture(share) for share in shares], RIG)
@@ -83,6 +84,7 @@ def test_a_curl_that_crosses_itself_in_views_is_found_to_a_thousandth(tight):
     assert found.views_seen.max() == 4
 
 
+@pytest.mark.slow
 def test_noise_and_an_uneven_ground_cost_little():
     line = curl(1.5, 0.9)
     views = [
@@ -94,6 +96,7 @@ def test_noise_and_an_uneven_ground_cost_little():
     assert found.radius == pytest.approx(RADIUS)
 
 
+@pytest.mark.slow
 def test_units_clamp_and_large_pictures_of_the_user():
     """The same rod, 200 mm long, from a clamp elsewhere, in pictures with three times the pixels."""
     line, length, clamp = curl(1.0, 0.8), 200.0, np.array([30.0, -20.0, 500.0])
@@ -112,6 +115,7 @@ def test_units_clamp_and_large_pictures_of_the_user():
     assert found.deviation.max() < 2e-3 * length
 
 
+@pytest.mark.slow
 def test_views_that_contradict_one_another_are_flagged(tight):
     _, shares = tight
     other = coverage(curl(2.0, 1.0), RIG[1])
@@ -121,6 +125,7 @@ def test_views_that_contradict_one_another_are_flagged(tight):
     assert re.search(r"(misfit|unexplained share|unsupported share) 0\.\d+ is above", " ".join(found.reasons))
 
 
+@pytest.mark.slow
 def test_a_wrong_length_is_flagged(tight):
     _, shares = tight
     assert reconstruct([picture(share) for share in shares], RIG, length=0.8).verdict == Verdict.failed
