@@ -3,10 +3,9 @@
 import re
 import shutil
 import subprocess
+import sys
 import sysconfig
 from pathlib import Path
-
-import pytest
 
 from stickslip_sim_core import build_info
 
@@ -15,11 +14,15 @@ SOURCE = Path(__file__).parents[1]
 
 def configure(source: Path, build: Path, *options: str) -> str:
     """Configure with CMake and return the build hash that it prints."""
-    pytest.importorskip("nanobind")
-    if shutil.which("cmake") is None:
-        pytest.skip("cmake is not on the path")
     site = sysconfig.get_path("purelib")
-    command = ["cmake", "-S", str(source), "-B", str(build), f"-DCMAKE_PREFIX_PATH={site}"]
+    command = [
+        str(Path(sys.executable).with_name("cmake")),
+        "-S",
+        str(source),
+        "-B",
+        str(build),
+        f"-DCMAKE_PREFIX_PATH={site}",
+    ]
     command += [f"-Dnanobind_ROOT={site}/nanobind/cmake", "-DCMAKE_BUILD_TYPE=Release", *options]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr

@@ -151,7 +151,7 @@ def cluster_cpus() -> Iterator[int]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", HERE)
         with ray_cluster(name="tests", address=None, cpus=2) as cpus:
-            processes = [thing for thing in gc.get_objects() if isinstance(thing, subprocess.Popen)]
+            processes = [thing for thing in gc.get_objects() if type(thing) is subprocess.Popen]
             yield cpus
         for process in processes:
             process.wait(timeout=30)  # Ray ends its processes and does not wait, of which Python warns
