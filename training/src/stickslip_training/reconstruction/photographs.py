@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from stickslip_schemas.cameras import Camera, read_rigs
 
 from stickslip_training.reconstruction.overlay import import_pillow, save_overlay
-from stickslip_training.reconstruction.reconstruct import Reconstruction, ReconstructionError, reconstruct
+from stickslip_training.reconstruction.pipeline import Reconstruction, ReconstructionError, reconstruct
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 

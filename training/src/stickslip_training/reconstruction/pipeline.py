@@ -32,7 +32,7 @@ Floats = npt.NDArray[np.float64]
 CONTROL_POINTS = 44
 STARTS = 4  # ways of the tracking that are refined
 APART = 0.02  # [L]: curves that are farther apart anywhere are different curves
-HOPELESS = 10.0  # a start whose coarse fit costs so many times the best one's is given up
+HOPELESS = 4.0  # a start whose coarse fit costs so many times the best one's is given up
 LARGEST_IMAGE = 1600  # [px]: larger pictures are averaged down
 WIDEST_ROD = 4.0  # half width [px]: of a rod that is wider, pictures are averaged down too
 SLENDER = (0.0005, 0.05)  # radius over length that is believed
@@ -183,9 +183,9 @@ def _view(image: npt.NDArray[np.generic], camera: Camera, length: float, clamp: 
 
 
 def _half_width(coverage: Floats) -> float:
-    """Estimate the rod's half width [px]: a strip's is its area over half its outline."""
+    """Estimate the rod's half width [px]: a strip's is its area over its outline, both sides counted."""
     solid = np.minimum(coverage, 1.0)
-    return float(2.0 * solid.sum() / max(float(np.hypot(*np.gradient(solid)).sum()), 1e-9))
+    return float(solid.sum() / max(float(np.hypot(*np.gradient(solid)).sum()), 1e-9))
 
 
 def _radius(views: Sequence[View]) -> float:
