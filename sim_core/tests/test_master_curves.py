@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp, solve_ivp
-from scipy.optimize import brentq
+from scipy.optimize import brentq, root
 from scipy.special import jv
 
 from stickslip_sim_core import boundary_value, master_curves
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class TestCantilever:
-    @pytest.mark.parametrize("gamma", [0.5, 30.0, 300.0, 3000.0])
+    @pytest.mark.parametrize("gamma", [1e-3, 0.5, 30.0, 300.0, 3000.0, 1e5])
     def test_against_scipy(self, gamma: float) -> None:
         def rate(s: Floats, y: Floats) -> Floats:
             return np.stack([y[1], gamma * (1 - s) * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])])
@@ -23,7 +23,7 @@ class TestCantilever:
         def ends(a: Floats, b: Floats) -> Floats:
             return np.array([a[0] - np.pi / 2, b[1], a[2], a[3]])
 
-        s = np.linspace(0, 1, 200)
+        s = np.unique(np.concatenate([np.linspace(0, 1, 200), np.geomspace(1e-4, 1, 100)]))
         psi = np.pi / 2 * np.exp(-s * np.sqrt(gamma))
         guess = np.stack([psi, -psi * np.sqrt(gamma), s, s])
         found = solve_bvp(rate, ends, s, guess, tol=1e-10, max_nodes=100_000)
@@ -57,6 +57,67 @@ def test_lateral_buckling_rod() -> None:
     zero = brentq(lambda z: jv(-1 / 6, z), 2.0, 2.3, xtol=1e-15)
     assert master_curves.lateral_buckling_rod() == pytest.approx(6 * zero, rel=1e-14)
     assert master_curves.lateral_buckling_rod() == pytest.approx(12.8538, abs=5e-5)
+
+
+class TestLateralBuckling:
+    """Of a plate strip; how it is solved has tests of its own in test_plate_buckling.py."""
+
+    @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.5])
+    def test_narrow_strip_is_a_rod(self, poisson: float) -> None:
+        rod = master_curves.lateral_buckling_rod() * np.sqrt(2 / (1 + poisson)) * (1 - poisson**2)
+        excess = master_curves.lateral_buckling([0.01, 0.02], poisson) / rod - 1
+        assert 0 < excess[0] < 0.01
+        assert 2 * excess[0] - excess[1] == pytest.approx(0, abs=4e-4)  # what is left at aspect 0
+
+    def test_wide_strip_is_stiffer(self) -> None:
+        weights = master_curves.lateral_buckling([0.05, 0.2, 1.0], 0.3)
+        np.testing.assert_allclose(weights, [15.0621, 16.9965, 29.815], rtol=5e-5)
+
+
+class TestStickSlip:
+    @pytest.mark.parametrize("strain", [1e-3, 0.05, 0.2, 0.33])
+    def test_against_shooting(self, strain: float) -> None:
+        """In theta itself, with scipy."""
+
+        def miss(p: Floats) -> Floats:
+            def rate(_: float, y: Floats) -> Floats:
+                return np.array([y[1], p[0] * np.cos(y[0]) + p[1] * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])])
+
+            y = solve_ivp(rate, (0, 1), [np.pi / 2, p[2], 0, 0], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+            return np.array([y[1], y[2], y[3] - 1 + strain])
+
+        load = 20.19
+        found = root(miss, [load, 0.48 * np.sqrt(strain) * load, -9.0 * np.sqrt(strain)], tol=1e-13)
+        assert np.abs(found.fun).max() < 1e-11
+        assert master_curves.stick_slip(strain) == pytest.approx(found.x[1] / found.x[0], rel=1e-8)
+
+    def test_small_strains(self) -> None:
+        strain = np.array([1e-14, 1e-8, 1e-6])
+        np.testing.assert_allclose(master_curves.stick_slip(strain), 0.445096317 * np.sqrt(strain), rtol=1e-6)
+
+    def test_triple_point(self) -> None:
+        strain, friction = master_curves.stick_slip_triple_point()
+        assert (strain, friction) == pytest.approx((0.3303, 0.3564), abs=5e-5)
+        assert float(master_curves.stick_slip(strain)) == pytest.approx(friction, rel=1e-12)
+
+    def test_inverse(self) -> None:
+        strain = np.array([1e-10, 1e-3, 0.1, 0.33])
+        np.testing.assert_allclose(
+            master_curves.stick_slip_strain(master_curves.stick_slip(strain)), strain, rtol=1e-10
+        )
+
+    def test_grows(self) -> None:
+        assert (np.diff(master_curves.stick_slip(np.geomspace(1e-6, 0.3302, 40))) > 0).all()
+
+    def test_refined(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        strain = np.array([1e-6, 1e-2, 0.1, 0.33])
+        fine = master_curves.stick_slip(strain)
+        monkeypatch.setattr(boundary_value, "STAGES", 6)
+        boundary_value.gauss_method.cache_clear()
+        coarse = master_curves.stick_slip(strain)
+        boundary_value.gauss_method.cache_clear()
+        np.testing.assert_allclose(coarse, fine, rtol=1e-9)
+        assert (coarse != fine).any()
 
 
 def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Floats]:
@@ -134,6 +195,9 @@ def test_shapes() -> None:
     assert master_curves.cantilever(np.ones((2, 3))).shape == (2, 3)
     assert master_curves.cantilever([]).shape == (0,)
     assert master_curves.bend_twist([[8.0], [9.0]], 0.5).shape == (2, 1)
+    assert master_curves.stick_slip([[0.1], [0.2]]).shape == (2, 1)
+    assert master_curves.stick_slip_strain(0.2).shape == ()
+    assert master_curves.lateral_buckling([0.5, 1.0], 0.3).shape == (2,)
 
 
 def test_arguments() -> None:
@@ -145,3 +209,11 @@ def test_arguments() -> None:
         master_curves.bend_twist(["six"], 0.5)
     with pytest.raises(ValueError, match=r"poisson: must be in \[0, 0\.5\], got 0\.6"):
         master_curves.bend_twist(6.0, 0.6)
+    with pytest.raises(ValueError, match=r"aspect: must be in \[0\.01, 1\], got 1\.5"):
+        master_curves.lateral_buckling([0.2, 1.5], 0.3)
+    with pytest.raises(ValueError, match=r"strain: must be in \(0, 0\.33028543\d+\], got 0\.34"):
+        master_curves.stick_slip(0.34)
+    with pytest.raises(ValueError, match=r"friction: must be in \(0, 0\.35637002\d+\], got 0\.0"):
+        master_curves.stick_slip_strain([0.1, 0.0])
+    with pytest.raises(ValueError, match=r"strain: must be in .* got nan"):
+        master_curves.stick_slip(np.nan)

@@ -1,10 +1,12 @@
-"""Master curves: what physics says that a protocol must measure, computed here to 1e-10 and never tabulated.
+"""Master curves: what physics says that a protocol must measure, computed here and never tabulated.
 
-Every curve comes from the differential equations of the continuous rod, solved by collocation (boundary_value.py). They
-share nothing with the chain of frames that the rod solver minimises, so that a protocol compares two independent
-computations. Symbols, definitions and figures: docs/protocols.md.
+Every curve of a rod, or of a strip that bends in one direction, comes from the differential equations of the continuous
+rod, solved by collocation to 1e-10 (boundary_value.py); that of a plate from plate_buckling.py, to 5e-5. They share
+nothing with the solvers that are measured, so that a protocol compares two independent computations. Symbols,
+definitions and figures: docs/protocols.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import gamma as gamma_function
@@ -12,7 +14,7 @@ from math import gamma as gamma_function
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core import boundary_value
+from stickslip_sim_core import boundary_value, plate_buckling
 from stickslip_sim_core.boundary_value import NotSolvedError, Numbers, Solution
 
 Floats = NDArray[np.float64]
@@ -78,6 +80,134 @@ def lateral_buckling_rod() -> float:
         powers = z ** (2.0 * k)
         z -= float(coefficients @ powers / (coefficients[1:] * 2.0 * k[1:] @ (powers[1:] / z)))
     return 6.0 * z
+
+
+def lateral_buckling(aspect: ArrayLike, poisson: float) -> Floats:
+    """Return the weight Gamma* = rho_A g L^3 / D at which a plate strip clamped edge-on buckles sideways, to 5e-5.
+
+    The strip of length L and width aspect * L is clamped along one short edge, with its width vertical, in displacement
+    and slope; its other edges are free. rho_A is its mass per area, D = Y h^3 / (12 (1 - poisson^2)) its bending
+    rigidity, so that per unit of rho_A g L^3 / (Y h^3 / 12) the answer is Gamma* / (1 - poisson^2). Plane stress under
+    its weight and Kirchhoff's plate, both linear until it buckles: a strip much thinner than wide. How they are solved:
+    plate_buckling.py. As aspect goes to zero,
+
+        Gamma* = lateral_buckling_rod() sqrt(2 / (1 + poisson)) (1 - poisson^2) (1 + O(aspect)).
+
+    Args:
+        aspect: Width over length [-], in [0.01, 1], any shape.
+        poisson: Poisson's ratio [-], in [0, 0.5].
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+    values = _within("aspect", aspect, 0.01, 1.0)
+    nu = _checked_poisson(poisson)
+    return np.array([plate_buckling.buckling_weight(float(v), nu) for v in values.ravel()]).reshape(values.shape)
+
+
+def stick_slip(strain: ArrayLike) -> Floats:
+    """Return mu = Q/P of a strip pressed end-on against a wall: at less friction its tip slips.
+
+    The strip of length 1 is clamped at the origin, upright; the wall has come down from height 1 to 1 - strain, and
+    acts on the tip with (Q, -P) in units of EI / L^2. With theta from the x axis to the tangent and primes d/ds,
+
+        theta'' = P cos theta + Q sin theta,   x' = cos theta,   y' = sin theta,
+        theta(0) = pi/2,   theta'(1) = 0,   x(0) = y(0) = x(1) = 0,   y(1) = 1 - strain
+
+    (the thesis's Eq. 3.1 with its sine and cosine the right way round) [Sano et al. 2017]. The tip, on its line, sticks
+    while mu >= Q/P. Of the two mirrored solutions that with theta(1) > pi/2, Q > 0 is meant, of all the modes the first
+    one: P = 20.1907 at buckling. For small strains Q/P = 0.44510 sqrt(strain).
+
+    Beyond `stick_slip_triple_point` there is no answer: the strip lies on the wall with more than its tip.
+
+    Args:
+        strain: Displacement of the wall over the length of the strip [-], > 0 and at most that of the triple point
+            (to 1e-9), any shape.
+
+    Raises:
+        ValueError: A strain is outside its range.
+    """
+    values = _within("strain", strain, 0.0, _triple_point().strain * (1.0 + 1e-9), open_below=True)
+
+    def friction(e: float) -> float:
+        return _pressed(lambda w, p: p[2] - np.sqrt(e), e).friction
+
+    return np.array([friction(float(e)) for e in values.ravel()]).reshape(values.shape)
+
+
+def stick_slip_strain(friction: ArrayLike) -> Floats:
+    """Return the strain at which a strip pressed end-on against a wall of this friction slips: stick_slip's inverse.
+
+    Args:
+        friction: Coefficient of friction mu [-], > 0 and at most that of the triple point (to 1e-9), any shape. At a
+            higher one the strip never slips.
+
+    Raises:
+        ValueError: A friction is outside its range.
+    """
+    top = _triple_point()
+    values = _within("friction", friction, 0.0, top.friction * (1.0 + 1e-9), open_below=True)
+
+    def strain(mu: float) -> float:
+        guess = top.strain * (mu / top.friction) ** 2
+        return _pressed(lambda w, p: p[1] * p[2] - mu * p[0], guess).strain
+
+    return np.array([strain(float(mu)) for mu in values.ravel()]).reshape(values.shape)
+
+
+def stick_slip_triple_point() -> tuple[float, float]:
+    """Return (strain, mu) where sticking, slipping and lying on the wall meet: there theta(1) = pi."""
+    top = _triple_point()
+    return top.strain, top.friction
+
+
+@dataclass(frozen=True)
+class _Pressed:
+    """A strip pressed against the wall."""
+
+    strain: float
+    friction: float
+    """Q/P."""
+
+
+@lru_cache(maxsize=1)
+def _triple_point() -> _Pressed:
+    return _pressed(lambda w, p: p[2] * w - np.pi / 2.0, 0.33)
+
+
+def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> _Pressed:
+    """Find the strip that fulfils one more condition on w(1) and (P, q, a), from a guess of its strain.
+
+    With a = sqrt(strain), theta = pi/2 + a w and Q = a q the problem has no bifurcation, and a may be as small as it
+    likes:
+
+        w'' = -P sin(a w) / a + q cos(a w),   w(0) = w'(1) = 0,   int sin(a w) / a = 0,   int (1 - cos(a w)) / a^2 = 1.
+
+    For a = 0 its solution is w = (q / P) (1 - cos(k s) - k sin(k s)), tan k = k, P = k^2.
+    """
+
+    def change(_: Floats, y: Numbers, p: Numbers) -> Numbers:
+        w, bend = y[0], y[1]
+        P, q, a = p
+        sine = np.sin(a * w) / a
+        return np.stack([bend, q * np.cos(a * w) - P * sine, sine, 0.5 * (np.sin(0.5 * a * w) / (0.5 * a)) ** 2])
+
+    def ends(first: Numbers, last: Numbers, p: Numbers) -> Numbers:
+        at_clamp = [first[0], first[2], first[3]]
+        return np.stack([*at_clamp, last[1], last[2], last[3] - 1.0, condition(last[0], p)])
+
+    k = 4.493409457909064
+    s = np.linspace(0.0, 1.0, 7)
+    w = 1.0 - np.cos(k * s) - k * np.sin(k * s)
+    bend = k * (np.sin(k * s) - k * np.cos(k * s))
+    scale = 0.44510  # q / P that makes int w^2 = 2
+    y = np.stack([scale * w, scale * bend, 0.0 * s, s])
+    found = boundary_value.solve(change, ends, s, y, np.array([k**2, scale * k**2, np.sqrt(guess)]))
+    P, q, a = found.parameters
+    w = found.y[0]
+    if not (P > 0.0 and q > 0.0 and a * w.max() <= np.pi / 2.0 + 1e-6 and w[-1] == w.max()):
+        raise NotSolvedError(f"stick_slip: near strain = {guess} the solution found is not the first mode")
+    return _Pressed(float(a**2), float(a * q / P))
 
 
 def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
@@ -272,11 +402,26 @@ def _checked_poisson(poisson: float) -> float:
 
 def _positive(name: str, values: ArrayLike) -> Floats:
     """Return `values` as float64 of their own shape."""
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: must be real numbers, got dtype {array.dtype}")
-    array = array.astype(np.float64)
+    array = _real(name, values)
     wrong = array[~(np.isfinite(array) & (array > 0.0))]
     if wrong.size:
         raise ValueError(f"{name}: must be finite and > 0, got {wrong.flat[0]}")
     return array
+
+
+def _within(name: str, values: ArrayLike, low: float, high: float, *, open_below: bool = False) -> Floats:
+    """Return `values` as float64 of their own shape."""
+    array = _real(name, values)
+    above = array > low if open_below else array >= low
+    wrong = array[~(above & (array <= high))]
+    if wrong.size:
+        bracket = "(" if open_below else "["
+        raise ValueError(f"{name}: must be in {bracket}{low:.10g}, {high:.10g}], got {wrong.flat[0]}")
+    return array
+
+
+def _real(name: str, values: ArrayLike) -> Floats:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: must be real numbers, got dtype {array.dtype}")
+    return array.astype(np.float64)
