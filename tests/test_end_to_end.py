@@ -15,7 +15,7 @@ from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.chunks import CorruptChunkError
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.manifest import Manifest
-from stickslip_sim_core import solve_rods
+from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
 from stickslip_training.datasets import RodDataset
 from stickslip_training.reader import DatasetReader
 
@@ -80,6 +80,10 @@ def test_labels_and_curves_are_those_of_the_solver(directory: Path) -> None:
     for name in ("centerline", "curvature", "frame"):
         assert np.array_equal(group[name][valid], getattr(solution, name)[valid].astype(np.float32)), name
     assert np.array_equal(group["energy"][valid], solution.energy[valid])
+    lines = solution.centerline[valid]
+    assert np.array_equal(group["multistable"][valid], other_minima(gamma, phi0, phi1).multistable[valid])
+    assert np.array_equal(group["self_contact_distance"][valid], self_contact_distance(lines))
+    assert np.array_equal(group["reach"][valid], reach(lines))
 
 
 def test_pictures_show_the_rod_of_their_sample(directory: Path) -> None:

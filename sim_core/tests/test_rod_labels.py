@@ -78,6 +78,8 @@ class TestOtherMinima:
         assert phi0.max() < 4.2
         assert phi1.min() > 9.0
         assert (found.energy_gap[found.multistable] > 0).all()
+        quick = other_minima(*thesis_rods.T, solution=solved, thorough=False)
+        np.testing.assert_array_equal(quick.multistable, found.multistable)
 
     def test_bad_solution(self, solved: RodSolution) -> None:
         with pytest.raises(ValueError, match=r"solution: must be of 1 rods at 150 points"):

@@ -209,6 +209,9 @@ def write_rods(root: Path, spec: RodHangSpec, rejected: tuple[int, ...] = ()) ->
     labels = [sample.labels for sample in samples(spec, builds)]
     parameters = {name: np.array([label[name] for label in labels]) for name in ("gamma", "phi0", "phi1")}
     content = {**parameters, **curves(**parameters), "energy": np.linspace(-1.0, 1.0, len(labels))}
+    content["multistable"] = np.arange(len(labels)) % 3 == 0
+    content["self_contact_distance"] = np.where(content["multistable"], 0.02, np.inf)
+    content["reach"] = np.linspace(0.0, 0.3, len(labels))
     if spec.views is not None:
         generator = np.random.default_rng(1)
         content["views"] = generator.integers(0, 256, (len(labels), 4, 224, 224, 3), dtype=np.uint8)

@@ -96,6 +96,11 @@ def make_dataset(store: Store) -> Callable[..., Made]:
             name: rng.standard_normal((count, *arrays[name].shape[1:])).astype(np.float32)
             for name in ("centerline", "curvature", "frame")
         }
+        curves |= {
+            "multistable": rng.random(count) < 0.5,
+            "self_contact_distance": np.where(rng.random(count) < 0.5, np.inf, rng.random(count)),
+            "reach": rng.random(count),
+        }
         artifact = store.publish(encode_records(curves))
         slots, rejections = [], []
         for sample in members:

@@ -36,7 +36,23 @@ def test_a_batch_is_one_artifact_and_the_same_again(store: Store) -> None:
         "centerline": ((150, 3), np.float32),
         "curvature": ((150, 3), np.float32),
         "frame": ((150, 3, 3), np.float32),
+        "multistable": ((), np.bool_),
+        "self_contact_distance": ((), np.float64),
+        "reach": ((), np.float64),
     }
+
+
+def test_labels_say_what_a_rod_looks_like(store: Store) -> None:
+    both_hands = SimulateTask(simulation=RodSimulation(gamma=600.0, phi0=0.3, phi1=15.0, poisson=0.5))
+    one_hand = SimulateTask(simulation=RodSimulation(gamma=600.0, phi0=10.0, phi1=15.0, poisson=0.5))
+    coil = SimulateTask(simulation=RodSimulation(gamma=0.0, phi0=2.0, phi1=30.0, poisson=0.5))
+    labels = [_curves(store, result) for result in run_tasks([both_hands, one_hand, coil], store)]
+    assert [bool(rod["multistable"]) for rod in labels] == [True, False, False]
+    assert [np.isinf(rod["self_contact_distance"]) for rod in labels] == [True, True, False]
+    # A helix of curvature 30 and torsion 2: its pitch is 2 pi 2 / (4 + 900), the next turn a little nearer.
+    assert labels[2]["self_contact_distance"] == pytest.approx(4 * np.pi / 904, rel=0.01)
+    for rod in labels:
+        assert rod["reach"] == pytest.approx(np.hypot(*rod["centerline"][:, :2].T).max(), rel=1e-6)
 
 
 def test_a_rod_does_not_depend_on_its_batch(store: Store) -> None:

@@ -95,6 +95,16 @@ def _rod_arrays(spec: RodHangSpec) -> tuple[ArrayLayout, ...]:
         ArrayLayout("phi0", "float64", (), (), "natural twist times L [rad]", fill=_NAN),
         ArrayLayout("phi1", "float64", (), (), "natural curvature times L [rad]", fill=_NAN),
         ArrayLayout("energy", "float64", (), (), "elastic and gravity energy over EI/L", fill=_NAN),
+        ArrayLayout("multistable", "bool", (), (), "another stable shape of the same rod was found", fill=False),
+        ArrayLayout(
+            "self_contact_distance",
+            "float64",
+            (),
+            (),
+            "least distance over L at which the centreline passes another part of itself; infinite where it does not",
+            fill=_NAN,
+        ),
+        ArrayLayout("reach", "float64", (), (), "largest distance over L from the vertical of the clamp", fill=_NAN),
     )
 
 

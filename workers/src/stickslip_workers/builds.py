@@ -10,6 +10,7 @@ from stickslip_schemas.keys import content_key, sha256
 import stickslip_workers
 
 _SIMULATING = ("rods.py", "records.py")
+_FACE = ("rods.py", "general_rods.py", "multistability.py", "rod_labels.py", "splines.py")
 _PACKING = ("pack.py", "publish.py", "metadata.py", "records.py")
 _CONTRACT = ("chunks.py", "layout.py", "manifest.py")
 _STAGES = Path(stickslip_workers.__file__).parent / "stages"
@@ -28,10 +29,10 @@ def sim_core_build() -> str:
     """Return the digest of everything that decides on a trajectory: the compiled core, its face, and our stage."""
     import stickslip_sim_core
 
-    face = Path(stickslip_sim_core.__file__).parent / "rods.py"
+    face = [Path(stickslip_sim_core.__file__).parent / name for name in _FACE]
     sources = {f"stage/{name}": digest for name, digest in _digests([_STAGES / name for name in _SIMULATING]).items()}
     core = str(stickslip_sim_core.build_info().build_hash)
-    return content_key("sim_core", {"core": core, "sources": sources | _digests([face])})
+    return content_key("sim_core", {"core": core, "sources": sources | _digests(face)})
 
 
 def _digests(sources: Iterable[Path]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import TaskResult
 
-from stickslip_workers.stages.rods import CURVES, simulate_rods
+from stickslip_workers.stages.rods import RECORD_ARRAYS, simulate_rods
 
 KindName = Literal["rod_hang", "cloth_drag"]
 
@@ -26,7 +26,7 @@ class Kind:
 
 KINDS: dict[KindName, Kind] = {
     # Small enough that a lost batch costs little: 512 rods are well below a second.
-    "rod_hang": Kind(simulate=simulate_rods, batch=512, record_arrays=CURVES),
+    "rod_hang": Kind(simulate=simulate_rods, batch=512, record_arrays=RECORD_ARRAYS),
 }
 
 

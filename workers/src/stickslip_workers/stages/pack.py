@@ -28,7 +28,7 @@ def pack(task: PackTask, store: Store) -> PackOutput:
             column: Array = np.full((size, *array.shape), array.fill, dtype=array.dtype)
             for row, slot in enumerate(task.slots):
                 if array.name in record_arrays:
-                    _fill_curve(column, row, array, slot, records)
+                    _fill_record(column, row, array, slot, records)
                 else:
                     column[row] = _label(array, slot)
             data = encode_chunk(column)
@@ -63,7 +63,7 @@ def _chunks(array: ArrayLayout, slots: Sequence[PackSlot], size: int, store: Sto
     return chunks
 
 
-def _fill_curve(column: Array, row: int, array: ArrayLayout, slot: PackSlot, records: Records) -> None:
+def _fill_record(column: Array, row: int, array: ArrayLayout, slot: PackSlot, records: Records) -> None:
     if not slot.valid:
         return
     if slot.record is None:

@@ -8,10 +8,12 @@ from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import RecordRef, RodSimulation, SimulateOutput, TaskResult
 
-from stickslip_workers.stages.records import encode_records
+from stickslip_workers.stages.records import Array, encode_records
 
 CURVES = ("centerline", "curvature", "frame")
-"""What a record holds: float32, the arrays of the same names in the dataset."""
+
+RECORD_ARRAYS = (*CURVES, "multistable", "self_contact_distance", "reach")
+"""What a record holds, under the names of the dataset: curves in float32, and labels."""
 
 
 def simulate_rods(simulations: Sequence[RodSimulation], store: Store) -> list[TaskResult]:
@@ -30,22 +32,25 @@ def simulate_rods(simulations: Sequence[RodSimulation], store: Store) -> list[Ta
 
 
 def _solve(rods: Sequence[RodSimulation], poisson: float, elements: int, points: int, store: Store) -> list[TaskResult]:
-    from stickslip_sim_core import solve_rods  # here, so that packing needs no compiled core
+    # Here, so that packing needs no compiled core.
+    from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
 
-    solution = solve_rods(
-        np.array([rod.gamma for rod in rods]),
-        np.array([rod.phi0 for rod in rods]),
-        np.array([rod.phi1 for rod in rods]),
-        poisson=poisson,
-        elements=elements,
-        points=points,
-    )
+    parameters = np.array([(rod.gamma, rod.phi0, rod.phi1) for rod in rods]).T
+    solution = solve_rods(*parameters, poisson=poisson, elements=elements, points=points)
     accepted = np.flatnonzero(solution.converged & solution.stable)
     rows = {int(index): row for row, index in enumerate(accepted)}
     digest = ""
     if rows:
-        curves = {name: np.asarray(getattr(solution, name)[accepted], dtype=np.float32) for name in CURVES}
-        digest = store.publish(encode_records(curves))
+        other = other_minima(
+            *parameters, poisson=poisson, elements=elements, points=points, solution=solution, thorough=False
+        )
+        arrays: dict[str, Array] = {
+            name: np.asarray(getattr(solution, name)[accepted], dtype=np.float32) for name in CURVES
+        }
+        arrays["multistable"] = other.multistable[accepted]
+        arrays["self_contact_distance"] = self_contact_distance(solution.centerline[accepted])
+        arrays["reach"] = reach(solution.centerline[accepted])
+        digest = store.publish(encode_records(arrays))
     return [
         TaskResult(
             outcome="succeeded",
