@@ -82,7 +82,8 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
     """Write the clips as a dataset version, its shards as the packer makes them, its metadata by zarr-python."""
     mu = {"type": "linspace", "start": 0.0, "stop": 1.0, "num": len(clips)}
     axes = {"material": "gray-interlock", "mu": mu, "texture": "plaid", "viewpoint": "calibrated"}
-    document = {"kind": "cloth_drag", "axes": axes, "frames": FRAMES, "samples_per_shard": samples_per_shard}
+    document: dict[str, Any] = {"kind": "cloth_drag", "axes": axes, "frames": FRAMES, "store_mesh": False}
+    document["samples_per_shard"] = samples_per_shard
     spec = job_spec_adapter.validate_python(document)
     assert isinstance(spec, ClothDragSpec)
     builds = Builds(sim_core="0" * 64, blender="0" * 64, packer="0" * 64)
@@ -99,6 +100,8 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
     }
     group = zarr.create_group(str(root), zarr_format=3)
     for array in layout(spec):
+        if array.name not in arrays:
+            arrays[array.name] = np.full((len(clips), *array.shape), array.fill, dtype=array.dtype)
         _write_array(group, root, array, arrays[array.name], samples_per_shard)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # consolidated metadata are no part of the Zarr v3 specification yet

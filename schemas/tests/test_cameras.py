@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from stickslip_schemas.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
+from stickslip_schemas.jobs import Viewpoint
 
 LEVEL = Camera(  # three units in front of the origin on the x axis, looking back at it
     name="level",
@@ -98,7 +99,7 @@ def test_a_camera_survives_json_unchanged() -> None:
 
 def test_rod_4_is_four_upright_views_that_never_face_each_other() -> None:
     rig = load_rig("rod-4")
-    assert rig_names() == ("rod-4",)
+    assert rig_names() == ("rod-4", "drag-3")
     assert [camera.name for camera in rig] == ["front", "side", "high", "low"]
     for camera in rig:
         assert (camera.width, camera.height) == (224, 224)
@@ -125,8 +126,21 @@ def test_the_digest_of_a_rig_changes_only_on_purpose() -> None:
     assert rig_digest("rod-4") == "fa3c632297ec32d0cc9c40ab57493d1ab6075c23aef6537f7977c7e354511e10"
 
 
+def test_drag_3_is_the_viewpoints_and_holds_the_stage() -> None:
+    rig = load_rig("drag-3")
+    assert [camera.name for camera in rig] == list(Viewpoint)
+    # The corners of a cloth of 20 cm are held at a height of 15 cm, so its lower edge is no further from them than
+    # sqrt(20^2 - 15^2) = 13 cm; it hangs at x = 0, upper edge at 21 cm, before it is lowered.
+    floor = [(x, y, 0.0) for x in (-0.14, 0.44) for y in (-0.115, 0.115)]
+    held = [(x, y, 0.15) for x in (0.0, 0.3) for y in (-0.11, 0.11)] + [(0.0, y, 0.21) for y in (-0.11, 0.11)]
+    for camera in rig:
+        assert camera.in_frame(floor + held, margin=1.0), camera.name
+        pixels, _ = camera.project(floor + held)
+        assert np.ptp(pixels, axis=0).max() > 190.0  # and the frame is not wider than it must be
+
+
 def test_an_unknown_rig_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="rig must be one of rod-4; got 'rod-5'"):
+    with pytest.raises(ValueError, match="rig must be one of rod-4, drag-3; got 'rod-5'"):
         load_rig("rod-5")
 
 

@@ -7,8 +7,10 @@ from stickslip_schemas.chunks import (
     CorruptChunkError,
     decode_chunk,
     decode_shard_index,
+    decode_trajectory,
     encode_chunk,
     encode_shard,
+    encode_trajectory,
     shard_index_size,
 )
 
@@ -38,6 +40,32 @@ def test_a_chunk_of_another_size_is_refused(size: int) -> None:
     for wrong in (size - 1, size + 1):
         with pytest.raises(CorruptChunkError, match=f"decodes to {size} bytes, and {wrong} are expected"):
             decode_chunk(chunk, np.empty(wrong, dtype=np.uint8))
+
+
+def smooth_trajectory() -> np.ndarray:
+    """Return vertices that sway, (100, 500, 3) float32."""
+    t, phase = np.linspace(0.0, 6.0, 100), np.random.default_rng(2).random((500, 3))
+    return (0.1 * np.sin(t[:, None, None] + 6.0 * phase)).astype(np.float32)
+
+
+def test_trajectory_round_trip() -> None:
+    data = smooth_trajectory()
+    chunk = encode_trajectory(data)
+    assert chunk == encode_trajectory(np.asfortranarray(data))
+    assert len(chunk) < 0.8 * len(encode_chunk(data))
+    out = np.empty_like(data)
+    decode_trajectory(chunk, out)
+    assert np.array_equal(out, data)
+
+
+def test_a_broken_trajectory_is_refused() -> None:
+    data = smooth_trajectory()
+    chunk = bytearray(encode_trajectory(data))
+    with pytest.raises(CorruptChunkError, match="decodes to 600000 bytes, and 594000 are expected"):
+        decode_trajectory(bytes(chunk), np.empty((99, 500, 3), dtype=np.float32))
+    chunk[1000] ^= 1
+    with pytest.raises(CorruptChunkError, match="crc32c of the chunk"):
+        decode_trajectory(bytes(chunk), np.empty_like(data))
 
 
 def test_shard_index_points_at_the_chunks() -> None:

@@ -17,7 +17,7 @@ from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.tasks import FileEntry, Rejection
-from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
 POINTS = 150
 
@@ -110,14 +110,16 @@ def write_dataset(
 
 def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samples_per_shard: int) -> None:
     shard = (samples_per_shard, *array.shape)
+    compressor = BloscCodec(typesize=4, cname="zstd", clevel=5, shuffle="shuffle") if array.is_trajectory else None
     out = group.create_array(
         array.name,
         shape=values.shape,
         dtype=array.dtype,
         chunks=(1, *array.shape) if array.per_sample else shard,
         shards=shard if array.per_sample else None,
+        filters=[TransposeCodec(order=(0, 3, 2, 1))] if array.is_trajectory else [],
         serializer=BytesCodec(),
-        compressors=[ZstdCodec(level=3), Crc32cCodec()],
+        compressors=[compressor or ZstdCodec(level=3), Crc32cCodec()],
         fill_value=array.fill,
         dimension_names=("sample", *array.dimensions),
         attributes=describe(array),
@@ -138,6 +140,7 @@ def cloth_spec(**changes: Any) -> ClothDragSpec:
             "viewpoint": "left",
         },
         "frames": 2,
+        "mesh": 5,
         "samples_per_shard": 8,
         "splits": {"train": 0.5, "validation": 0.25, "test": 0.25},
         **changes,
@@ -231,6 +234,13 @@ def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ())
     }
     content["mu"] = np.array([label["mu"] for label in labels])
     content["video"] = generator.integers(1, 6, (len(labels), spec.frames, 224, 224, 3), dtype=np.uint8)
+    for array in layout(spec):
+        if array.name in content or array.name in ("valid", "split", "sample_key"):
+            continue
+        values = generator.standard_normal((len(labels), *array.shape))
+        content[array.name] = (10 * values).astype(array.dtype)
+    if spec.store_mesh:  # one mesh for all samples
+        content["rest"][:], content["triangles"][:] = content["rest"][0], content["triangles"][0]
     return write_dataset(root, spec, content, rejected)
 
 
@@ -260,5 +270,15 @@ def make_rods(tmp_path: Path) -> Callable[..., MadeDataset]:
 
     def make(rejected: tuple[int, ...] = (), **changes: Any) -> MadeDataset:
         return write_rods(tmp_path / f"rods-{len(list(tmp_path.iterdir()))}", rod_spec(**changes), rejected)
+
+    return make
+
+
+@pytest.fixture
+def make_clips(tmp_path: Path) -> Callable[..., MadeDataset]:
+    """Return a function that writes clips of `cloth_spec(**changes)`."""
+
+    def make(rejected: tuple[int, ...] = (), **changes: Any) -> MadeDataset:
+        return write_clips(tmp_path / f"clips-{len(list(tmp_path.iterdir()))}", cloth_spec(**changes), rejected)
 
     return make

@@ -46,6 +46,28 @@ def test_a_clip(clips):
     assert dataset.categories("texture")[item["texture"]] == "plaid"
     assert dataset.categories("viewpoint")[item["viewpoint"]] == "left"
     assert item["mu"] == np.float32(0.4)
+    assert item["side"] == clips.arrays["side"][10]
+    assert "mesh" not in item
+
+
+def test_a_clip_with_its_mesh(clips):
+    dataset = ClipDataset(clips.root, mesh=True)
+    assert np.array_equal(dataset[8]["mesh"].numpy(), clips.arrays["mesh"][10])
+    batch = dataset.__getitems__([8, 0, 3])
+    assert batch["mesh"].shape == (3, 300, 25, 3)
+    assert np.array_equal(batch["mesh"].numpy(), clips.arrays["mesh"][dataset.slots[[8, 0, 3]]])
+    assert np.array_equal(dataset.rest().numpy(), clips.arrays["rest"][10])
+    assert np.array_equal(dataset.triangles().numpy(), clips.arrays["triangles"][10])
+    assert dataset.instants == (0, 150)
+
+
+def test_a_dataset_without_meshes_says_so(make_clips):
+    made = make_clips(store_mesh=False)
+    assert ClipDataset(made.root)[1]["video"].shape == (2, 224, 224, 3)
+    with pytest.raises(ValueError, match="the dataset has no array mesh; it has video"):
+        ClipDataset(made.root, mesh=True)
+    with pytest.raises(ValueError, match="the dataset has no rest: it was made with store_mesh: false"):
+        ClipDataset(made.root).rest()
 
 
 def test_a_batch_is_its_items(clips):

@@ -112,8 +112,8 @@ def test_runs_what_it_is_given_and_says_who_it_is(
     double.offer(**_simulate(700), picture=_render(fake_renderer.FINE), shard=made.pack_tasks[0], all=made.publish_task)
     double.until(lambda: len(double.results) == 703)
     assert {result.outcome for result in double.results.values()} == {"succeeded"}
-    # 700 rods are two batches, and each is one artifact.
-    assert len({double.results[f"rod-{i}"].output.record.digest for i in range(700)}) == 2
+    # The first calls are given little, to learn how long a rod takes; then 512 go together. Each is one artifact.
+    assert len({double.results[f"rod-{i}"].output.record.digest for i in range(700)}) <= 4
     assert (store.dataset_path(made.publish_task.dataset, 1) / "manifest.json").exists()
     (registration,) = double.registrations
     assert registration.builds.blender == fake_renderer.BUILD

@@ -8,7 +8,7 @@ import pytest
 import stickslip_sim_core
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import ClothSimulation, RodSimulation, SimulateTask, TaskResult
+from stickslip_schemas.tasks import RodSimulation, SimulateTask, TaskResult
 from stickslip_workers.stages.run import run_tasks
 
 
@@ -96,10 +96,3 @@ def test_all_rejected_makes_no_artifact(store: Store, monkeypatch: pytest.Monkey
     monkeypatch.setattr(stickslip_sim_core, "solve_rods", fail)
     assert {result.outcome for result in run_tasks(_rods(2), store)} == {"rejected"}
     assert not (store.root / "artifacts").exists()
-
-
-def test_cloth_is_refused_by_name(store: Store) -> None:
-    cloth = ClothSimulation(material="royal-target", mu=0.2, preset="fast", mesh=5, seed=0)
-    (result,) = run_tasks([SimulateTask(simulation=cloth)], store)
-    assert (result.outcome, result.reason) == ("failed", Reason.internal_error)
-    assert "kind must be one of rod_hang for this worker; got 'cloth_drag'" in result.message

@@ -179,6 +179,9 @@ class ClothDragSpec(_JobSpec):
     preset: Preset = Preset.certified
     mesh: int = Field(default=41, ge=5, le=161, description="vertices a side")
     frames: int = Field(default=30, ge=1, le=300, description="rendered frames, at regular intervals of 300")
+    store_mesh: bool = Field(
+        default=True, description="keep the positions of all vertices in all 300 frames, beside the clips"
+    )
     quality: Quality = Quality.standard
 
 

@@ -1,15 +1,17 @@
 """Which arrays a dataset of each kind has. The first dimension of every array is `sample`.
 
 Labels and curves are one chunk per shard group; pictures, clips and meshes are one chunk per sample, and the chunks of
-a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`.
+a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for those of trajectories:
+`transpose(sample axes reversed) -> bytes(little) -> blosc(zstd 5, shuffle) -> crc32c`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from typing import Any
 
 import numpy as np
 
+from stickslip_schemas.clips import FRAMES, FRAMES_PER_SECOND, shown_frames
 from stickslip_schemas.jobs import ClothDragSpec, Material, RodHangSpec, Texture, Viewpoint
 from stickslip_schemas.tasks import RodSimulation
 
@@ -32,6 +34,10 @@ class ArrayLayout:
     """True where a chunk is one sample and the chunks of a shard group lie in one shard."""
     categories: tuple[str, ...] = ()
     """Names of the codes 0, 1, ... of a categorical label."""
+    is_trajectory: bool = False
+    """True where the first dimension of a sample is time and the values change slowly: coded by `encode_trajectory`."""
+    attributes: dict[str, Any] = field(default_factory=dict, hash=False)
+    """What else the Zarr array says of itself."""
 
     @property
     def sample_bytes(self) -> int:
@@ -120,17 +126,83 @@ def _cloth_arrays(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
             ("frame", "y", "x", "rgb"),
             "sRGB clip",
             per_sample=True,
+            attributes={"instants": list(shown_frames(spec.frames))},
         ),
         codes("material", Material),
         ArrayLayout("mu", "float64", (), (), "friction coefficient", fill=_NAN),
         codes("texture", Texture),
         codes("viewpoint", Viewpoint),
+        ArrayLayout("light_seed", "int32", (), (), "seed of the light", fill=-1),
+        ArrayLayout(
+            "light",
+            "float32",
+            (5,),
+            ("light",),
+            "azimuth and elevation of the lamp [degree], its power over the nominal, albedo and roughness of the floor",
+            fill=_NAN,
+        ),
+        ArrayLayout("side", "int8", (), (), "side to which the drop broke its symmetry, +1 or -1 along x"),
+        ArrayLayout("bias", "float64", (), (), "seeded disturbance that broke the symmetry", fill=_NAN),
+        ArrayLayout("steps", "int32", (), (), "time steps of the solver", fill=-1),
+        ArrayLayout("unconverged_steps", "int32", (), (), "steps that stopped short of the tolerance", fill=-1),
+        ArrayLayout("worst_residual", "float64", (), (), "largest residual of a step [weights of a node]", fill=_NAN),
+        ArrayLayout(
+            "self_intersections",
+            "int16",
+            (FRAMES,),
+            ("instant",),
+            "pairs of edge and triangle that cut each other",
+            fill=-1,
+            attributes=_INSTANTS,
+        ),
+        *(
+            ArrayLayout(name, "float32", (FRAMES, 3), ("instant", "xyz"), what, fill=_NAN, attributes=_INSTANTS)
+            for name, what in (
+                ("contact_force", "force of the floor on the cloth [N]"),
+                ("holder_force", "force of the holders on the cloth [N]"),
+            )
+        ),
+        *(_mesh_arrays(spec.mesh) if spec.store_mesh else ()),
+    )
+
+
+_INSTANTS = {"instants_per_second": FRAMES_PER_SECOND}
+
+
+def _mesh_arrays(side: int) -> tuple[ArrayLayout, ...]:
+    """Return the arrays of a mesh of `side` vertices a side.
+
+    Rest shape and triangles are the same for all samples of a dataset, and are there for each all the same: a row that
+    repeats costs some bytes, an array without the dimension `sample` would be an exception in every reader.
+    """
+    vertices, triangles = side**2, 2 * (side - 1) ** 2
+    return (
+        ArrayLayout(
+            "mesh",
+            "float32",
+            (FRAMES, vertices, 3),
+            ("instant", "vertex", "xyz"),
+            "positions of the vertices [m]; the floor is z = 0, the drag along x",
+            fill=_NAN,
+            per_sample=True,
+            is_trajectory=True,
+            attributes=_INSTANTS,
+        ),
+        ArrayLayout(
+            "rest",
+            "float32",
+            (vertices, 2),
+            ("vertex", "uv"),
+            "the flat cloth [m]: along the held edge, and along the sheet up to it",
+            fill=_NAN,
+        ),
+        ArrayLayout("triangles", "int32", (triangles, 3), ("triangle", "corner"), "vertices of the triangles", fill=-1),
     )
 
 
 def describe(array: ArrayLayout) -> dict[str, Any]:
     """Return the attributes that the Zarr array carries."""
-    attributes: dict[str, Any] = {"description": array.description}
+    attributes: dict[str, Any] = {"description": array.description, **array.attributes}
     if array.categories:
         attributes["categories"] = list(array.categories)
     return attributes

@@ -25,7 +25,7 @@ class Manifest(Document):
     builds: Builds
     certificate: Sha256 | None = Field(default=None, description="digest of the certificate of the solver preset")
     cameras: tuple[Camera, ...] = Field(
-        description="of the array `views`, in its order; empty where nothing is rendered"
+        description="of the array `views`, in its order, or of the viewpoints, by name; empty where nothing is rendered"
     )
     sample_count: int = Field(ge=1, description="slots, the rejected ones included")
     valid_count: int = Field(ge=0)

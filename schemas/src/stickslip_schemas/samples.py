@@ -14,6 +14,9 @@ from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec, Splits
 from stickslip_schemas.keys import canonical_json, content_key, derived_seed, keyed_text, seed_of_key, sha256
 from stickslip_schemas.tasks import ClothRender, ClothSimulation, RodRender, RodSimulation
 
+CLOTH_RIG = "drag-3"
+"""The cameras of cloth clips; their names are those of the viewpoints."""
+
 SPLITS = ("train", "validation", "test")
 """Names of the splits, in the order of their numbers in the array `split`."""
 
@@ -214,6 +217,8 @@ def _cloth(spec: ClothDragSpec, point: dict[str, Any]) -> tuple[ClothSimulation,
         viewpoint=point["viewpoint"],
         frames=spec.frames,
         quality=spec.quality,
+        rig=CLOTH_RIG,
+        rig_digest=_rig_digest(CLOTH_RIG),
         light_seed=derived_seed(spec.seed, "light", point),
     )
     return simulation, render

@@ -101,6 +101,8 @@ class ClothRender(Document):
     """How a cloth is seen: all that its clip depends on besides its trajectory and the renderer's build."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
+    rig: str
+    rig_digest: Sha256
     texture: Texture
     viewpoint: Viewpoint
     frames: int

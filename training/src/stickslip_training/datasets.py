@@ -15,6 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.jobs import ClothDragSpec
 from stickslip_schemas.layout import SAMPLE_KEY_BYTES
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
@@ -156,7 +158,8 @@ class ClipDataset(_SampleDataset):
     """Clips of dragged cloth.
 
     An item holds `video` (frames, 224, 224, 3) uint8; `material`, `texture`, `viewpoint` int64, codes that
-    `categories()` names; `mu` float32; `slot` int64; `sample_key` uint8 (32,).
+    `categories()` names; `mu` float32; `side` int64, the side to which the drop went; `slot` int64; `sample_key` uint8
+    (32,). With `mesh`, also `mesh` (300, vertices, 3) float32 [m], and `rest()` and `triangles()` say what mesh it is.
     """
 
     def __init__(
@@ -164,11 +167,34 @@ class ClipDataset(_SampleDataset):
         source: str | os.PathLike[str] | DatasetReader,
         split: Split | None = None,
         *,
+        mesh: bool = False,
         ring: int = 0,
     ) -> None:
         """Open `split` of a dataset of clips, or all of it; `source` is a directory, a URL or an open reader."""
-        labels = ["material", "mu", "texture", "viewpoint"]
-        super().__init__(source, split, kind="cloth_drag", arrays=["video"], labels=labels, ring=ring)
+        labels = ["material", "mu", "texture", "viewpoint", "side"]
+        arrays = ["video"] + ["mesh"] * mesh
+        super().__init__(source, split, kind="cloth_drag", arrays=arrays, labels=labels, ring=ring)
+
+    @property
+    def instants(self) -> tuple[int, ...]:
+        """Index into the first dimension of `mesh` of each frame of `video`."""
+        spec = self.reader.spec
+        assert isinstance(spec, ClothDragSpec)
+        return shown_frames(spec.frames)
+
+    def rest(self) -> torch.Tensor:
+        """Return the flat cloth of all samples, (vertices, 2) float32 [m]."""
+        return self._of_any_sample("rest")
+
+    def triangles(self) -> torch.Tensor:
+        """Return the triangles of the mesh of all samples, (triangles, 3) int32."""
+        return self._of_any_sample("triangles")
+
+    def _of_any_sample(self, name: str) -> torch.Tensor:
+        valid = self.reader.slots()
+        if name not in self.reader.arrays or not len(valid):
+            raise ValueError(f"the dataset has no {name}: it was made with store_mesh: false, or has no valid sample")
+        return torch.from_numpy(self.reader.read(name, valid[:1])[0].copy())
 
     def categories(self, name: str) -> tuple[str, ...]:
         """Return the names of the codes 0, 1, ... of the label `name`."""

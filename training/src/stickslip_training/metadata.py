@@ -76,6 +76,10 @@ _CRC = {"name": "crc32c", "configuration": {}}
 
 def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
     chunk = [_LITTLE, {"name": "zstd", "configuration": {}}, _CRC]
+    if array.is_trajectory:
+        order = [0, *range(len(array.shape), 0, -1)]
+        transpose = {"name": "transpose", "configuration": {"order": order}}
+        chunk = [transpose, _LITTLE, {"name": "blosc", "configuration": {}}, _CRC]
     if not array.per_sample:
         return chunk
     configuration = {
@@ -88,7 +92,7 @@ def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
 
 
 def _normalised_codecs(codecs: Any, array: ArrayLayout) -> Any:
-    """Give every codec a configuration, and drop what a reader need not know: the level of zstd, say."""
+    """Give every codec a configuration, and drop what a reader need not know: the level of zstd, all of blosc's."""
     if not isinstance(codecs, list):
         return codecs
     result = []
@@ -97,7 +101,7 @@ def _normalised_codecs(codecs: Any, array: ArrayLayout) -> Any:
         if not isinstance(codec, dict):
             return codecs
         configuration = dict(codec.get("configuration") or {})
-        if codec.get("name") == "zstd":
+        if codec.get("name") in ("zstd", "blosc"):
             configuration = {}
         elif codec.get("name") == "bytes" and np.dtype(array.dtype).itemsize == 1:
             configuration.setdefault("endian", "little")  # a byte has no order

@@ -18,6 +18,7 @@ from stickslip_schemas.chunks import (
     CorruptChunkError,
     decode_chunk,
     decode_shard_index,
+    decode_trajectory,
     shard_index_size,
 )
 from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
@@ -196,7 +197,7 @@ class DatasetReader:
                 f"array {array.name}, sample {slot}: its chunk reaches beyond the end of {self._at(file)}"
             )
         chunk = self.source.read(file, offset, length)
-        _decode(chunk, out, f"array {array.name}, sample {slot}, {self._at(file)}")
+        _decode(chunk, out, f"array {array.name}, sample {slot}, {self._at(file)}", trajectory=array.is_trajectory)
 
     def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
         key = array.name, shard
@@ -318,9 +319,12 @@ def _parse_manifest(data: bytes) -> Manifest:
     return manifest
 
 
-def _decode(chunk: bytes, out: Array, what: str) -> None:
+def _decode(chunk: bytes, out: Array, what: str, *, trajectory: bool = False) -> None:
     """Decode a chunk into all of `out`, or raise."""
     try:
-        decode_chunk(chunk, out)
+        if trajectory:
+            decode_trajectory(chunk, out)
+        else:
+            decode_chunk(chunk, out)
     except (CorruptChunkError, RuntimeError, ValueError) as error:
         raise CorruptDataError(f"{what}: {error}") from error

@@ -9,7 +9,7 @@ from stickslip_schemas.keys import content_key, sha256
 
 import stickslip_workers
 
-_SIMULATING = ("rods.py", "records.py")
+_SIMULATING = ("rods.py", "cloth.py", "records.py")
 _FACE = ("rods.py", "general_rods.py", "multistability.py", "rod_labels.py", "splines.py")
 _PACKING = ("pack.py", "publish.py", "metadata.py", "records.py")
 _CONTRACT = ("chunks.py", "layout.py", "manifest.py")

@@ -46,7 +46,11 @@ LARGEST_BATCH = max(kind.batch for kind in KINDS.values())
 """How many simulations to ask for at once: one call takes them all."""
 
 _PRECEDENCE = (Stage.publish, Stage.pack, Stage.simulate, Stage.render)
-"""What goes first: the end of a job before its beginning, and simulations, being short, before renders."""
+"""What goes first: the end of a job before its beginning, and simulations, while they are short, before renders."""
+
+LONG_SIMULATION = 2.0
+"""Simulations that take longer [s] go after renders: clips come out while others are simulated, and the time that is
+left can be told from both. Of such no more are leased than run soon, for another dispatcher may have nothing to do."""
 
 _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
 _results = TypeAdapter(list[TaskResult])
@@ -102,6 +106,7 @@ class Dispatcher:
         self._reports: deque[Report] = deque()
         self._reports_due = 0.0
         self._task_seconds: dict[Stage, float] = {}
+        self._simulation_seconds: float | None = None
         self._next_lease = 0.0
         self._stopping = False
 
@@ -200,6 +205,9 @@ class Dispatcher:
             results = _read_results(answer, len(assignment.leases))
         seconds = time.monotonic() - assignment.started_at
         self._task_seconds[assignment.stage] = 0.8 * self._task_seconds.get(assignment.stage, seconds) + 0.2 * seconds
+        if assignment.stage is Stage.simulate:
+            each = seconds / len(assignment.leases)
+            self._simulation_seconds = 0.8 * (self._simulation_seconds or each) + 0.2 * each
         self._settle(assignment, results)
 
     def _settle(self, assignment: Assignment, results: list[TaskResult]) -> None:
@@ -242,7 +250,8 @@ class Dispatcher:
             if len(wanted) < len(queue):
                 queue.clear()
                 queue.extend(wanted)
-        for stage in _PRECEDENCE:
+        long = (self._simulation_seconds or 0.0) > LONG_SIMULATION
+        for stage in reversed(Stage) if long else _PRECEDENCE:
             queue = self._queues[stage]
             pool = self._pool(stage)
             while queue and len(self._running) < self._slots:
@@ -290,7 +299,7 @@ class Dispatcher:
         registration = WorkerRegistration(
             name=self._settings.name,
             builds=Builds(**stage["builds"], blender=render["build"]),
-            kinds=tuple(KINDS),
+            kinds=tuple(kind for kind in KINDS if kind in render["kinds"]),
             slots=self._slots,
             versions={**stage["versions"], **render.get("versions", {})},
         )
@@ -337,7 +346,8 @@ class Dispatcher:
             if idle > 0 or queued <= ahead // 2:  # not for one at a time
                 wanted[stage] = ahead + idle
         if wanted and not self._queues[Stage.simulate]:
-            wanted[Stage.simulate] = LARGEST_BATCH
+            short = self._simulation_seconds is not None and self._simulation_seconds <= LONG_SIMULATION
+            wanted[Stage.simulate] = LARGEST_BATCH if short else self._slots
         return {stage: count for stage, count in wanted.items() if count > 0}
 
     def _ahead(self, stage: Stage) -> int:

@@ -33,7 +33,7 @@ class Settings:
     """Resident memory at which a process gives way to a fresh one [bytes]."""
 
     exec_seconds: dict[Stage, float] = field(
-        default_factory=lambda: {Stage.simulate: 600, Stage.render: 300, Stage.pack: 600, Stage.publish: 3600}
+        default_factory=lambda: {Stage.simulate: 3600, Stage.render: 1800, Stage.pack: 600, Stage.publish: 3600}
     )
     """Limit of one task, or batch of simulations, by stage; then its process is killed."""
     start_seconds: float = 120

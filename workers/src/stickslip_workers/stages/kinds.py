@@ -7,6 +7,8 @@ from typing import Any, Literal
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import TaskResult
 
+from stickslip_workers.stages.cloth import RECORD_ARRAYS as CLOTH_ARRAYS
+from stickslip_workers.stages.cloth import simulate_cloths
 from stickslip_workers.stages.rods import RECORD_ARRAYS, simulate_rods
 
 KindName = Literal["rod_hang", "cloth_drag"]
@@ -27,11 +29,6 @@ class Kind:
 KINDS: dict[KindName, Kind] = {
     # Small enough that a lost batch costs little: 512 rods are well below a second.
     "rod_hang": Kind(simulate=simulate_rods, batch=512, record_arrays=RECORD_ARRAYS),
+    # Minutes each.
+    "cloth_drag": Kind(simulate=simulate_cloths, batch=1, record_arrays=CLOTH_ARRAYS),
 }
-
-
-def kind_of(name: KindName) -> Kind:
-    """Return the kind of this name, or raise ValueError."""
-    if name not in KINDS:
-        raise ValueError(f"kind must be one of {', '.join(KINDS)} for this worker; got {name!r}")
-    return KINDS[name]

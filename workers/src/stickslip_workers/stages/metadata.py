@@ -2,7 +2,8 @@
 
 import warnings
 
-from stickslip_schemas.chunks import ZSTD_LEVEL
+import numpy as np
+from stickslip_schemas.chunks import BLOSC_LEVEL, ZSTD_LEVEL
 from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.layout import FORMAT, ArrayLayout, describe, layout
 
@@ -37,18 +38,24 @@ def metadata_files(
 
 def create_array(group: object, array: ArrayLayout, *, sample_count: int, samples_per_shard: int) -> object:
     """Create `array` in a zarr group, empty, with the codecs that the packer writes."""
-    from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+    from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
     group_shape = (samples_per_shard, *array.shape)
+    filters: tuple[object, ...] = ()
+    compressor: object = ZstdCodec(level=ZSTD_LEVEL, checksum=False)
+    if array.is_trajectory:
+        filters = (TransposeCodec(order=(0, *range(len(array.shape), 0, -1))),)
+        width = np.dtype(array.dtype).itemsize
+        compressor = BloscCodec(typesize=width, cname="zstd", clevel=BLOSC_LEVEL, shuffle="shuffle", blocksize=0)
     return group.create_array(  # type: ignore[attr-defined]  # zarr.Group; zarr is imported late
         array.name,
         shape=(sample_count, *array.shape),
         dtype=array.dtype,
         chunks=(1, *array.shape) if array.per_sample else group_shape,
         shards=group_shape if array.per_sample else None,  # the index: crc32c, at the end, as zarr has it
-        filters=(),
+        filters=filters,
         serializer=BytesCodec(endian="little"),
-        compressors=(ZstdCodec(level=ZSTD_LEVEL, checksum=False), Crc32cCodec()),
+        compressors=(compressor, Crc32cCodec()),
         fill_value=array.fill,
         dimension_names=("sample", *array.dimensions),
         attributes=describe(array),

@@ -1,37 +1,25 @@
 """Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write them."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.chunks import check_chunk, encode_chunk, encode_shard
+from stickslip_schemas.chunks import check_chunk, encode_chunk, encode_shard, encode_trajectory
 from stickslip_schemas.layout import ArrayLayout, layout
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry, PackOutput, PackSlot, PackTask
+from stickslip_schemas.tasks import FileEntry, PackOutput, PackSlot, PackTask, RecordRef
 
-from stickslip_workers.stages.kinds import kind_of
+from stickslip_workers.stages.kinds import KINDS
 from stickslip_workers.stages.records import Array, Records
 
 
 def pack(task: PackTask, store: Store) -> PackOutput:
     """Make the file of shard `task.shard` of every array."""
     _check_slots(task)
-    records = Records(store)
-    record_arrays = kind_of(task.spec.kind).record_arrays
-    size = task.spec.samples_per_shard
+    shard = _Shard(task, store)
+    for row, slot in enumerate(task.slots):
+        shard.fill(row, slot)
     files = []
     for array in layout(task.spec):
-        if array.per_sample:
-            data = encode_shard(_chunks(array, task.slots, size, store))
-        else:
-            # Slots beyond the last sample keep the fill value: a chunk is always whole.
-            column: Array = np.full((size, *array.shape), array.fill, dtype=array.dtype)
-            for row, slot in enumerate(task.slots):
-                if array.name in record_arrays:
-                    _fill_record(column, row, array, slot, records)
-                else:
-                    column[row] = _label(array, slot)
-            data = encode_chunk(column)
+        data = shard.encode(array)
         digest = store.publish(data)
         files.append(FileEntry(path=array.shard_path(task.shard), sha256=digest, size=len(data)))
     return PackOutput(files=tuple(files))
@@ -48,33 +36,78 @@ def _check_slots(task: PackTask) -> None:
         )
 
 
-def _chunks(array: ArrayLayout, slots: Sequence[PackSlot], size: int, store: Store) -> list[bytes | None]:
-    """Return the encoded chunks as the renderer wrote them; None where there is nothing."""
-    chunks: list[bytes | None] = [None] * size
-    for position, slot in enumerate(slots):
-        if not slot.valid:
-            continue
+class _Shard:
+    """A shard group while it fills, sample by sample: a record is megabytes of cloth and is read once."""
+
+    def __init__(self, task: PackTask, store: Store) -> None:
+        self._store = store
+        self._records = Records(store)
+        self._record_arrays = KINDS[task.spec.kind].record_arrays
+        self._arrays = layout(task.spec)
+        size = task.spec.samples_per_shard
+        # A sample that is not there has no chunk; in a column, it keeps the fill value, for a chunk is always whole.
+        self._chunks: dict[str, list[bytes | None]] = {
+            array.name: [None] * size for array in self._arrays if array.per_sample
+        }
+        self._columns: dict[str, Array] = {
+            array.name: np.full((size, *array.shape), array.fill, dtype=array.dtype)
+            for array in self._arrays
+            if not array.per_sample
+        }
+        self._trajectories: dict[tuple[str, RecordRef], bytes] = {}
+
+    def fill(self, row: int, slot: PackSlot) -> None:
+        """Put a sample in its place."""
+        for array in self._arrays:
+            recorded = array.name in self._record_arrays
+            if not array.per_sample and not recorded:
+                self._columns[array.name][row] = _label(array, slot)
+            elif not slot.valid:
+                continue
+            elif not array.per_sample:
+                self._columns[array.name][row] = self._recorded(array, _record(slot))
+            elif recorded:
+                self._chunks[array.name][row] = self._trajectory(array, _record(slot))
+            else:
+                self._chunks[array.name][row] = self._rendered(array, slot)
+
+    def encode(self, array: ArrayLayout) -> bytes:
+        """Return the file of an array."""
+        if array.per_sample:
+            return encode_shard(self._chunks[array.name])
+        return encode_chunk(self._columns[array.name])
+
+    def _rendered(self, array: ArrayLayout, slot: PackSlot) -> bytes:
+        """Return an encoded chunk as the renderer wrote it."""
         if array.name not in slot.chunks:
             raise ValueError(f"chunks of slot {slot.slot} must have {array.name!r}; got {sorted(slot.chunks)}")
         where = slot.chunks[array.name]
-        chunk = store.read(where.digest, offset=where.offset, length=where.length)
+        chunk = self._store.read(where.digest, offset=where.offset, length=where.length)
         check_chunk(chunk)
-        chunks[position] = chunk
-    return chunks
+        return chunk
+
+    def _trajectory(self, array: ArrayLayout, record: RecordRef) -> bytes:
+        """Return the encoded chunk of a trajectory; the renders of one simulation share it."""
+        key = array.name, record
+        if key not in self._trajectories:
+            self._trajectories[key] = encode_trajectory(self._recorded(array, record))
+        return self._trajectories[key]
+
+    def _recorded(self, array: ArrayLayout, record: RecordRef) -> Array:
+        values = self._records(record.digest)[array.name]
+        if values.shape[1:] != array.shape or values.dtype != array.dtype or record.row >= len(values):
+            raise ValueError(
+                f"{array.name!r} of artifact {record.digest} must be {array.dtype} of shape (n, *{array.shape}) "
+                f"with n > {record.row}; got {values.dtype} of shape {values.shape}"
+            )
+        row: Array = values[record.row]
+        return row
 
 
-def _fill_record(column: Array, row: int, array: ArrayLayout, slot: PackSlot, records: Records) -> None:
-    if not slot.valid:
-        return
+def _record(slot: PackSlot) -> RecordRef:
     if slot.record is None:
         raise ValueError(f"record of slot {slot.slot} must be there, for the slot is valid")
-    values = records(slot.record.digest)[array.name]
-    if values.shape[1:] != array.shape or values.dtype != array.dtype or slot.record.row >= len(values):
-        raise ValueError(
-            f"{array.name!r} of artifact {slot.record.digest} must be {array.dtype} of shape (n, *{array.shape}) "
-            f"with n > {slot.record.row}; got {values.dtype} of shape {values.shape}"
-        )
-    column[row] = values[slot.record.row]
+    return slot.record
 
 
 def _label(array: ArrayLayout, slot: PackSlot) -> npt.ArrayLike:

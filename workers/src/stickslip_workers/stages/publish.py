@@ -7,7 +7,7 @@ from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import canonical_json
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
-from stickslip_schemas.samples import SPLITS, dataset_id
+from stickslip_schemas.samples import CLOTH_RIG, SPLITS, dataset_id
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask
 
@@ -61,7 +61,9 @@ def _check_complete(task: PublishTask, store: Store) -> None:
 
 
 def _cameras(spec: RodHangSpec | ClothDragSpec) -> tuple[Camera, ...]:
-    return load_rig(spec.views) if isinstance(spec, RodHangSpec) and spec.views is not None else ()
+    if isinstance(spec, ClothDragSpec):
+        return load_rig(CLOTH_RIG)
+    return () if spec.views is None else load_rig(spec.views)
 
 
 def _split_counts(task: PublishTask, store: Store) -> dict[str, int]:

@@ -7,7 +7,7 @@ from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult
 
 from stickslip_workers.failures import failure
-from stickslip_workers.stages.kinds import kind_of
+from stickslip_workers.stages.kinds import KINDS
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
 
@@ -35,7 +35,7 @@ def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     simulations = [task.simulation for task in tasks if isinstance(task, SimulateTask)]
     kinds = {simulation.kind for simulation in simulations}
     if len(simulations) == len(tasks) and len(kinds) == 1:
-        return kind_of(kinds.pop()).simulate(simulations, store)
+        return KINDS[kinds.pop()].simulate(simulations, store)
     if len(tasks) == 1:
         (task,) = tasks
         if isinstance(task, PackTask):

@@ -1,0 +1,300 @@
+"""Cloth: a trajectory becomes a record, and records and clips a dataset that every reader opens."""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import stickslip_sim_core
+import tensorstore
+import xarray
+import zarr
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.chunks import encode_chunk, encode_trajectory
+from stickslip_schemas.jobs import ClothDragSpec, Viewpoint
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.samples import dataset_id, samples
+from stickslip_schemas.states import Reason
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import (
+    ChunkRef,
+    ClothSimulation,
+    FileEntry,
+    PackSlot,
+    PackTask,
+    PublishTask,
+    Rejection,
+    SimulateTask,
+)
+from stickslip_workers.stages import pack as pack_module
+from stickslip_workers.stages.metadata import create_array
+from stickslip_workers.stages.pack import pack
+from stickslip_workers.stages.publish import publish
+from stickslip_workers.stages.records import Records, encode_records
+from stickslip_workers.stages.run import run_tasks
+
+BUILDS = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+SIDE = 5
+
+
+@dataclass(frozen=True)
+class Run:
+    """What `drop_and_drag` returns."""
+
+    positions: np.ndarray[Any, Any]
+    rest: np.ndarray[Any, Any]
+    triangles: np.ndarray[Any, Any]
+    self_intersections: np.ndarray[Any, Any]
+    contact_force: np.ndarray[Any, Any]
+    holder_force: np.ndarray[Any, Any]
+    steps: int = 1200
+    unconverged_steps: int = 3
+    worst_residual: float = 2e-4
+    side: int = -1
+    bias: float = 1e-5
+    valid: bool = True
+    reason: str = ""
+
+
+@dataclass
+class Core:
+    """A core that moves a sheet at once: slides it with mu, and breaks where it is told to."""
+
+    calls: list[tuple[Any, ...]] = field(default_factory=list)
+    changes: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self, material: str, mu: float, *, preset: str, vertices: int, frames: int, seed: int) -> Run:
+        self.calls.append((material, mu, preset, vertices, frames, seed))
+        line = np.linspace(-0.1, 0.1, vertices)
+        rest = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+        number = np.arange(vertices**2).reshape(vertices, vertices)
+        a, b, c, d = (number[i : vertices - 1 + i, j : vertices - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
+        t = np.linspace(0.0, 1.0, frames)
+        positions = np.zeros((frames, len(rest), 3))
+        positions[..., 0] = mu * t[:, None]
+        positions[..., 1:] = rest + np.array([0.0, 0.11])
+        run = Run(
+            positions=positions,
+            rest=rest,
+            triangles=np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)]),
+            self_intersections=np.arange(frames) * 1000,
+            contact_force=np.outer(t, (mu, 0.0, 1.0)),
+            holder_force=np.outer(t, (-mu, 0.0, -1.0)),
+        )
+        return replace(run, **self.changes)
+
+
+@pytest.fixture
+def core(monkeypatch: pytest.MonkeyPatch) -> Core:
+    """A core that answers at once, in place of the one that takes minutes."""
+    core = Core()
+    monkeypatch.setattr(stickslip_sim_core, "drop_and_drag", core, raising=False)
+    return core
+
+
+def _task(**changes: Any) -> SimulateTask:
+    cloth = {"material": "gray-interlock", "mu": 0.25, "preset": "fast", "mesh": SIDE, "seed": 7}
+    return SimulateTask(simulation=ClothSimulation(**(cloth | changes)))
+
+
+def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> None:
+    (result,) = run_tasks([_task()], store)
+    assert core.calls == [("gray-interlock", 0.25, "fast", SIDE, 300, 7)]
+    assert result.outcome == "succeeded"
+    assert result.output.labels == {
+        "side": -1,
+        "bias": 1e-5,
+        "steps": 1200,
+        "unconverged_steps": 3,
+        "worst_residual": 2e-4,
+    }
+    with np.load(io.BytesIO(store.read(result.output.record.digest))) as arrays:
+        record = {name: values[result.output.record.row] for name, values in arrays.items()}
+    assert {name: (values.shape, values.dtype) for name, values in record.items()} == {
+        "mesh": ((300, 25, 3), np.float32),
+        "rest": ((25, 2), np.float32),
+        "triangles": ((32, 3), np.int32),
+        "self_intersections": ((300,), np.int16),
+        "contact_force": ((300, 3), np.float32),
+        "holder_force": ((300, 3), np.float32),
+    }
+    assert record["mesh"][-1, :, 0] == pytest.approx(0.25)
+    assert record["self_intersections"][[1, 50]].tolist() == [1000, 32767]  # more than fits is still many
+
+
+def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: Core, store: Store) -> None:
+    core.changes = {"valid": False, "reason": "12 of 1200 steps did not converge"}
+    (result,) = run_tasks([_task()], store)
+    assert (result.outcome, result.reason) == ("rejected", Reason.solver_diverged)
+    assert result.message == (
+        "12 of 1200 steps did not converge at material = gray-interlock, mu = 0.25 with preset fast, "
+        "5 vertices a side, seed 7"
+    )
+    assert not (store.root / "artifacts").exists()
+
+
+@dataclass
+class Clips:
+    """A dataset of 3 trajectories x 2 textures before it is packed, and what its arrays must hold."""
+
+    spec: ClothDragSpec
+    pack_tasks: list[PackTask]
+    arrays: dict[str, np.ndarray[Any, Any]]
+    publish_task: Callable[[list[FileEntry]], PublishTask]
+
+
+@pytest.fixture
+def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
+    def make(rejected: tuple[int, ...] = (), per_shard: int = 4, **changes: Any) -> Clips:
+        document = {
+            "kind": "cloth_drag",
+            "axes": {
+                "material": "gray-interlock",
+                "mu": [0.1, 0.2, 0.3],
+                "texture": ["dots", "plaid"],
+                "viewpoint": "right",
+            },
+            "mesh": SIDE,
+            "frames": 2,
+            "samples_per_shard": per_shard,
+        }
+        spec = ClothDragSpec.model_validate(document | changes)
+        members = list(samples(spec, BUILDS))
+        arrays = {
+            array.name: np.full((len(members), *array.shape), array.fill, dtype=array.dtype) for array in layout(spec)
+        }
+        rng = np.random.default_rng(0)
+        slots, rejections = [], []
+        for i, sample in enumerate(members):
+            common = {"slot": i, "sample_key": sample.key, "labels": sample.labels}
+            arrays["sample_key"][i] = np.frombuffer(bytes.fromhex(sample.key), dtype=np.uint8)
+            arrays["split"][i] = sample.split
+            arrays["mu"][i] = sample.labels["mu"]
+            arrays["material"][i], arrays["viewpoint"][i] = 2, 2
+            arrays["texture"][i] = {"dots": 1, "plaid": 3}[sample.labels["texture"]]
+            if i in rejected:
+                rejections.append(Rejection(**common, reason=Reason.out_of_frame, message="made up"))
+                slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
+                continue
+            (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
+            light = [float(value) for value in rng.random(5).astype(np.float32)]
+            labels = sample.labels | result.output.labels | {"light_seed": i, "light": light}
+            arrays["valid"][i] = True
+            for name in ("side", "bias", "steps", "unconverged_steps", "worst_residual", "light_seed", "light"):
+                arrays[name][i] = labels[name]
+            for name, values in Records(store)(result.output.record.digest).items():
+                if name in arrays:
+                    arrays[name][i] = values[0]
+            arrays["video"][i] = rng.integers(0, 4, arrays["video"].shape[1:])
+            chunk = encode_chunk(arrays["video"][i])
+            where = ChunkRef(digest=store.publish(chunk), offset=0, length=len(chunk))
+            slots.append(
+                PackSlot(
+                    slot=i,
+                    sample_key=sample.key,
+                    split=sample.split,
+                    labels=labels,
+                    record=result.output.record,
+                    chunks={"video": where},
+                )
+            )
+        tasks = [
+            PackTask(spec=spec, shard=shard, slots=tuple(slots[first : first + per_shard]))
+            for shard, first in enumerate(range(0, len(slots), per_shard))
+        ]
+
+        def publish_task(files: list[FileEntry]) -> PublishTask:
+            return PublishTask(
+                spec=spec,
+                dataset=dataset_id(spec),
+                version=1,
+                builds=BUILDS,
+                files=tuple(files),
+                sample_keys=tuple(sample.key for sample in members),
+                rejections=tuple(rejections),
+            )
+
+        return Clips(spec, tasks, arrays, publish_task)
+
+    return make
+
+
+@pytest.mark.parametrize("store_mesh", [True, False])
+def test_files_are_those_of_zarr_python(
+    make_clips: Callable[..., Clips], store: Store, tmp_path: Path, store_mesh: bool
+) -> None:
+    made = make_clips(rejected=(2,), store_mesh=store_mesh)
+    packed = {file.path: store.read(file.sha256) for task in made.pack_tasks for file in pack(task, store).files}
+    group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
+    for array in layout(made.spec):
+        with zarr.config.set({"array.write_empty_chunks": not array.per_sample}):
+            create_array(group, array, sample_count=6, samples_per_shard=4)[:] = made.arrays[array.name]  # type: ignore[index]
+    written = {
+        path.relative_to(tmp_path / "zarr").as_posix(): path.read_bytes()
+        for path in (tmp_path / "zarr").rglob("*")
+        if path.is_file() and path.name != "zarr.json"
+    }
+    assert ("mesh/c/0/0/0/0" in packed) == store_mesh
+    assert packed.keys() == written.keys()
+    assert [path for path in packed if packed[path] != written[path]] == []
+
+
+def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], store: Store) -> None:
+    made = make_clips(rejected=(3,))
+    files = [file for task in made.pack_tasks for file in pack(task, store).files]
+    publish(made.publish_task(files), store)
+    directory = store.dataset_path(dataset_id(made.spec), 1)
+    group = zarr.open_group(directory, mode="r")
+    with xarray.open_zarr(directory, chunks=None, mask_and_scale=False) as dataset:
+        for name, expected in made.arrays.items():
+            spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{directory / name}/"}}
+            third = tensorstore.open(spec, read=True).result().read().result()
+            for got in (group[name][...], dataset[name].values, third):
+                assert got.dtype == expected.dtype, name
+                assert got.tobytes() == expected.tobytes(), name
+        assert dataset["mesh"].dims == ("sample", "instant", "vertex", "xyz")
+    assert group["video"].attrs["instants"] == [0, 150]
+    manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+    assert manifest.cameras == load_rig("drag-3")
+    assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
+
+
+def test_a_trajectory_is_encoded_once_for_all_its_renders(
+    make_clips: Callable[..., Clips], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoded = []
+
+    def count(data: np.ndarray[Any, Any]) -> bytes:
+        encoded.append(data)
+        return encode_trajectory(data)
+
+    monkeypatch.setattr(pack_module, "encode_trajectory", count)
+    for task in make_clips(per_shard=6).pack_tasks:
+        pack(task, store)
+    assert len(encoded) == 3
+
+
+def test_a_mesh_of_another_size_is_refused(make_clips: Callable[..., Clips], store: Store) -> None:
+    (task, *_) = make_clips().pack_tasks
+    other = task.spec.model_copy(update={"mesh": 7})
+    with pytest.raises(ValueError, match=r"must be float32 of shape \(n, \*\(300, 49, 3\)\) with n > 0; got float32"):
+        pack(task.model_copy(update={"spec": other}), store)
+
+
+def test_records_forget_what_is_too_much(store: Store) -> None:
+    digests = [store.publish(encode_records({"a": np.full(100, i)})) for i in range(3)]
+    records = Records(store, kept_bytes=1700)
+    for i in (0, 1, 2, 0):
+        assert records(digests[i])["a"].tolist() == [i] * 100
+    first = records(digests[0])
+    assert records(digests[0]) is first  # kept: it was used last
+    assert records(digests[1]) is not records(digests[2])
+    store.path(digests[1]).unlink()
+    records(digests[2]), records(digests[0])
+    with pytest.raises(FileNotFoundError):
+        records(digests[1])
