@@ -6,15 +6,18 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
-from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.responses import Dataset, DatasetVersion, Page
 
+from stickslip_services.dataset_page import dataset_page
 from stickslip_services.files import OPENAPI_HEADERS, serve
 from stickslip_services.routes.common import CoordinatorDep, PageDep, problem_responses
 
 router = APIRouter(tags=["datasets"])
 
 Version = Annotated[int, Path(ge=1, lt=2**31)]
+
+_INERT = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
 
 _BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 
@@ -58,6 +61,14 @@ _MANIFEST_CONTENT: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/
 def get_manifest(dataset: str, version: Version, request: Request, coordinator: CoordinatorDep) -> Response:
     """Return the manifest: every file of the version with its digest, and what it was made from."""
     return _serve(request, coordinator, dataset, version, MANIFEST_NAME)
+
+
+@router.get("/v1/datasets/{dataset}/versions/{version}/page", include_in_schema=False)
+def get_page(dataset: str, version: Version, coordinator: CoordinatorDep) -> Response:
+    """Return the version's page for people: its acceptance rate, and where in the grid samples were lost."""
+    file = coordinator.find_file(dataset, version, MANIFEST_NAME)
+    manifest = Manifest.model_validate_json(coordinator.store.read(file.sha256))
+    return Response(dataset_page(manifest), media_type="text/html", headers=_INERT)
 
 
 @router.get(
