@@ -1,11 +1,12 @@
 """How far reconstructed centrelines are from the true ones, over rods rendered as datasets are.
 
-python benchmarks/reconstruction.py [--rods 200] [--hard] [--out DIR] [--save FILE.npz] [--views FILE.npz]
+python benchmarks/reconstruction.py [--rods 200] [--hard | --varying] [--out DIR] [--save FILE.npz] [--views FILE.npz]
 
 Draws rods from the thesis's ranges (seeded), renders them in Blender's interpreter, reconstructs them from the
 pictures alone, and prints errors in per cent of the length. The error of a rod is the mean distance of points at the
 same arc length. --views keeps the pictures, or takes them from there if the file exists. --save writes `true` and
-`reconstructed` (rods, 150, 3) over L, with parameters and verdicts: data for a model of reconstruction noise.
+`reconstructed` (rods, 150, 3) over L, with verdicts, parameters and true strains: data for a model of reconstruction
+noise. --varying takes rods whose natural curvature varies along their length (rod_families.py).
 """
 
 import argparse
@@ -23,7 +24,9 @@ for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another
 
 import numpy as np  # noqa: E402
 import numpy.typing as npt  # noqa: E402
+from rod_families import RANGES, varying_rods  # noqa: E402
 from stickslip_schemas.cameras import load_rig  # noqa: E402
+from stickslip_sim_core import solve_rods  # noqa: E402
 from stickslip_training.reconstruction import Reconstruction, Verdict, reconstruct  # noqa: E402
 from stickslip_training.reconstruction.hull import moving_cylinder, visual_hull  # noqa: E402
 from stickslip_training.reconstruction.overlay import save_overlay  # noqa: E402
@@ -35,7 +38,6 @@ Floats = npt.NDArray[np.float64]
 HERE = Path(__file__).parent
 RIG = "rod-4"
 RADIUS = 0.008  # [L], the renderer's default
-RANGES = {"gamma": (100.0, 1300.0), "phi0": (0.2, 12.0), "phi1": (6.0, 20.0)}  # [thesis, 5.4.1]
 # Where rods coil at their free end, twice over: most of the thesis's own few hard ones lie in this corner.
 HARD_RANGES = {"gamma": (50.0, 200.0), "phi0": (0.2, 4.0), "phi1": (15.0, 30.0)}
 BAD = 0.005  # [L]: a mean error above it, or a largest error above four times it, is a failure
@@ -57,18 +59,23 @@ class Judged:
         return bool(self.error.mean() > BAD or self.error.max() > 4.0 * BAD)
 
 
-def draw_rods(count: int, seed: int, hard: bool) -> dict[str, Floats]:
-    """Return parameters and centrelines of rods that lie in all four frames."""
-    from stickslip_sim_core import solve_rods
-
+def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats]:
+    """Return rods of a family that lie in all four frames: centrelines, strains and what they are made from."""
     random, rig = np.random.Generator(np.random.PCG64(seed)), load_rig(RIG)
-    rows = [random.uniform(low, high, 2 * count) for low, high in (HARD_RANGES if hard else RANGES).values()]
-    lines = solve_rods(*rows).centerline
+    if family == "varying":
+        drawn = varying_rods(2 * count, random)
+        made = {"gamma": drawn.gamma, "natural": drawn.natural}
+        lines, strains = drawn.centerline, drawn.strains
+    else:
+        ranges = HARD_RANGES if family == "hard" else RANGES
+        made = {name: random.uniform(*bounds, 2 * count) for name, bounds in ranges.items()}
+        solution = solve_rods(*made.values())
+        lines, strains = solution.centerline, solution.curvature
     kept = [i for i, line in enumerate(lines) if all(camera.in_frame(line, RADIUS) for camera in rig)][:count]
-    return {"centerline": lines[kept], **{name: row[kept] for name, row in zip(RANGES, rows, strict=True)}}
+    return {"centerline": lines[kept], "strains": strains[kept], **{name: row[kept] for name, row in made.items()}}
 
 
-def rendered(rods: int, seed: int, hard: bool, blender: Path, keep: Path | None) -> dict[str, npt.NDArray[Any]]:
+def rendered(rods: int, seed: int, family: str, blender: Path, keep: Path | None) -> dict[str, npt.NDArray[Any]]:
     """Return the rods with their `views`, rendered now unless `keep` has them."""
     if keep is not None and keep.exists():
         with np.load(keep) as file:
@@ -76,7 +83,7 @@ def rendered(rods: int, seed: int, hard: bool, blender: Path, keep: Path | None)
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / "rods.npz"
         views = keep or Path(folder) / "views.npz"
-        arrays: dict[str, Any] = {**draw_rods(rods, seed, hard)}
+        arrays: dict[str, Any] = {**draw_rods(rods, seed, family)}
         np.savez(drawn, **arrays)
         subprocess.run([blender, HERE / "render_rod_set.py", drawn, views, "--rig", RIG], check=True)
         with np.load(views) as file:
@@ -157,7 +164,7 @@ def save_pictures(out: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Jud
 
 def save_data(path: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Judged]) -> None:
     """Write true and reconstructed centrelines."""
-    parameters: dict[str, Any] = {name: rods[name] for name in RANGES}
+    given: dict[str, Any] = {name: rods[name] for name in ("strains", "natural", *RANGES) if name in rods}
     np.savez_compressed(
         path,
         true=rods["centerline"],
@@ -166,7 +173,7 @@ def save_data(path: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Judged
         views_seen=np.stack([item.found.views_seen for item in judged]),
         verdict=np.array([item.found.verdict.value for item in judged]),
         misfit=np.array([item.found.misfit for item in judged]),
-        **parameters,
+        **given,
     )
 
 
@@ -174,14 +181,17 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--rods", type=int, default=200)
     arguments.add_argument("--seed", type=int, default=2024)
-    arguments.add_argument("--hard", action="store_true", help="rods beyond the thesis's, to see failures flagged")
+    kinds = arguments.add_mutually_exclusive_group()
+    kinds.add_argument("--hard", action="store_true", help="rods beyond the thesis's, to see failures flagged")
+    kinds.add_argument("--varying", action="store_true", help="rods of varying natural curvature")
     arguments.add_argument("--out", type=Path, help="folder for the histogram and overlays")
     arguments.add_argument("--save", type=Path, help="npz for true and reconstructed centrelines")
     arguments.add_argument("--views", type=Path, help="npz that keeps the rendered views")
     arguments.add_argument("--blender", type=Path, default=HERE.parent / ".venv-blender/bin/python")
     options = arguments.parse_args()
 
-    rods = rendered(options.rods, options.seed, options.hard, options.blender, options.views)
+    family = "hard" if options.hard else "varying" if options.varying else "thesis"
+    rods = rendered(options.rods, options.seed, family, options.blender, options.views)
     judged, thesis = [], []
     for views, true in zip(rods["views"], rods["centerline"], strict=True):
         judged.append(judge(views, true))
