@@ -66,6 +66,37 @@ class TestRodLateralBuckling:
         assert weights[0] > weights[1] > weights[2]
 
 
+class TestCertification:
+    @pytest.mark.parametrize("preset", sorted(protocols.CERTIFICATION))
+    def test_names_protocols_and_numbers(self, preset: str) -> None:
+        certification = protocols.CERTIFICATION[preset]
+        assert certification.protocols
+        assert set(certification.protocols) <= set(protocols.PROTOCOLS)
+        assert set(certification.quick) <= set(certification.protocols)
+        json.dumps(dict(certification.numbers), allow_nan=False)
+
+    def test_rods_take_no_notice_of_a_preset(self) -> None:
+        first, second = (protocols.run("rod-cantilever", preset, gamma=(1.0,), elements=64) for preset in (None, "x"))
+        assert first == second
+
+    def test_others_are_given_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def pretend(*, preset: str = "certified", cells: int = 50) -> Any:
+            return preset, cells
+
+        monkeypatch.setattr(protocols, "PROTOCOLS", {"pretend": pretend})
+        results: list[Any] = [protocols.run("pretend"), protocols.run("pretend", "fast", cells=7)]
+        assert results == [("certified", 50), ("fast", 7)]
+
+    def test_figures(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        pytest.importorskip("matplotlib")
+        from stickslip_sim_core.protocols import plots
+
+        result = protocols.run("rod-cantilever", gamma=(1.0, 2.0), elements=64)
+        assert len(plots.figures(result)) == 1
+        monkeypatch.setattr(plots, "PLOTS", {"rod-cantilever": (plots.plot, plots.plot)})
+        assert len(plots.figures(result)) == 2
+
+
 class TestRelax:
     def test_agrees_with_solve_rods(self) -> None:
         """From its own natural shape a chain relaxes to the rod that solve_rods extrapolates to."""

@@ -177,6 +177,10 @@ class ClothDragSpec(_JobSpec):
     kind: Literal["cloth_drag"]
     axes: ClothAxes
     preset: Preset = Preset.certified
+    allow_uncertified: bool = Field(
+        default=False,
+        description="make the dataset even where no passing certificate vouches for the preset with the workers' build",
+    )
     mesh: int = Field(default=41, ge=5, le=161, description="vertices a side")
     frames: int = Field(default=30, ge=1, le=300, description="rendered frames, at regular intervals of 300")
     store_mesh: bool = Field(

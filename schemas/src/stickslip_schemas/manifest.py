@@ -23,7 +23,9 @@ class Manifest(Document):
     spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
     spec_digest: Sha256
     builds: Builds
-    certificate: Sha256 | None = Field(default=None, description="digest of the certificate of the solver preset")
+    certificate: Sha256 | None = Field(
+        default=None, description="digest of the certificate of preset and build; null: none"
+    )
     cameras: tuple[Camera, ...] = Field(
         description="of the array `views`, in its order, or of the viewpoints, by name; empty where nothing is rendered"
     )

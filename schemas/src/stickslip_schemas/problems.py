@@ -22,6 +22,7 @@ class ProblemCode(StrEnum):
     precondition_failed = "precondition_failed"
     idempotency_key_reused = "idempotency_key_reused"
     kind_not_available = "kind_not_available"
+    preset_not_certified = "preset_not_certified"
     stale_lease = "stale_lease"
     unknown_worker = "unknown_worker"
     storage_error = "storage_error"

@@ -1,7 +1,7 @@
 """What the coordinator answers to users."""
 
 from datetime import datetime
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
@@ -80,6 +80,7 @@ class Validation(Document):
     simulation_count: int
     cached_count: int | None = Field(description="tasks whose results are there already; null: no worker known yet")
     bytes_estimate: int = Field(description="size of the arrays before compression [bytes]")
+    certificate: Sha256 | None = Field(description="of the certificate that will vouch for the dataset; null: none")
 
 
 class Dataset(Document):
@@ -101,6 +102,19 @@ class DatasetVersion(Document):
     sample_count: int
     valid_count: int
     bytes: int
+
+
+class CertificateEntry(Document):
+    """A certificate that the coordinator has."""
+
+    digest: Sha256
+    preset: str
+    sim_core: Sha256 = Field(description="build of sim_core that was measured")
+    extent: Literal["full", "quick"]
+    passed: bool
+    created_at: datetime
+    href: str
+    page: str = Field(description="where the page for people is")
 
 
 class SampleState(Document):

@@ -74,9 +74,13 @@ def pack_key(spec: RodHangSpec | ClothDragSpec, shard: int, members: Sequence[Ke
     return content_key("pack", content)
 
 
-def publish_key(spec: RodHangSpec | ClothDragSpec, pack_keys: Sequence[str], builds: Builds) -> str:
-    """Return the content key of a dataset version: what was asked for, and the shards that answer it."""
-    content = {"spec": spec.content_digest, "shards": list(pack_keys), "builds": builds.digest}
+def publish_key(
+    spec: RodHangSpec | ClothDragSpec, pack_keys: Sequence[str], builds: Builds, certificate: str | None = None
+) -> str:
+    """Return the content key of a dataset version: what was asked for, the shards that answer it, who vouches for it."""
+    content: dict[str, Any] = {"spec": spec.content_digest, "shards": list(pack_keys), "builds": builds.digest}
+    if certificate is not None:
+        content["certificate"] = certificate
     return content_key("publish", content)
 
 

@@ -75,6 +75,7 @@ class Reason(StrEnum):
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"
     waiting_for_worker = "waiting_for_worker"
+    preset_not_certified = "preset_not_certified"
 
     @property
     def is_deterministic(self) -> bool:

@@ -188,6 +188,7 @@ class PublishTask(Document):
     files: tuple[FileEntry, ...] = Field(description="the files of all shards")
     sample_keys: tuple[Sha256, ...] = Field(description="by slot")
     rejections: tuple[Rejection, ...]
+    certificate: Sha256 | None = Field(default=None, description="digest of the certificate that vouches for it")
 
 
 class PublishOutput(Document):

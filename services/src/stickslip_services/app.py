@@ -14,7 +14,7 @@ from stickslip_services.metrics import Metrics
 from stickslip_services.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.openapi import describe
 from stickslip_services.operations import Coordinator
-from stickslip_services.routes import datasets, health, jobs, tasks, worker_api
+from stickslip_services.routes import certificates, datasets, health, jobs, tasks, worker_api
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     )
     app.state.coordinator = coordinator
     app.state.metrics = metrics
-    for module in (jobs, datasets, tasks, worker_api, health):
+    for module in (jobs, datasets, certificates, tasks, worker_api, health):
         app.include_router(module.router)
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]

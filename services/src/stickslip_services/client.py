@@ -9,6 +9,7 @@ from typing import Any, Self, TypeVar
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
 from pydantic import TypeAdapter, ValidationError
+from stickslip_schemas.certificate import Certificate, CertificateUpload
 from stickslip_schemas.events import (
     DatasetPublishedEvent,
     EventName,
@@ -19,6 +20,7 @@ from stickslip_schemas.events import (
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.problems import MEDIA_TYPE, Problem
 from stickslip_schemas.responses import (
+    CertificateEntry,
     Dataset,
     DatasetVersion,
     Job,
@@ -191,6 +193,25 @@ class Client:
     def workers(self) -> list[Worker]:
         """Return the workers."""
         return self._get("GET", "/v1/workers", TypeAdapter(list[Worker]))
+
+    # --- certificates ---------------------------------------------------------------------------------------------
+
+    def certificates(self) -> Iterator[CertificateEntry]:
+        """Yield all certificates, newest first."""
+        return self._items("/v1/certificates", Page[CertificateEntry])
+
+    def certificate(self, digest: str) -> Certificate:
+        """Return a certificate."""
+        return self._get("GET", f"/v1/certificates/{digest}", Certificate)
+
+    def certificate_page(self, digest: str) -> str:
+        """Return the page of a certificate, HTML."""
+        return self.request("GET", f"/v1/certificates/{digest}/page").text
+
+    def register(self, upload: CertificateUpload) -> CertificateEntry:
+        """Register a certificate; sent twice it is there once."""
+        content, headers = upload.model_dump_json(), {"Content-Type": "application/json"}
+        return self._get("POST", "/v1/certificates", CertificateEntry, content=content, headers=headers)
 
     # --- HTTP -----------------------------------------------------------------------------------------------------
 

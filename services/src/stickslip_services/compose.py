@@ -141,7 +141,8 @@ def _slots(connection: Connection, job: int, *, first: int, count: int) -> list[
 
 
 def _publish_task(connection: Connection, task: StoredTask) -> PublishTask:
-    job = json.loads(task.payload)["job"]
+    payload = json.loads(task.payload)
+    job = payload["job"]
     spec, builds = _job_spec(connection, job)
     dataset = dataset_id(spec)
     outputs = connection.scalars(
@@ -161,6 +162,7 @@ def _publish_task(connection: Connection, task: StoredTask) -> PublishTask:
             "files": files,
             "sample_keys": [key.hex() for key in keys],
             "rejections": rejections(connection, job),
+            "certificate": payload.get("certificate"),
         }
     )
 

@@ -7,6 +7,7 @@ StickslipError
 ├── InvalidTokenError           422
 ├── IdempotencyKeyReusedError   422
 ├── KindNotAvailableError       422
+├── PresetNotCertifiedError     422
 └── MissingArtifactError        500
 """
 
@@ -37,6 +38,18 @@ class IdempotencyKeyReusedError(StickslipError):
 
 class KindNotAvailableError(StickslipError):
     """No worker makes this kind."""
+
+
+class PresetNotCertifiedError(StickslipError):
+    """No certificate vouches for the preset with the workers' build."""
+
+    def __init__(self, preset: str, sim_core: str) -> None:
+        self.preset = preset
+        self.rule = (
+            f"the preset needs a passing certificate for the workers' sim_core build {sim_core[:12]}: run `stickslip "
+            f"certify --preset {preset}` with that build, or say `allow_uncertified: true` in the spec"
+        )
+        super().__init__(f"preset {preset!r} is not certified: {self.rule}")
 
 
 class UnknownWorkerError(StickslipError):

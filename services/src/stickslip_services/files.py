@@ -15,7 +15,7 @@ from stickslip_services.problems import ProblemError
 
 BLOCK = 1 << 18
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
-_MEDIA_TYPES = {".json": "application/json", ".png": "image/png"}
+_MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".html": "text/html"}
 
 OPENAPI_HEADERS = {
     name: {"description": description, "schema": {"type": "string"}}

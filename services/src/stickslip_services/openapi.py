@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, TypeAdapter
+from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.problems import Problem
@@ -25,6 +26,7 @@ _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
     "LeaseRequest": LeaseRequest,
     "Heartbeat": Heartbeat,
     "ReportBatch": ReportBatch,
+    "CertificateUpload": CertificateUpload,
     "Manifest": Manifest,
     "Problem": Problem,
 }

@@ -8,10 +8,21 @@ from pathlib import Path
 from sqlalchemy import Connection
 from stickslip_schemas import responses
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import job_spec_adapter
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.layout import layout
-from stickslip_schemas.responses import Dataset, DatasetVersion, Job, JobDetail, Page, Preview, SampleState, Validation
+from stickslip_schemas.responses import (
+    CertificateEntry,
+    Dataset,
+    DatasetVersion,
+    Job,
+    JobDetail,
+    Page,
+    Preview,
+    SampleState,
+    Validation,
+)
 from stickslip_schemas.states import JobState, Reason, TaskState
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import FileEntry, PublishOutput, TaskResult
@@ -29,6 +40,15 @@ from stickslip_schemas.worker_api import (
 
 from stickslip_services import migrate
 from stickslip_services.bell import Bell
+from stickslip_services.certificates import (
+    StoredCertificate,
+    Terms,
+    find_certificate,
+    insert_certificate,
+    list_certificates,
+    store_certificate,
+    terms_for,
+)
 from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.compose import AnyTask, find_task
 from stickslip_services.datasets import (
@@ -40,10 +60,14 @@ from stickslip_services.datasets import (
     read_version,
 )
 from stickslip_services.db import Database
-from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError
+from stickslip_services.errors import (
+    ConflictError,
+    KindNotAvailableError,
+    NotFoundError,
+    PresetNotCertifiedError,
+)
 from stickslip_services.jobs import (
     Replay,
-    builds_for,
     cancel_job,
     find_job,
     find_replay,
@@ -120,11 +144,11 @@ class Coordinator:
     def validate(self, spec: Spec) -> Validation:
         """Tell what a job would be."""
         with self.database.read() as connection:
-            builds = builds_for(connection, spec.kind)
+            terms = terms_for(connection, spec)
         with collector_at_rest():
-            plan = expand(spec, builds or _NO_BUILDS)
+            plan = self._expand(spec, terms or Terms(_NO_BUILDS, None))
         with self.database.read() as connection:
-            cached = None if builds is None else count_settled(connection, plan.tasks)
+            cached = None if terms is None else count_settled(connection, plan.tasks)
         return Validation(
             spec=spec,
             spec_digest=spec.content_digest,
@@ -132,6 +156,7 @@ class Coordinator:
             simulation_count=plan.simulation_count,
             cached_count=cached,
             bytes_estimate=spec.sample_count * sum(array.sample_bytes for array in layout(spec)),
+            certificate=plan.certificate,
         )
 
     def submit(self, spec: Spec, idempotency_key: str | None) -> JobDetail | Replay:
@@ -146,14 +171,14 @@ class Coordinator:
             with self.database.read() as connection:
                 if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
                     return replay
-                builds = builds_for(connection, spec.kind)
-            if builds is not None and (plan is None or plan.builds != builds):
-                plan = self._expand(spec, builds)
+                terms = terms_for(connection, spec)
+            if terms is not None and (plan is None or Terms(plan.builds, plan.certificate) != terms):
+                plan = self._expand(spec, terms)
             with self.database.write() as connection:
                 if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
                     return replay
-                if builds_for(connection, spec.kind) != builds:
-                    continue  # a worker with other builds has registered in between
+                if terms_for(connection, spec) != terms:
+                    continue  # a worker with other builds has registered in between, or a certificate
                 now = self.clock()
                 job = insert_job(connection, spec, plan, now)
                 shown = self.show(connection, job)
@@ -225,6 +250,22 @@ class Coordinator:
         """Return a file of a committed version; raise NotFoundError, MissingArtifactError."""
         manifest = self.show_version(dataset, version).manifest
         return find_file(self.store, manifest, dataset, version, path)
+
+    def add_certificate(self, upload: CertificateUpload) -> CertificateEntry:
+        """Register a certificate."""
+        stored = store_certificate(self.store, upload)
+        with self.database.write() as connection:
+            return insert_certificate(connection, upload, stored, self.clock())
+
+    def list_certificates(self, page: PageRequest) -> Page[CertificateEntry]:
+        """Return a page of certificates."""
+        with self.database.read() as connection:
+            return list_certificates(connection, page)
+
+    def find_certificate(self, digest: str) -> StoredCertificate:
+        """Return where a certificate lies; raise NotFoundError."""
+        with self.database.read() as connection:
+            return find_certificate(connection, digest)
 
     def show_task(self, name: str) -> AnyTask:
         """Return a task as a worker gets it."""
@@ -327,15 +368,18 @@ class Coordinator:
         for row in waiting:
             spec = job_spec_adapter.validate_json(row.spec)
             with self.database.read() as connection:
+                terms: Terms | None = None
+                refusal, reason = "", Reason.waiting_for_worker
                 try:
-                    builds = builds_for(connection, row.kind)
+                    terms = terms_for(connection, spec)
                 except KindNotAvailableError as error:
                     refusal = str(error)
+                except PresetNotCertifiedError as error:
+                    refusal, reason = str(error), Reason.preset_not_certified
                 else:
-                    if builds is None:
+                    if terms is None:
                         return
-                    refusal = ""
-            plan = None if refusal or builds is None else self._expand(spec, builds)
+            plan = None if terms is None else self._expand(spec, terms)
             with self.database.write() as connection:
                 if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
                     continue  # cancelled, or planned by somebody else
@@ -345,7 +389,7 @@ class Coordinator:
                         row.seq,
                         JobState.failed,
                         self.clock(),
-                        reason=Reason.waiting_for_worker,
+                        reason=reason,
                         message=refusal,
                     )
                 else:
@@ -365,8 +409,8 @@ class Coordinator:
     def _alive(self, connection: Connection) -> list[Worker]:
         return present_workers(connection, seen_since=self.clock() - self.settings.lease_seconds)
 
-    def _expand(self, spec: Spec, builds: Builds) -> Plan:
-        return expand(spec, builds, previews=self.settings.previews_per_job)
+    def _expand(self, spec: Spec, terms: Terms) -> Plan:
+        return expand(spec, terms.builds, certificate=terms.certificate, previews=self.settings.previews_per_job)
 
     def _note_stranded(self) -> None:
         with self.database.read() as connection:

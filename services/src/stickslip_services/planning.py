@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import Connection, func, select, update
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
+from stickslip_schemas.keys import Sha256
 from stickslip_schemas.samples import keyed_points, pack_key, publish_key
 from stickslip_schemas.states import Stage, TaskState
 
@@ -58,6 +59,7 @@ class Plan:
 
     spec: Spec
     builds: Builds
+    certificate: Sha256 | None = None
     tasks: dict[bytes, PlannedTask] = field(default_factory=dict)
     samples: list[PlannedSample] = field(default_factory=list)
 
@@ -103,9 +105,9 @@ def preview_slots(sample_count: int, previews: int) -> set[int]:
     return {position * sample_count // count for position in range(count)}
 
 
-def expand(spec: Spec, builds: Builds, *, previews: int = 0) -> Plan:
-    """Return all tasks and samples that `spec` means."""
-    plan = Plan(spec, builds)
+def expand(spec: Spec, builds: Builds, *, certificate: Sha256 | None = None, previews: int = 0) -> Plan:
+    """Return all tasks and samples that `spec` means; the manifest will carry the certificate's digest."""
+    plan = Plan(spec, builds, certificate)
     tasks_by_key = plan.tasks
     previewed = preview_slots(spec.sample_count, previews)
     pack_keys: list[str] = []
@@ -129,8 +131,9 @@ def expand(spec: Spec, builds: Builds, *, previews: int = 0) -> Plan:
         payload = json.dumps({"shard": shard})
         packs[bytes.fromhex(name)] = PlannedTask(_PACK, builds.packer, payload, tuple(last))
     tasks_by_key.update(packs)
-    publish = bytes.fromhex(publish_key(spec, pack_keys, builds))
-    tasks_by_key[publish] = PlannedTask(_PUBLISH, builds.digest, json.dumps({}), tuple(packs))
+    publish = bytes.fromhex(publish_key(spec, pack_keys, builds, certificate))
+    payload = json.dumps({} if certificate is None else {"certificate": certificate})
+    tasks_by_key[publish] = PlannedTask(_PUBLISH, builds.digest, payload, tuple(packs))
     return plan
 
 

@@ -1,5 +1,6 @@
 """Errors to problem documents: one table."""
 
+import json
 import logging
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -22,6 +23,7 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.InvalidTokenError: (422, ProblemCode.validation_failed),
     errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
     errors.KindNotAvailableError: (422, ProblemCode.kind_not_available),
+    errors.PresetNotCertifiedError: (422, ProblemCode.preset_not_certified),
     errors.MissingArtifactError: (500, ProblemCode.storage_error),
 }
 
@@ -107,6 +109,8 @@ def _stickslip_error(request: Request, error: Exception) -> Response:
                 pointer="/query/page_token", rule="page_token must come from an earlier page", value=error.token[:200]
             )
         ]
+    elif isinstance(error, errors.PresetNotCertifiedError):
+        fields = [FieldError(pointer="/preset", rule=error.rule, value=json.dumps(error.preset))]
     if status >= 500:
         logger.error("%s %s: %s", request.method, request.url.path, error)
     return _answer(request, status, code, str(error), fields=fields)

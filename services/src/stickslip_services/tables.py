@@ -241,6 +241,22 @@ dataset_versions = Table(
     Column("bytes", Integer),
 )
 
+certificates = Table(
+    "certificates",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("digest", String, nullable=False, unique=True),
+    Column("artifact", String, nullable=False),  # the document
+    Column("page", String, nullable=False),  # its page for people, an artifact
+    Column("preset", String, nullable=False),
+    Column("sim_core", String, nullable=False),
+    Column("extent", String, nullable=False),
+    Column("passed", Boolean, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Index("ix_certificates_preset_sim_core", "preset", "sim_core"),
+    sqlite_autoincrement=True,
+)
+
 events = Table(
     "events",
     metadata,

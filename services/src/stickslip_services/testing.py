@@ -180,6 +180,7 @@ class PretendWorker:
             spec=task.spec,
             spec_digest=task.spec.content_digest,
             builds=task.builds,
+            certificate=task.certificate,
             cameras=(),
             sample_count=len(task.sample_keys),
             valid_count=len(task.sample_keys) - len(task.rejections),

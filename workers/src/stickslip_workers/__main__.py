@@ -1,4 +1,4 @@
-"""Command line: `python -m stickslip_workers dispatch | replay | describe`."""
+"""Command line: `python -m stickslip_workers dispatch | replay | certify | describe`."""
 
 import argparse
 import json
@@ -33,6 +33,11 @@ def main(arguments: list[str] | None = None) -> int:
     replay.add_argument("--store", type=Path, required=True, help="root of the store")
     replay.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
 
+    certify = commands.add_parser("certify", help="run the physical protocols of a preset with this build")
+    certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
+    certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json and certificate.html")
+    certify.add_argument("--quick", action="store_true", help="a few points only; certifies nothing")
+
     commands.add_parser("describe", help="print the builds of this environment")
 
     options = parser.parse_args(arguments)
@@ -40,6 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _dispatch(options)
     if options.command == "replay":
         return _replay(options)
+    if options.command == "certify":
+        return _certify(options)
     from stickslip_workers.stages.actor import StageActor
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
@@ -97,6 +104,23 @@ def _replay(options: argparse.Namespace) -> int:
     )
     sys.stdout.write(result.model_dump_json(indent=2) + "\n")
     return 1 if result.outcome == "failed" else 0
+
+
+def _certify(options: argparse.Namespace) -> int:
+    """Return 0 if the preset passed, 1 if not, 2 if there was nothing to run."""
+    from stickslip_workers.certify import certify
+
+    def say(message: str) -> None:
+        sys.stderr.write(message + "\n")
+        sys.stderr.flush()
+
+    try:
+        certificate = certify(options.preset, options.out, quick=options.quick, say=say)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        say(f"error: {error}")
+        return 2
+    sys.stdout.write(certificate.digest + "\n")
+    return 0 if certificate.passed else 1
 
 
 if __name__ == "__main__":

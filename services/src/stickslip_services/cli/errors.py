@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from stickslip_services.certifying import CertifyError
 from stickslip_services.cli.specs import SpecFileError
 from stickslip_services.client import ClientError, ProblemError, UnreachableError
 from stickslip_services.supervisor import SupervisorError
@@ -33,7 +34,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
                 _print_line(f"  request {escape(error.problem.request_id)}; the coordinator's log says more")
         except UnreachableError as error:
             _print(f"{error}. Is it running? `stickslip up` starts one; --url or STICKSLIP_URL names another.")
-        except (ClientError, SpecFileError, SupervisorError) as error:
+        except (CertifyError, ClientError, SpecFileError, SupervisorError) as error:
             _print(str(error))
         except OSError as error:
             _print(f"{error.filename or 'the file system'}: {error.strerror or error}")

@@ -12,15 +12,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
-from stickslip_schemas.responses import JobDetail
+from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import TaskState
 
-from stickslip_services import __version__, pull, supervisor
+from stickslip_services import __version__, certifying, pull, supervisor
 from stickslip_services.cli import wording
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.cli.specs import read_spec
 from stickslip_services.cli.watch import GOOD, watch
-from stickslip_services.client import DEFAULT_URL, Client, ClientError
+from stickslip_services.client import DEFAULT_URL, Client, ClientError, UnreachableError
 from stickslip_services.settings import DEFAULT_PORT
 
 app = typer.Typer(
@@ -292,3 +292,68 @@ def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset
     console.print(table)
     console.print(f"{len(faults)} files are not as they should be", style="red")
     raise typer.Exit(1)
+
+
+@app.command()
+@shows_errors
+def certify(
+    preset: Annotated[str, typer.Option(help="the preset to certify; rods: the rod solver")],
+    out: Annotated[Path | None, typer.Option(help="folder for the certificate (certificates/PRESET)")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="a few points only; certifies nothing")] = False,
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Measure a preset on the physical protocols with this build, and register its certificate where a coordinator is.
+
+    Writes certificate.json and certificate.html; exits with 1 if the preset does not pass.
+    """
+    console = _console()
+    directory = out or Path("certificates") / preset
+    certificate = certifying.measure(preset, directory, quick=quick)
+    verdict = "passed" if certificate.passed else "did NOT pass"
+    console.print(f"preset {escape(preset)} {verdict}: {escape(str(directory / certifying.PAGE_NAME))}")
+    try:
+        with Client(url, patience=1.0) as client:
+            _say_registered(client.register(certifying.read_certificate(directory)), url)
+    except UnreachableError:
+        console.print(f"no coordinator answers at {url}; later: stickslip register {escape(str(directory))}")
+    raise typer.Exit(0 if certificate.passed else 1)
+
+
+@app.command()
+@shows_errors
+def register(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="what `stickslip certify` wrote")],
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Register a certificate that was made without a coordinator, or for another one."""
+    upload = certifying.read_certificate(directory)
+    with Client(url) as client:
+        _say_registered(client.register(upload), url)
+
+
+def _say_registered(entry: CertificateEntry, url: str) -> None:
+    _console().print(f"certificate {entry.digest} is registered: {url.rstrip('/')}{entry.page}")
+
+
+@app.command()
+@shows_errors
+def certificates(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+    """List certificates, newest first, and which of them vouch for the workers that are there."""
+    with Client(url) as client:
+        found = list(client.certificates())
+        if as_json:
+            return _print_json(found)
+        builds = {worker.builds.sim_core for worker in client.workers()}
+    table = Table(box=None, header_style="bold")
+    for column in ("certificate", "preset", "extent", "verdict", "build", "made"):
+        table.add_column(column, overflow="fold", no_wrap=column == "certificate")
+    for entry in found:
+        table.add_row(
+            entry.digest[:16],
+            entry.preset,
+            entry.extent,
+            "[green]passed[/]" if entry.passed else "[red]failed[/]",
+            "this" if entry.sim_core in builds else f"another ({entry.sim_core[:12]})",
+            f"{entry.created_at:%Y-%m-%d %H:%M} UTC",
+        )
+    return _console().print(table)

@@ -5,6 +5,7 @@ from types import MappingProxyType
 from typing import Any
 
 from stickslip_sim_core.protocols import bend_twist, rod_cantilever, rod_lateral_buckling
+from stickslip_sim_core.protocols.certification import CERTIFICATION, Certification
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 
 PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
@@ -15,9 +16,17 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
     }
 )
 
+ROD_PROTOCOLS = frozenset({"bend-twist", "rod-cantilever", "rod-lateral-buckling"})
+"""Those that know no presets."""
 
-def run(name: str, **settings: Any) -> ProtocolResult:
+
+def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult:
     """Run the protocol `name`, one of PROTOCOLS, with its own settings.
+
+    Args:
+        name: The protocol.
+        preset: The solver's preset; None is the protocol's own choice. Protocols of rods take no notice of it.
+        settings: See the protocol's `run`.
 
     Raises:
         ValueError: There is no such protocol, or a setting breaks its rule.
@@ -25,7 +34,9 @@ def run(name: str, **settings: Any) -> ProtocolResult:
     """
     if name not in PROTOCOLS:
         raise ValueError(f"protocol: must be one of {', '.join(PROTOCOLS)}, got {name!r}")
+    if preset is not None and name not in ROD_PROTOCOLS:
+        settings["preset"] = preset
     return PROTOCOLS[name](**settings)
 
 
-__all__ = ["PROTOCOLS", "Curve", "ProtocolResult", "run"]
+__all__ = ["CERTIFICATION", "PROTOCOLS", "ROD_PROTOCOLS", "Certification", "Curve", "ProtocolResult", "run"]

@@ -3,7 +3,7 @@
 They need matplotlib: `pip install stickslip-sim-core[plots]`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 SIZE = (6.0, 5.0)  # inches
 DPI = 110
+
+
+def figures(result: ProtocolResult) -> tuple["Figure", ...]:
+    """Draw everything that there is to see of a result."""
+    return tuple(draw(result) for draw in PLOTS.get(result.protocol, (plot,)))
 
 
 def plot(result: ProtocolResult) -> "Figure":
@@ -88,3 +93,7 @@ def plot_bend_twist_phases(*, poisson: Sequence[float] = POISSON, points: int = 
     axes.set_title("Bend-Twist: master curve (line), measured (dots),\nmeasured from the natural shape (dotted)")
     axes.legend(loc="upper left", fontsize="small")
     return figure
+
+
+PLOTS: Mapping[str, tuple[Callable[[ProtocolResult], "Figure"], ...]] = {}
+"""By protocol: its pictures, where they are others than `plot`."""

@@ -27,6 +27,7 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         spec=task.spec,
         spec_digest=task.spec.content_digest,
         builds=task.builds,
+        certificate=task.certificate,
         cameras=_cameras(task.spec),
         sample_count=len(task.sample_keys),
         valid_count=len(task.sample_keys) - len(task.rejections),

@@ -1,0 +1,113 @@
+"""The certificate: what one build of the core, with the numbers of one preset, measured on the physical protocols.
+
+Its digest is over everything but `environment`: the same build and preset on another day give the same certificate.
+"""
+
+from typing import Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from stickslip_schemas.base import Document
+from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
+from stickslip_schemas.keys import Sha256, canonical_json, content_key
+
+ROD_PRESET = "rods"
+"""Stands for the rod solver, which has no presets to choose from."""
+
+MAX_PAGE_CHARACTERS = 8 * 2**20
+
+Numbers = tuple[float | None, ...]
+
+
+class CurveReport(Document):
+    """A measured curve beside its master curve; null where there is nothing to measure."""
+
+    parameters: dict[str, float]
+    x: Numbers
+    measured: Numbers
+    master: Numbers
+    errors: Numbers = Field(description="measured over master less one; null is infinite")
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        lengths = {len(self.x), len(self.measured), len(self.master), len(self.errors)}
+        if len(lengths) > 1:
+            raise ValueError(f"x, measured, master and errors must have one length, and theirs are {sorted(lengths)}")
+        return self
+
+
+class ProtocolReport(Document):
+    """A protocol that was run: `ProtocolResult.as_dict` of sim_core, or how it broke off."""
+
+    protocol: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")
+    x: str
+    y: str
+    tolerance: float = Field(gt=0, description="largest |relative error| that passes")
+    error: float | None = Field(ge=0, description="largest |relative error|; null is infinite")
+    passed: bool
+    settings: dict[str, Any]
+    build_hash: Sha256 = Field(description="of the compiled core")
+    curves: tuple[CurveReport, ...]
+    message: str = Field(default="", description="why it broke off, where it did")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        errors = [error for curve in self.curves for error in curve.errors]
+        finite = [abs(error) for error in errors if error is not None]
+        largest = max(finite) if errors and len(finite) == len(errors) else None
+        if self.error != largest:
+            raise ValueError(f"error must be the largest of the curves' errors, {largest}, and it is {self.error}")
+        within = self.error is not None and self.error <= self.tolerance
+        if self.passed != (within and not self.message):
+            raise ValueError("passed must say whether the error is within the tolerance")
+        return self
+
+
+class Certificate(Document):
+    """How well a build and a preset follow the master curves."""
+
+    format: Literal["stickslip-certificate/1"] = "stickslip-certificate/1"
+    preset: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")
+    numbers: dict[str, Any] = Field(description="the settings that the preset stands for")
+    sim_core: Sha256 = Field(description="build of sim_core as it enters content keys (`Builds.sim_core`)")
+    extent: Literal["full", "quick"] = Field(description="quick: few points, to try things out; certifies nothing")
+    protocols: tuple[ProtocolReport, ...] = Field(min_length=1)
+    passed: bool
+    environment: dict[str, str] = Field(description="where and how it was made; not part of the content")
+
+    @property
+    def digest(self) -> str:
+        """Key of the content."""
+        return content_key("certificate", self.model_dump(mode="json", exclude={"environment"}))
+
+    @property
+    def certifies(self) -> bool:
+        """True where data of this build and preset may be made."""
+        return self.passed and self.extent == "full"
+
+    def canonical(self) -> bytes:
+        """Return the document as it is written."""
+        return canonical_json(self.model_dump(mode="json")).encode()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = [protocol.protocol for protocol in self.protocols]
+        if len(set(names)) != len(names):
+            raise ValueError(f"every protocol must be there once, and they are {names}")
+        if self.passed != all(protocol.passed for protocol in self.protocols):
+            raise ValueError("passed must say whether all protocols passed")
+        if len({protocol.build_hash for protocol in self.protocols}) > 1:
+            raise ValueError("all protocols must have been run with one build")
+        return self
+
+
+class CertificateUpload(Document):
+    """A certificate with its page for people."""
+
+    certificate: Certificate
+    page: str = Field(min_length=1, max_length=MAX_PAGE_CHARACTERS, description="one self-contained HTML page")
+
+
+def preset_of(spec: RodHangSpec | ClothDragSpec) -> str:
+    """Return the preset whose certificate vouches for the samples of a spec."""
+    return spec.preset if isinstance(spec, ClothDragSpec) else ROD_PRESET

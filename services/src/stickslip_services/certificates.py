@@ -1,0 +1,132 @@
+"""Certificates: taking them in, finding them, and the rule that cloth is made with certified presets only."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Row, insert, select
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.certificate import CertificateUpload, preset_of
+from stickslip_schemas.jobs import ClothDragSpec
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.responses import CertificateEntry, Page
+from stickslip_schemas.store import Store
+
+from stickslip_services.clock import as_datetime
+from stickslip_services.errors import NotFoundError, PresetNotCertifiedError
+from stickslip_services.jobs import builds_for
+from stickslip_services.paging import PageRequest, make_page
+from stickslip_services.planning import Spec
+from stickslip_services.tables import certificates
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What a job is made with: the builds of the workers, and the certificate that vouches for them, if any does."""
+
+    builds: Builds
+    certificate: Sha256 | None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCertificate:
+    """A certificate's artifacts: the document and the page."""
+
+    digest: Sha256
+    artifact: Sha256
+    page: Sha256
+
+
+def terms_for(connection: Connection, spec: Spec) -> Terms | None:
+    """Return what a job of `spec` is made with, None where no worker has ever registered.
+
+    Raise KindNotAvailableError where no worker makes the kind, and PresetNotCertifiedError for cloth of a preset that
+    has no passing certificate for the workers' build, unless the spec allows for it. Rods need none.
+    """
+    builds = builds_for(connection, spec.kind)
+    if builds is None:
+        return None
+    certificate = standing_certificate(connection, preset_of(spec), builds.sim_core)
+    if certificate is None and isinstance(spec, ClothDragSpec) and not spec.allow_uncertified:
+        raise PresetNotCertifiedError(spec.preset, builds.sim_core)
+    return Terms(builds, certificate)
+
+
+def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Sha256 | None:
+    """Return the digest of the newest full certificate of a preset and a build if it passed, else None."""
+    columns = certificates.c
+    row = connection.execute(
+        select(columns.digest, columns.passed)
+        .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
+        .order_by(columns.seq.desc())
+        .limit(1)
+    ).one_or_none()
+    return row.digest if row is not None and row.passed else None
+
+
+def store_certificate(store: Store, upload: CertificateUpload) -> StoredCertificate:
+    """Write a certificate and its page into the store."""
+    certificate = upload.certificate
+    return StoredCertificate(
+        digest=certificate.digest,
+        artifact=store.publish(certificate.canonical()),
+        page=store.publish(upload.page.encode()),
+    )
+
+
+def insert_certificate(
+    connection: Connection, upload: CertificateUpload, stored: StoredCertificate, now: float
+) -> CertificateEntry:
+    """Register a certificate; one that is there already stays as it is."""
+    if _find(connection, stored.digest) is None:
+        connection.execute(
+            insert(certificates).values(
+                digest=stored.digest,
+                artifact=stored.artifact,
+                page=stored.page,
+                preset=upload.certificate.preset,
+                sim_core=upload.certificate.sim_core,
+                extent=upload.certificate.extent,
+                passed=upload.certificate.passed,
+                created_at=now,
+            )
+        )
+    return _entry(_found(connection, stored.digest))
+
+
+def list_certificates(connection: Connection, page: PageRequest) -> Page[CertificateEntry]:
+    """Return a page of certificates, newest first."""
+    query = select(certificates).order_by(certificates.c.seq.desc()).limit(page.size + 1)
+    if page.after is not None:
+        query = query.where(certificates.c.seq < page.after)
+    rows = connection.execute(query).all()
+    return make_page(rows, page, position=lambda row: int(row.seq), item=_entry)
+
+
+def find_certificate(connection: Connection, digest: str) -> StoredCertificate:
+    """Return where a certificate lies; raise NotFoundError."""
+    row = _found(connection, digest)
+    return StoredCertificate(digest=row.digest, artifact=row.artifact, page=row.page)
+
+
+def _found(connection: Connection, digest: str) -> Row[tuple[Any, ...]]:
+    row = _find(connection, digest)
+    if row is None:
+        raise NotFoundError(f"there is no certificate {digest[:100]!r}")
+    return row
+
+
+def _find(connection: Connection, digest: str) -> Row[tuple[Any, ...]] | None:
+    return connection.execute(select(certificates).where(certificates.c.digest == digest)).one_or_none()
+
+
+def _entry(row: Row[tuple[Any, ...]]) -> CertificateEntry:
+    return CertificateEntry(
+        digest=row.digest,
+        preset=row.preset,
+        sim_core=row.sim_core,
+        extent=row.extent,
+        passed=row.passed,
+        created_at=as_datetime(row.created_at),
+        href=f"/v1/certificates/{row.digest}",
+        page=f"/v1/certificates/{row.digest}/page",
+    )

@@ -1,0 +1,70 @@
+"""Certificates: registering them, listing them, and their pages."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request, Response
+from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.responses import CertificateEntry, Page
+
+from stickslip_services.bodies import JsonBody, body_schema
+from stickslip_services.files import OPENAPI_HEADERS, serve
+from stickslip_services.routes.common import BODY_PROBLEMS, CoordinatorDep, PageDep, problem_responses
+
+router = APIRouter(tags=["certificates"])
+
+_CERTIFICATE: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Certificate"}}}
+_PAGE: dict[str, Any] = {"text/html": {"schema": {"type": "string"}}}
+
+_INERT = {
+    # The page is whatever was uploaded: it may show itself, and do nothing else.
+    "Content-Security-Policy": "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+    return {
+        200: {"description": "The file", "headers": OPENAPI_HEADERS, "content": content},
+        206: {"description": "The range that was asked for", "headers": OPENAPI_HEADERS, "content": content},
+        304: {"description": "The client has it already", "headers": OPENAPI_HEADERS},
+        **problem_responses(404, 416),
+    }
+
+
+@router.post(
+    "/v1/certificates",
+    status_code=201,
+    responses=problem_responses(*BODY_PROBLEMS),
+    openapi_extra=body_schema("CertificateUpload"),
+)
+def post_certificate(
+    upload: Annotated[CertificateUpload, Depends(JsonBody(CertificateUpload))],
+    coordinator: CoordinatorDep,
+    response: Response,
+) -> CertificateEntry:
+    """Register a certificate. One that is there already stays as it is, so that it may be sent twice."""
+    entry = coordinator.add_certificate(upload)
+    response.headers["Location"] = entry.href
+    return entry
+
+
+@router.get("/v1/certificates", responses=problem_responses(422))
+def get_certificates(page: PageDep, coordinator: CoordinatorDep) -> Page[CertificateEntry]:
+    """List certificates, newest first."""
+    return coordinator.list_certificates(page)
+
+
+@router.get("/v1/certificates/{digest}", response_class=Response, responses=_file_responses(_CERTIFICATE))
+def get_certificate(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return a certificate."""
+    artifact = coordinator.find_certificate(digest).artifact
+    return serve(request, coordinator.store.path(artifact), artifact, name="certificate.json")
+
+
+@router.get("/v1/certificates/{digest}/page", response_class=Response, responses=_file_responses(_PAGE))
+def get_certificate_page(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return the page of a certificate."""
+    artifact = coordinator.find_certificate(digest).page
+    response = serve(request, coordinator.store.path(artifact), artifact, name="certificate.html")
+    response.headers.update(_INERT)
+    return response

@@ -1,0 +1,33 @@
+"""Which protocols a preset has to pass before data are made with it, and the numbers that it stands for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Certification:
+    """What the certificate of a preset is made of."""
+
+    protocols: tuple[str, ...]
+    """Names in PROTOCOLS, in the order in which they run: the quick ones first."""
+
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    """The settings that the preset stands for, in JSON's types."""
+
+    quick: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Settings by protocol for a first look; a certificate made with them certifies nothing."""
+
+
+_ROD_QUICK: Mapping[str, Mapping[str, Any]] = {
+    "bend-twist": {"phi": (6.0, 10.0), "poisson": (0.5,), "elements": 256},
+    "rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512},
+}
+
+CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
+    {
+        "rods": Certification(("rod-lateral-buckling", "rod-cantilever", "bend-twist"), quick=_ROD_QUICK),
+    }
+)
+"""By preset; "rods" stands for the rod solver, which has none."""

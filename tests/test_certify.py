@@ -1,0 +1,116 @@
+"""From `stickslip certify` to a dataset that carries the certificate: real protocols, a real coordinator."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.manifest import Manifest
+from stickslip_services.certifying import read_certificate
+from stickslip_services.cli import app
+from stickslip_services.client import Client
+from stickslip_services.testing import BUILDS, RunningServer, start_server
+from typer.testing import CliRunner, Result
+
+CLOTH = {
+    "kind": "cloth_drag",
+    "axes": {"material": "gray-interlock", "mu": [0.1, 0.2], "texture": "dots", "viewpoint": "left"},
+}
+NOBODY = "http://127.0.0.1:9"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    running = start_server(tmp_path_factory.mktemp("certify") / "data")
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def cli(server: RunningServer) -> Callable[..., Result]:
+    def run(*words: object, url: str = server.url) -> Result:
+        return CliRunner().invoke(app, [str(word) for word in words], env={"STICKSLIP_URL": url, "COLUMNS": "200"})
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def quick(cli: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A certificate of the rod solver that was made while nobody listened."""
+    out = tmp_path_factory.mktemp("certificates") / "rods"
+    result = cli("certify", "--preset", "rods", "--out", out, "--quick", url=NOBODY)
+    assert result.exit_code == 0, result.output
+    assert "preset rods passed" in result.stdout
+    assert f"stickslip register {out}" in result.stdout
+    return out
+
+
+def test_register_and_list(cli: Callable[..., Result], quick: Path) -> None:
+    registered = cli("register", quick)
+    assert registered.exit_code == 0, registered.output
+    digest = read_certificate(quick).certificate.digest
+    assert digest in registered.stdout
+    assert cli("register", quick).stdout == registered.stdout
+    (entry,) = json.loads(cli("certificates", "--json").stdout)
+    assert (entry["digest"], entry["preset"], entry["extent"], entry["passed"]) == (digest, "rods", "quick", True)
+    assert digest[:16] in cli("certificates").stdout
+
+
+def test_a_cloth_job_from_refusal_to_dataset(
+    cli: Callable[..., Result], server: RunningServer, quick: Path, tmp_path: Path
+) -> None:
+    """The certificate is the rods' under the name of a preset of cloth: its protocols are real, its subject is not."""
+    upload = read_certificate(quick)
+    build = upload.certificate.sim_core
+    builds = BUILDS.model_copy(update={"sim_core": build})
+    worker = server.worker(kinds=("cloth_drag",), builds=builds)
+    spec = tmp_path / "spec.json"
+    spec.write_text(json.dumps(CLOTH))
+    refused = cli("submit", spec)
+    assert refused.exit_code == 1
+    for words in ("preset", f"sim_core build {build[:12]}", "stickslip certify --preset certified", '"certified"'):
+        assert words in refused.stderr
+
+    made: dict[str, Any] = {"preset": "certified", "extent": "full"}
+    full = CertificateUpload(certificate=upload.certificate.model_copy(update=made), page=upload.page)
+    with Client(server.url) as client:
+        entry = client.register(full)
+        assert client.certificate(entry.digest) == full.certificate
+        assert client.certificate_page(entry.digest) == full.page
+        submitted = cli("submit", spec)
+        assert submitted.exit_code == 0, submitted.output
+        worker.work()
+        job = client.job(submitted.stdout.strip())
+        assert job.dataset is not None
+        manifest, _ = client.manifest(job.dataset.dataset, job.dataset.version)
+    assert isinstance(manifest, Manifest)
+    assert manifest.certificate == entry.digest
+    assert manifest.builds.sim_core == full.certificate.sim_core
+    assert "this" in cli("certificates").stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("certify", "--preset", "best", "--out", "{}/x"), "no certificate"),
+        (("register", "{}"), "there is no certificate.json"),
+    ],
+)
+def test_errors_are_words(cli: Callable[..., Result], tmp_path: Path, words: tuple[str, ...], said: str) -> None:
+    result = cli(*(word.format(tmp_path) for word in words))
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_damaged_certificate_is_refused_in_words(cli: Callable[..., Result], quick: Path, tmp_path: Path) -> None:
+    document = json.loads((quick / "certificate.json").read_text())
+    document["protocols"][0]["error"] = 0.5
+    (tmp_path / "certificate.json").write_text(json.dumps(document))
+    (tmp_path / "certificate.html").write_text("<p>")
+    result = cli("register", tmp_path)
+    assert result.exit_code == 1
+    assert "is no certificate" in result.stderr
+    assert "largest of the curves' errors" in result.stderr

@@ -1,0 +1,119 @@
+"""Certifying: run the protocols of a preset with this very build, and write the certificate and its page.
+
+It lives with the workers because it is their build that is certified, digest and all.
+"""
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+
+from stickslip_schemas.certificate import Certificate, ProtocolReport
+from stickslip_schemas.store import write_durably
+from stickslip_sim_core import build_info, protocols
+from stickslip_sim_core.protocols import ProtocolResult
+
+from stickslip_workers.builds import sim_core_build
+from stickslip_workers.certificate_page import certificate_page
+
+DOCUMENT_NAME = "certificate.json"
+PAGE_NAME = "certificate.html"
+
+Say = Callable[[str], None]
+
+
+def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
+    """Certify a preset: write `certificate.json` and `certificate.html` into `out`.
+
+    A protocol that breaks off has not passed, and the others run all the same.
+
+    Raises:
+        ValueError: There is no such preset.
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:  # better now than after an hour of protocols
+        raise ModuleNotFoundError("certificates have pictures: pip install 'stickslip-sim-core[plots]'")
+    if preset not in protocols.CERTIFICATION:
+        raise ValueError(f"preset: must be one of {', '.join(protocols.CERTIFICATION)}, got {preset!r}")
+    certification = protocols.CERTIFICATION[preset]
+    environment = _environment()
+    reports: list[ProtocolReport] = []
+    results: list[ProtocolResult] = []
+    for number, name in enumerate(certification.protocols, 1):
+        say(f"{number}/{len(certification.protocols)} {name} ...")
+        cpu, wall = time.process_time(), time.monotonic()
+        try:
+            result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
+        except Exception as error:  # whatever it is, the certificate has to say so
+            reports.append(_broken_off(name, error))
+        else:
+            results.append(result)
+            reports.append(ProtocolReport.model_validate(result.as_dict()))
+        spent = time.process_time() - cpu
+        environment[f"cpu_seconds/{name}"] = f"{spent:.2f}"
+        say(f"    {verdict(reports[-1])}; {spent:.1f} CPU s in {time.monotonic() - wall:.1f} s")
+    certificate = Certificate(
+        preset=preset,
+        numbers=dict(certification.numbers),
+        sim_core=sim_core_build(),
+        extent="quick" if quick else "full",
+        protocols=tuple(reports),
+        passed=all(report.passed for report in reports),
+        environment=environment,
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    write_durably(out / PAGE_NAME, certificate_page(certificate, results).encode())
+    write_durably(out / DOCUMENT_NAME, certificate.canonical())
+    return certificate
+
+
+def verdict(report: ProtocolReport) -> str:
+    """Return how a protocol ended, in words."""
+    if report.message:
+        return f"broke off: {report.message}"
+    error = "infinite" if report.error is None else f"{report.error:.1e}"
+    return f"{'passed' if report.passed else 'FAILED'}, largest error {error} of {report.tolerance:g} allowed"
+
+
+def _broken_off(name: str, error: Exception) -> ProtocolReport:
+    return ProtocolReport(
+        protocol=name,
+        x="",
+        y="",
+        tolerance=sys.float_info.min,
+        error=None,
+        passed=False,
+        settings={},
+        build_hash=build_info().build_hash,
+        curves=(),
+        message=f"{type(error).__name__}: {error}"[:2000],
+    )
+
+
+def _environment() -> dict[str, str]:
+    build = build_info()
+    return {
+        "made_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": _processor(),
+        "cores": str(os.cpu_count()),
+        "load": f"{os.getloadavg()[0]:.1f}",
+        "python": platform.python_version(),
+        "numpy": metadata.version("numpy"),
+        "sim_core": build.version,
+        "compiler": build.compiler,
+        "isa": build.isa,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
