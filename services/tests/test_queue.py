@@ -383,6 +383,7 @@ def test_a_waiting_job_can_be_cancelled(coordinator: Coordinator) -> None:
 
 CLOTH = {
     "kind": "cloth_drag",
+    "allow_uncertified": True,
     "axes": {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "plaid"], "viewpoint": "left"},
 }
 

@@ -77,7 +77,7 @@ def pack_key(spec: RodHangSpec | ClothDragSpec, shard: int, members: Sequence[Ke
 def publish_key(
     spec: RodHangSpec | ClothDragSpec, pack_keys: Sequence[str], builds: Builds, certificate: str | None = None
 ) -> str:
-    """Return the content key of a dataset version: what was asked for, the shards that answer it, who vouches for it."""
+    """Return the content key of a dataset version: what was asked for, its shards, and who vouches for them."""
     content: dict[str, Any] = {"spec": spec.content_digest, "shards": list(pack_keys), "builds": builds.digest}
     if certificate is not None:
         content["certificate"] = certificate

@@ -47,7 +47,7 @@ def terms_for(connection: Connection, spec: Spec) -> Terms | None:
         return None
     certificate = standing_certificate(connection, preset_of(spec), builds.sim_core)
     if certificate is None and isinstance(spec, ClothDragSpec) and not spec.allow_uncertified:
-        raise PresetNotCertifiedError(spec.preset, builds.sim_core)
+        raise PresetNotCertifiedError(str(spec.preset), builds.sim_core)
     return Terms(builds, certificate)
 
 
