@@ -6,7 +6,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,12 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 from stickslip_blender.actor import RenderActor
+from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.color import silicone_color, to_linear
 from stickslip_blender.rods import RodRenderer
-from stickslip_schemas.cameras import Camera, rig_digest
+from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.chunks import decode_chunk
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.jobs import Quality, Texture
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import CorruptArtifactError, Store
@@ -140,6 +142,7 @@ def test_what_is_not_the_samples_fault_is_raised(actor: RenderActor, store: Stor
 _CRASH = """
 import json, os, signal, sys
 from stickslip_blender.actor import RenderActor
+from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.pixels import FrameReader
 FrameReader.read = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
@@ -170,3 +173,92 @@ def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> 
     assert description["kinds"] == ["rod_hang"]
     assert set(description["versions"]) == {"bpy", "blender_build"}
     assert RenderActor(str(tmp_path / "elsewhere")).describe() == description
+
+
+# --- cloth ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def trajectory(store: Store, make_sheet: Callable[..., Any]) -> Callable[..., str]:
+    """Publish the trajectory of a sheet of 5 x 5 vertices; return its digest."""
+
+    def publish(*, shift: float = 0.0, reach: float = 0.3) -> str:
+        sheet = make_sheet(5, reach=reach)
+        track = np.repeat(sheet.track + np.float32([shift, 0.0, 0.0]), 75, axis=0)
+        file = io.BytesIO()
+        np.savez(file, mesh=track[None], rest=sheet.rest[None], triangles=sheet.triangles[None])
+        return store.publish(file.getvalue())
+
+    return publish
+
+
+def _clip(record: str, *, preview: bool = False, **look: Any) -> dict[str, Any]:
+    render = {
+        "kind": "cloth_drag",
+        "rig": "drag-3",
+        "rig_digest": rig_digest("drag-3"),
+        "texture": "plaid",
+        "viewpoint": "left",
+        "frames": 3,
+        "quality": "draft",
+        "light_seed": 9,
+    }
+    return {"stage": "render", "render": render | look, "record": {"digest": record, "row": 0}, "preview": preview}
+
+
+def test_a_trajectory_becomes_a_clip_and_a_preview(
+    actor: RenderActor, store: Store, trajectory: Callable[..., str], make_sheet: Callable[..., Any]
+) -> None:
+    result = TaskResult.model_validate(actor.render(_clip(trajectory(), preview=True)))
+    assert isinstance(result.output, RenderOutput)
+    light = Light.drawn(9)
+    assert result.output.labels == {"light_seed": 9, "light": list(astuple(light))}
+    chunk = result.output.chunks["video"]
+    data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
+    video = np.frombuffer(data, dtype=np.uint8).reshape(3, 224, 224, 3)
+    sheet = make_sheet(5)
+    camera = load_rig("drag-3")[1]
+    with ClothRenderer(sheet.triangles, sheet.rest, quality=Quality.draft) as renderer:
+        expected = renderer.render(sheet.track[[0, 1, 2]], camera, texture=Texture.plaid, light=light)
+    assert np.array_equal(video, expected)  # frames 0, 100 and 200 of 300
+    assert result.output.preview is not None
+    with Image.open(io.BytesIO(store.read(result.output.preview))) as preview:
+        assert np.array_equal(np.asarray(preview), np.concatenate(list(video), axis=1))
+
+
+def test_rods_and_cloths_take_turns(
+    actor: RenderActor, record: str, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[str] = []
+    for renderer in (RodRenderer, ClothRenderer):
+
+        def count(self: Any, *arguments: Any, _init: Any = renderer.__init__, **options: Any) -> None:
+            built.append(type(self).__name__)
+            _init(self, *arguments, **options)
+
+        monkeypatch.setattr(renderer, "__init__", count)
+    cloth = trajectory()
+    first = actor.render(_clip(cloth, frames=1))
+    actor.render(_clip(cloth, frames=1, viewpoint="right", texture="dots"))
+    assert built == ["ClothRenderer"]  # built once for all looks of a mesh
+    rod = actor.render(_task(record))
+    again = actor.render(_clip(cloth, frames=1))
+    assert built == ["ClothRenderer", "RodRenderer", "ClothRenderer"]
+    assert again["output"] == first["output"]
+    assert rod["outcome"] == "succeeded"
+
+
+def test_a_cloth_that_leaves_the_frame_at_any_time_is_rejected(
+    actor: RenderActor, store: Store, trajectory: Callable[..., str]
+) -> None:
+    away = trajectory(reach=0.9)  # its first frame, the only one that the clip shows, is in the frame
+    before = _files(store)
+    result = TaskResult.model_validate(actor.render(_clip(away, frames=1)))
+    assert (result.outcome, result.reason) == ("rejected", Reason.out_of_frame)
+    assert "the cloth leaves view left by " in result.message
+    assert _files(store) == before
+
+
+def test_a_trajectory_of_nan_is_rejected(actor: RenderActor, trajectory: Callable[..., str]) -> None:
+    result = TaskResult.model_validate(actor.render(_clip(trajectory(shift=np.nan))))
+    assert (result.outcome, result.reason) == ("rejected", Reason.invalid_sample)

@@ -9,24 +9,41 @@ from __future__ import annotations
 
 import io
 import time
-from typing import Any
+from collections.abc import Callable
+from dataclasses import astuple
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.chunks import encode_chunk
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, RodRender, TaskResult
+from stickslip_schemas.tasks import (
+    ChunkRef,
+    ClothRender,
+    RecordRef,
+    RenderOutput,
+    RenderTask,
+    RodRender,
+    TaskResult,
+)
 
 from stickslip_blender.build import blender_version, build_digest
+from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.color import silicone_color, to_linear
 from stickslip_blender.preview import side_by_side
 from stickslip_blender.rods import RodRenderer
 
 FRAME_MARGIN = 1.0
-"""How far inside the frame a rod has to stay [px]."""
+"""How far inside the frame a rod or a cloth has to stay [px]."""
+
+PREVIEW_FRAMES = 6
+"""Frames of a clip that its preview shows, side by side."""
+
+Array = npt.NDArray[Any]
+Renderer = TypeVar("Renderer", RodRenderer, ClothRenderer)
 
 
 class RenderActor:
@@ -35,8 +52,8 @@ class RenderActor:
     def __init__(self, store_root: str, scratch: str | None = None) -> None:
         self._store = Store(store_root)
         self._scratch = scratch
-        self._renderer: tuple[Quality, RodRenderer] | None = None
-        self._centerlines: tuple[str, npt.NDArray[np.float32]] = ("", np.empty(0, dtype=np.float32))
+        self._renderer: tuple[object, RodRenderer | ClothRenderer] | None = None
+        self._records: tuple[str, dict[str, Array]] = ("", {})
 
     def close(self) -> None:
         """Let go of what the renderer holds outside Blender."""
@@ -52,57 +69,89 @@ class RenderActor:
         """Render the sample of a `RenderTask`; return a `TaskResult`."""
         wall, cpu = time.perf_counter(), time.process_time()
         job = RenderTask.model_validate(task)
-        if not isinstance(job.render, RodRender):
-            raise ValueError(f"render.kind must be rod_hang; got {job.render.kind!r}")
-        result = self._rod(job.render, job.record, preview=job.preview)
+        _check_rig(job.render)
+        if isinstance(job.render, RodRender):
+            result = self._rod(job.render, job.record, preview=job.preview)
+        else:
+            result = self._cloth(job.render, job.record, preview=job.preview)
         spent = {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
         return result.model_copy(update=spent).model_dump(mode="json")
 
     def _rod(self, look: RodRender, record: RecordRef, *, preview: bool) -> TaskResult:
-        if look.rig_digest != rig_digest(look.rig):
-            raise ValueError(
-                f"render.rig_digest must be that of {look.rig} here, {rig_digest(look.rig)}; got {look.rig_digest}"
-            )
         cameras = load_rig(look.rig)
-        line = self._centerline(record)
+        (line,) = self._record(record, "centerline")
         if not np.isfinite(line).all():
             return _rejected(Reason.invalid_sample, "the centreline has values that are not finite")
-        if outside := _leaving(line, look.radius, cameras):
+        if outside := _leaving("rod", line, look.radius, cameras):
             return _rejected(Reason.out_of_frame, outside)
         color = silicone_color(look.color_seed)
-        views = self._renderer_for(look.quality).render(line, cameras, color=color, radius=look.radius)
-        chunk = encode_chunk(views[None])
+        renderer = self._renderer_for(
+            ("rod", look.quality), lambda: RodRenderer(quality=look.quality, scratch=self._scratch)
+        )
+        views = renderer.render(line, cameras, color=color, radius=look.radius)
+        return self._rendered("views", views, views if preview else None, {"color": list(to_linear(color))})
+
+    def _cloth(self, look: ClothRender, record: RecordRef, *, preview: bool) -> TaskResult:
+        (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
+        track, rest, triangles = self._record(record, "mesh", "rest", "triangles")
+        if not np.isfinite(track).all():
+            return _rejected(Reason.invalid_sample, "the trajectory has positions that are not finite")
+        if outside := _leaving("cloth", track, 0.0, (camera,)):
+            return _rejected(Reason.out_of_frame, outside)
+        mesh = triangles.tobytes(), rest.tobytes()
+        renderer = self._renderer_for(
+            ("cloth", look.quality, mesh),
+            lambda: ClothRenderer(triangles, rest, quality=look.quality, scratch=self._scratch),
+        )
+        light = Light.drawn(look.light_seed)
+        shown = track[list(shown_frames(look.frames))]
+        video = renderer.render(shown, camera, texture=look.texture, light=light)
+        few = video[np.linspace(0, len(video) - 1, min(PREVIEW_FRAMES, len(video))).round().astype(int)]
+        labels = {"light_seed": look.light_seed, "light": list(astuple(light))}
+        return self._rendered("video", video, few if preview else None, labels)
+
+    def _rendered(self, name: str, pictures: Array, preview: Array | None, labels: dict[str, Any]) -> TaskResult:
+        """Publish pictures (n, height, width, 3), and some of them as a preview, and return the result."""
+        chunk = encode_chunk(pictures[None])
         output = RenderOutput(
-            chunks={"views": ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
-            preview=self._store.publish(side_by_side(views)) if preview else None,
-            labels={"color": list(to_linear(color))},
+            chunks={name: ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
+            preview=None if preview is None else self._store.publish(side_by_side(preview)),
+            labels=labels,
         )
         return TaskResult(outcome="succeeded", output=output)
 
-    def _centerline(self, record: RecordRef) -> npt.NDArray[np.float32]:
-        """Return one row of an artifact of rods; the last artifact is kept, for a batch shares one."""
-        digest, lines = self._centerlines
+    def _record(self, record: RecordRef, *names: str) -> list[Array]:
+        """Return one row of arrays of an artifact; the last artifact is kept, for several renders share it."""
+        digest, arrays = self._records
         if digest != record.digest:
             with np.load(io.BytesIO(self._store.read(record.digest)), allow_pickle=False) as file:
-                lines = file["centerline"]
-            self._centerlines = record.digest, lines
-        if record.row >= len(lines):
-            raise ValueError(f"record.row must be below {len(lines)}, the rows of {record.digest}; got {record.row}")
-        line: npt.NDArray[np.float32] = lines[record.row]
-        return line
+                arrays = {name: file[name] for name in names}
+            self._records = record.digest, arrays
+        rows = len(arrays[names[0]])
+        if record.row >= rows:
+            raise ValueError(f"record.row must be below {rows}, the rows of {record.digest}; got {record.row}")
+        return [arrays[name][record.row] for name in names]
 
-    def _renderer_for(self, quality: Quality) -> RodRenderer:
-        if self._renderer is None or self._renderer[0] != quality:
+    def _renderer_for(self, scene: object, build: Callable[[], Renderer]) -> Renderer:
+        """Return the renderer of a scene: the last one, or else another in its place."""
+        if self._renderer is None or self._renderer[0] != scene:
             self.close()
-            self._renderer = quality, RodRenderer(quality=quality, scratch=self._scratch)
-        return self._renderer[1]
+            self._renderer = scene, build()
+        return self._renderer[1]  # type: ignore[return-value]  # `scene` names what `build` makes
 
 
-def _leaving(line: npt.NDArray[np.float32], radius: float, cameras: tuple[Camera, ...]) -> str:
-    """Say which views the rod leaves and by how much; nothing if it is in all of them."""
-    overflow = {camera.name: camera.overflow(line, radius, FRAME_MARGIN) for camera in cameras}
+def _check_rig(look: RodRender | ClothRender) -> None:
+    if look.rig_digest != rig_digest(look.rig):
+        raise ValueError(
+            f"render.rig_digest must be that of {look.rig} here, {rig_digest(look.rig)}; got {look.rig_digest}"
+        )
+
+
+def _leaving(what: str, points: Array, radius: float, cameras: tuple[Camera, ...]) -> str:
+    """Say which views a thing leaves and by how much; nothing if it is in all of them."""
+    overflow = {camera.name: camera.overflow(points, radius, FRAME_MARGIN) for camera in cameras}
     return "; ".join(
-        f"the rod leaves view {name} by {excess:.1f} px" for name, excess in overflow.items() if excess > 0.0
+        f"the {what} leaves view {name} by {excess:.1f} px" for name, excess in overflow.items() if excess > 0.0
     )
 
 

@@ -29,6 +29,11 @@ SAMPLING = {
     Quality.draft: Sampling(samples=8),
     Quality.standard: Sampling(samples=32),
 }
+# The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
+CLOTH_SAMPLING = {
+    Quality.draft: Sampling(samples=8, denoiser="fast"),
+    Quality.standard: Sampling(samples=16, denoiser="fast"),
+}
 REFERENCE = Sampling(samples=256, seed=1)
 """What pictures are compared with; its seed is another, so that it shares no noise with them."""
 

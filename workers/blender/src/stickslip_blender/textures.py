@@ -1,0 +1,122 @@
+"""The cloth textures, drawn by formula: a square of cloth seen flat.
+
+Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread would be noise, a pattern is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.jobs import Texture
+
+SIZE = 512
+"""Side of a texture [texels]: 0.4 mm on the cloth, a seventh of a pixel."""
+_OVERSAMPLING = 2
+
+Field = npt.NDArray[np.float64]
+Rgb = tuple[int, int, int]  # sRGB
+
+
+def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
+    """Return the picture of a texture, 8-bit sRGB, shape (SIZE, SIZE, 3); row 0 is the lower edge of the cloth."""
+    fine = SIZE * _OVERSAMPLING
+    across = (np.arange(fine) + 0.5) / fine
+    u, v = np.meshgrid(across, across)
+    picture = _DRAWN_BY[texture](u, v)
+    boxes = picture.reshape(SIZE, _OVERSAMPLING, SIZE, _OVERSAMPLING, 3)
+    mean: npt.NDArray[np.uint8] = np.rint(boxes.mean(axis=(1, 3))).astype(np.uint8)
+    return mean
+
+
+def _mix(where: npt.NDArray[np.bool_] | Field, there: Rgb | Field, elsewhere: Rgb | Field) -> Field:
+    share = np.asarray(where, dtype=np.float64)[..., None]
+    return share * np.asarray(there, dtype=np.float64) + (1.0 - share) * np.asarray(elsewhere, dtype=np.float64)
+
+
+def _phase(x: Field, count: float) -> Field:
+    """Return where in its period a point is, [0, 1), with `count` periods on the cloth."""
+    phase: Field = np.mod(x * count, 1.0)
+    return phase
+
+
+def _checker(u: Field, v: Field) -> Field:
+    return _mix((_phase(u, 4) < 0.5) == (_phase(v, 4) < 0.5), (34, 37, 46), (236, 230, 214))
+
+
+def _dots(u: Field, v: Field) -> Field:
+    """Draw dots on a staggered grid."""
+    odd = np.mod(np.floor(v * 8), 2) == 1
+    x, y = _phase(u + np.where(odd, 1 / 16, 0.0), 8) - 0.5, _phase(v, 8) - 0.5
+    return _mix(np.hypot(x, y) < 0.3, (240, 234, 220), (38, 62, 122))
+
+
+def _stripes(u: Field, v: Field) -> Field:
+    return _mix(_phase(u, 8) < 0.5, (176, 38, 44), (238, 230, 216))
+
+
+def _plaid(u: Field, v: Field) -> Field:
+    """Draw a tartan: the same sett as warp and as weft, each seen half."""
+
+    def threads(x: Field) -> Field:
+        place = _phase(x, 3)
+        sett = _mix(np.abs(place - 0.5) < 0.17, (24, 46, 96), (30, 92, 62))
+        sett = _mix((np.abs(place - 0.5) > 0.19) & (np.abs(place - 0.5) < 0.24), (16, 20, 28), sett)
+        sett = _mix(np.abs(place - 0.5) < 0.035, (226, 182, 58), sett)
+        return _mix(np.minimum(place, 1.0 - place) < 0.045, (198, 40, 40), sett)
+
+    return 0.5 * (threads(u) + threads(v))
+
+
+def _gingham(u: Field, v: Field) -> Field:
+    share = 0.5 * ((_phase(u, 6) < 0.5).astype(float) + (_phase(v, 6) < 0.5))
+    return _mix(share, (46, 104, 176), (244, 242, 236))
+
+
+def _herringbone(u: Field, v: Field) -> Field:
+    """Draw a twill that turns, and breaks, at every column."""
+    place = _phase(u, 8)
+    odd = np.mod(np.floor(u * 8), 2) == 1
+    twill = np.where(odd, v + place / 8, v - place / 8 + 1 / 20)
+    return _mix(_phase(twill, 10) < 0.5, (92, 64, 46), (214, 190, 156))
+
+
+def _houndstooth(u: Field, v: Field) -> Field:
+    """Weave four dark and four light threads, over two and under two."""
+    warp, weft = np.floor(u * 48), np.floor(v * 48)
+    warp_on_top = np.mod(warp + weft, 4) < 2
+    return _mix(np.where(warp_on_top, np.mod(warp, 8) < 4, np.mod(weft, 8) < 4), (28, 28, 32), (236, 232, 224))
+
+
+def _floral(u: Field, v: Field) -> Field:
+    """Strew five-petalled flowers of three colours and leaves over cream, seeded; the pattern repeats at the edges."""
+    picture = np.broadcast_to(np.asarray((240, 230, 208), dtype=np.float64), (*u.shape, 3))
+    random = np.random.Generator(np.random.PCG64(7))
+    petals: tuple[Rgb, ...] = ((200, 52, 76), (232, 140, 60), (110, 78, 168))
+    rows = 5
+    for place in range(rows * rows):
+        row, column = divmod(place, rows)
+        x = (column + 0.5 * (row % 2) + 0.5 + random.uniform(-0.1, 0.1)) / rows
+        y = (row + 0.5 + random.uniform(-0.1, 0.1)) / rows
+        du, dv = np.mod(u - x + 0.5, 1.0) - 0.5, np.mod(v - y + 0.5, 1.0) - 0.5
+        radius, angle = np.hypot(du, dv), np.arctan2(dv, du) + random.uniform(0.0, 2.0 * np.pi)
+        size = random.uniform(0.068, 0.088)
+        leaf = size * 1.45 * np.maximum(np.cos(1.5 * angle), 0.0) ** 3
+        petal = size * (0.62 + 0.38 * np.abs(np.cos(2.5 * angle)))
+        picture = _mix(radius < leaf, (66, 116, 66), picture)
+        picture = _mix(radius < petal, petals[place % 3], picture)
+        picture = _mix(radius < 0.3 * size, (250, 206, 84), picture)
+    return picture
+
+
+_DRAWN_BY: dict[Texture, Callable[[Field, Field], Field]] = {
+    Texture.checker: _checker,
+    Texture.dots: _dots,
+    Texture.stripes: _stripes,
+    Texture.plaid: _plaid,
+    Texture.gingham: _gingham,
+    Texture.herringbone: _herringbone,
+    Texture.houndstooth: _houndstooth,
+    Texture.floral: _floral,
+}
