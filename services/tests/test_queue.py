@@ -381,7 +381,7 @@ def test_a_waiting_job_can_be_cancelled(coordinator: Coordinator) -> None:
     check(coordinator)
 
 
-CLOTH = {
+CLOTH: dict[str, Any] = {
     "kind": "cloth_drag",
     "allow_uncertified": True,
     "axes": {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "plaid"], "viewpoint": "left"},
@@ -401,6 +401,26 @@ def test_a_waiting_job_of_such_a_kind_fails(coordinator: Coordinator) -> None:
     shown = coordinator.show_job(job.id)  # type: ignore[union-attr]
     assert shown.state is JobState.failed
     assert "no worker makes 'cloth_drag'" in shown.message
+
+
+def test_one_simulation_serves_all_looks_and_those_that_come_later(coordinator: Coordinator) -> None:
+    worker = PretendWorker(coordinator, coordinator.store, kinds=("rod_hang", "cloth_drag")).register()
+
+    def work(**axes: Any) -> dict[str, dict[str, int]]:
+        job = coordinator.submit(parsed(CLOTH | {"axes": CLOTH["axes"] | axes}), None)
+        worker.work()
+        stages = coordinator.show_job(job.id).progress.stages  # type: ignore[union-attr]
+        return {
+            stage: {"all": sum(stages[stage].counts.values()), "cached": stages[stage].cached}
+            for stage in (Stage.simulate, Stage.render)
+        }
+
+    first = work(texture=["dots", "plaid"], viewpoint=["left", "right"])
+    assert first == {Stage.simulate: {"all": 1, "cached": 0}, Stage.render: {"all": 4, "cached": 0}}
+    more = work(texture=["dots", "plaid", "floral"], viewpoint=["left", "right"])
+    assert more == {Stage.simulate: {"all": 1, "cached": 1}, Stage.render: {"all": 6, "cached": 4}}
+    assert sum(name.startswith("simulate") for name in worker.ran) == 1
+    check(coordinator)
 
 
 def test_many_renders_share_one_simulation(coordinator: Coordinator) -> None:
