@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 import torch
 from stickslip_training import train_curvature as module
+from stickslip_training.reader import DatasetReader
 from stickslip_training.train_curvature import (
     CurvatureTraining,
     estimate_strains,
     load_model,
+    read_rods,
     read_test_rods,
     train_curvature,
+    train_on_rods,
 )
 
 
@@ -180,3 +183,13 @@ def test_the_number_of_threads_is_put_back(config):
     before = torch.get_num_threads()
     train_curvature(replace(config, epochs=1))
     assert torch.get_num_threads() == before
+
+
+def test_rods_in_memory_train_as_those_of_a_dataset(config, rods, tmp_path):
+    with DatasetReader(rods.root) as reader:
+        parts = [read_rods(reader, reader.slots(split)) for split in ("train", "validation")]
+    net = train_on_rods(replace(config, dataset="none", out=tmp_path / "memory"), *parts)
+    train_curvature(config)
+    expected = weights(config)
+    assert all(torch.equal(value, expected[name]) for name, value in net.state_dict().items())
+    assert not net.training

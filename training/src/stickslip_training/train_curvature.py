@@ -228,6 +228,18 @@ def train_curvature(
     return report
 
 
+def train_on_rods(config: CurvatureTraining, train: Rods, validation: Rods) -> CurvatureNet:
+    """Train on rods in memory instead of a dataset, and return the network; `config.dataset` is only a name."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(config.threads)
+    try:
+        net, state = _train(config, {"train": train, "validation": validation}, "", False, None)
+    finally:
+        torch.set_num_threads(threads)
+    net.load_state_dict(state.best)
+    return net.eval()
+
+
 def load_model(path: str | Path) -> CurvatureNet:
     """Return the network of a `model.pt`, ready to estimate."""
     net = CurvatureNet()
