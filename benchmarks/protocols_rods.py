@@ -39,7 +39,7 @@ def main() -> None:
     print(f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}")
     print(f"numpy {np.__version__}  python {platform.python_version()}  load {os.getloadavg()[0]:.1f}")
     results = []
-    for name in protocols.PROTOCOLS:
+    for name in [name for name in protocols.PROTOCOLS if name in protocols.ROD_PROTOCOLS]:
         start = time.process_time()
         results.append(protocols.run(name))
         report(results[-1], time.process_time() - start)

@@ -92,9 +92,9 @@ class TestCertification:
         from stickslip_sim_core.protocols import plots
 
         result = protocols.run("rod-cantilever", gamma=(1.0, 2.0), elements=64)
-        assert len(plots.figures(result)) == 1
+        assert len(list(plots.figures(result))) == 1
         monkeypatch.setattr(plots, "PLOTS", {"rod-cantilever": (plots.plot, plots.plot)})
-        assert len(plots.figures(result)) == 2
+        assert len(list(plots.figures(result))) == 2
 
 
 class TestRelax:
@@ -150,7 +150,7 @@ class TestResult:
         assert json.loads(text)["build_hash"] == build_info().build_hash
         assert json.loads(json.dumps(self.RESULT.as_dict(), allow_nan=False))["curves"][0]["measured"] == [1.1, None]
 
-    @pytest.mark.parametrize("name", sorted(protocols.PROTOCOLS))
+    @pytest.mark.parametrize("name", sorted(protocols.ROD_PROTOCOLS))
     def test_plot(self, name: str, tmp_path: Path) -> None:
         pytest.importorskip("matplotlib")
         from stickslip_sim_core.protocols import plots

@@ -1,13 +1,14 @@
 """Certifying: real protocols, two files, and a build's own digest."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from stickslip_schemas.certificate import Certificate
 from stickslip_sim_core import build_info, protocols
-from stickslip_sim_core.protocols import Certification
+from stickslip_sim_core.protocols import Certification, plots
 from stickslip_workers.__main__ import main
 from stickslip_workers.builds import sim_core_build
 from stickslip_workers.certify import certify
@@ -83,6 +84,31 @@ class TestCertify:
         certificate = certify("good", tmp_path, quick=False, say=lambda _: None)
         assert asked == [("rod-lateral-buckling", "good", {}), ("rod-cantilever", "good", {})]
         assert certificate.certifies
+
+    def test_a_picture_that_cannot_be_drawn_loses_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def fail(_result: Any) -> Any:
+            raise IndexError("no points")
+
+        monkeypatch.setattr(plots, "PLOTS", {"rod-cantilever": (plots.plot, fail)})
+        assert certify("good", tmp_path, quick=True, say=lambda _: None).passed
+        page = (tmp_path / "certificate.html").read_text()
+        assert page.count("data:image/svg+xml;base64,") == 2
+        assert "could not be drawn: <code>IndexError: no points" in page
+
+    def test_settings_that_are_not_json_are_a_protocol_that_broke_off(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        run = protocols.run
+
+        def spoil(name: str, preset: str | None = None, **settings: Any) -> Any:
+            result = run(name, preset, **settings)
+            return replace(result, settings={"mesh": object()}) if name == "rod-cantilever" else result
+
+        monkeypatch.setattr(protocols, "run", spoil)
+        certificate = certify("good", tmp_path, quick=True, say=lambda _: None)
+        assert [report.passed for report in certificate.protocols] == [True, False]
 
     def test_an_unknown_preset(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
         assert main(["certify", "--preset", "best", "--out", str(tmp_path / "no")]) == 2

@@ -110,6 +110,10 @@ def _certify(options: argparse.Namespace) -> int:
     """Return 0 if the preset passed, 1 if not, 2 if there was nothing to run."""
     from stickslip_workers.certify import certify
 
+    # Long protocols may tell of their progress, as logging.info.
+    logging.basicConfig(level=logging.INFO, format="    %(message)s")
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
+
     def say(message: str) -> None:
         sys.stderr.write(message + "\n")
         sys.stderr.flush()

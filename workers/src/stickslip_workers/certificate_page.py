@@ -101,11 +101,16 @@ def _pictures(result: ProtocolResult) -> list[str]:
     import matplotlib
     from stickslip_sim_core.protocols import plots
 
-    images = []
+    images: list[str] = []
     with matplotlib.rc_context({"svg.hashsalt": "stickslip", "svg.fonttype": "path"}):
-        for figure in plots.figures(result):
-            data = io.BytesIO()
-            figure.savefig(data, format="svg", metadata={"Date": None})
-            text = base64.b64encode(data.getvalue()).decode()
-            images.append(f'<img alt="{escape(result.protocol)}" src="data:image/svg+xml;base64,{text}">')
+        try:
+            for figure in plots.figures(result):
+                data = io.BytesIO()
+                figure.savefig(data, format="svg", metadata={"Date": None})
+                text = base64.b64encode(data.getvalue()).decode()
+                images.append(f'<img alt="{escape(result.protocol)}" src="data:image/svg+xml;base64,{text}">')
+        except Exception as error:  # what was measured is not lost for want of a picture
+            images.append(
+                f"<p>A picture could not be drawn: <code>{escape(f'{type(error).__name__}: {error}')}</code></p>"
+            )
     return images

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from stickslip_schemas.certificate import Certificate, ProtocolReport
+from stickslip_schemas.keys import canonical_json
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
@@ -49,14 +50,16 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         cpu, wall = time.process_time(), time.monotonic()
         try:
             result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
+            report = ProtocolReport.model_validate(result.as_dict())
+            canonical_json(report.model_dump(mode="json"))  # settings are free in form
         except Exception as error:  # whatever it is, the certificate has to say so
-            reports.append(_broken_off(name, error))
+            report = _broken_off(name, error)
         else:
             results.append(result)
-            reports.append(ProtocolReport.model_validate(result.as_dict()))
+        reports.append(report)
         spent = time.process_time() - cpu
         environment[f"cpu_seconds/{name}"] = f"{spent:.2f}"
-        say(f"    {verdict(reports[-1])}; {spent:.1f} CPU s in {time.monotonic() - wall:.1f} s")
+        say(f"    {verdict(report)}; {spent:.1f} CPU s in {time.monotonic() - wall:.1f} s")
     certificate = Certificate(
         preset=preset,
         numbers=dict(certification.numbers),
@@ -67,8 +70,8 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         environment=environment,
     )
     out.mkdir(parents=True, exist_ok=True)
-    write_durably(out / PAGE_NAME, certificate_page(certificate, results).encode())
     write_durably(out / DOCUMENT_NAME, certificate.canonical())
+    write_durably(out / PAGE_NAME, certificate_page(certificate, results).encode())
     return certificate
 
 

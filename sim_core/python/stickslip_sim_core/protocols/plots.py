@@ -3,8 +3,9 @@
 They need matplotlib: `pip install stickslip-sim-core[plots]`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,9 +24,9 @@ SIZE = (6.0, 5.0)  # inches
 DPI = 110
 
 
-def figures(result: ProtocolResult) -> tuple["Figure", ...]:
+def figures(result: ProtocolResult) -> Iterator["Figure"]:
     """Draw everything that there is to see of a result."""
-    return tuple(draw(result) for draw in PLOTS.get(result.protocol, (plot,)))
+    return (draw(result) for draw in PLOTS.get(result.protocol, (plot,)))
 
 
 def plot(result: ProtocolResult) -> "Figure":
@@ -35,7 +36,7 @@ def plot(result: ProtocolResult) -> "Figure":
 
     figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    for curve, colour in zip(result.curves, COLOURS, strict=False):
+    for curve, colour in zip(result.curves, cycle(COLOURS), strict=False):
         label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items())
         above.plot(curve.x, curve.master, color=colour, label=f"master curve {label}".strip())
         above.plot(curve.x, curve.measured, "o", color=colour, markerfacecolor="none", label="measured")
