@@ -1,6 +1,7 @@
 """From `stickslip certify` to a dataset that carries the certificate: real protocols, a real coordinator."""
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -103,6 +104,15 @@ def test_errors_are_words(cli: Callable[..., Result], tmp_path: Path, words: tup
     assert result.exit_code == 1
     assert said in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_an_old_certificate_is_not_taken_for_a_new_one(
+    cli: Callable[..., Result], quick: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")  # ends with status 1, as a preset that fails does
+    result = cli("certify", "--preset", "rods", "--out", quick)
+    assert result.exit_code == 1
+    assert "there is no certificate: the workers' program ended with status 1" in result.stderr
 
 
 def test_a_damaged_certificate_is_refused_in_words(cli: Callable[..., Result], quick: Path, tmp_path: Path) -> None:

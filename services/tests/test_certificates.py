@@ -12,7 +12,7 @@ from stickslip_services.app import make_app
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.operations import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import BUILDS, PretendWorker, parsed, rods, serving
+from stickslip_services.testing import BUILDS, ManualClock, PretendWorker, parsed, rods, serving
 
 KINDS = ("rod_hang", "cloth_drag")
 PAGE = "<!doctype html><title>c</title>"
@@ -86,13 +86,18 @@ class TestTheRule:
         with pytest.raises(PresetNotCertifiedError):
             coordinator.submit(cloth(), None)
 
-    def test_the_newest_full_one_stands(self, coordinator: Coordinator, weaver: PretendWorker) -> None:
+    def test_the_full_one_that_came_last_stands(
+        self, coordinator: Coordinator, weaver: PretendWorker, clock: ManualClock
+    ) -> None:
         good = coordinator.add_certificate(upload())
         coordinator.add_certificate(upload(extent="quick", error=0.5))
         assert coordinator.validate(cloth()).certificate == good.digest
         coordinator.add_certificate(upload(error=0.02))
         with pytest.raises(PresetNotCertifiedError):
             coordinator.validate(cloth())
+        clock.advance(1)
+        coordinator.add_certificate(upload())
+        assert coordinator.validate(cloth()).certificate == good.digest
 
     def test_uncertified_where_the_spec_says_so(self, coordinator: Coordinator, weaver: PretendWorker) -> None:
         job = coordinator.submit(cloth(allow_uncertified=True), None)
@@ -150,9 +155,9 @@ class TestHttp:
             assert first.status_code == 201, first.text
             body["certificate"]["environment"] = {"python": "another"}
             again = client.post("/v1/certificates", json=body)
-            assert again.json() == first.json()
             (entry,) = client.get("/v1/certificates").json()["items"]
-            assert entry == first.json()
+            assert entry == again.json()
+            assert entry == first.json() | {"created_at": entry["created_at"]}
             assert first.headers["location"] == entry["href"]
             shown = client.get(entry["href"])
             assert Certificate.model_validate_json(shown.content).digest == entry["digest"]

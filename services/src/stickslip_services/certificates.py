@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select
+from sqlalchemy import Connection, Row, insert, select, update
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.certificate import CertificateUpload, preset_of
 from stickslip_schemas.jobs import ClothDragSpec
@@ -52,12 +52,12 @@ def terms_for(connection: Connection, spec: Spec) -> Terms | None:
 
 
 def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Sha256 | None:
-    """Return the digest of the newest full certificate of a preset and a build if it passed, else None."""
+    """Return the digest of the full certificate of a preset and a build that was registered last if it passed."""
     columns = certificates.c
     row = connection.execute(
         select(columns.digest, columns.passed)
         .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
-        .order_by(columns.seq.desc())
+        .order_by(columns.created_at.desc(), columns.seq.desc())
         .limit(1)
     ).one_or_none()
     return row.digest if row is not None and row.passed else None
@@ -76,8 +76,11 @@ def store_certificate(store: Store, upload: CertificateUpload) -> StoredCertific
 def insert_certificate(
     connection: Connection, upload: CertificateUpload, stored: StoredCertificate, now: float
 ) -> CertificateEntry:
-    """Register a certificate; one that is there already stays as it is."""
-    if _find(connection, stored.digest) is None:
+    """Register a certificate. One that is there already stays as it is, but it was measured last again."""
+    if _find(connection, stored.digest) is not None:
+        known = certificates.c.digest == stored.digest
+        connection.execute(update(certificates).where(known).values(created_at=now))
+    else:
         connection.execute(
             insert(certificates).values(
                 digest=stored.digest,

@@ -26,14 +26,16 @@ def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     # Threads of NumPy's linear algebra only disturb: the matrices of master curves are small.
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
     try:
-        status = subprocess.run(
-            [*program, *arguments], env=environment, stdout=subprocess.DEVNULL, check=False
-        ).returncode
+        ended = subprocess.run([*program, *arguments], env=environment, stdout=subprocess.PIPE, text=True, check=False)
     except OSError as error:
         raise CertifyError(f"the workers' program does not start: {error}") from error
-    if status not in (0, 1):
-        raise CertifyError(f"there is no certificate: the workers' program ended with status {status}")
-    return read_certificate(out).certificate
+    digest = ended.stdout.strip()
+    if ended.returncode not in (0, 1) or not digest:
+        raise CertifyError(f"there is no certificate: the workers' program ended with status {ended.returncode}")
+    certificate = read_certificate(out).certificate
+    if certificate.digest != digest:
+        raise CertifyError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
+    return certificate
 
 
 def read_certificate(directory: Path) -> CertificateUpload:

@@ -42,7 +42,7 @@ def post_certificate(
     coordinator: CoordinatorDep,
     response: Response,
 ) -> CertificateEntry:
-    """Register a certificate. One that is there already stays as it is, so that it may be sent twice."""
+    """Register a certificate; it may be sent twice. Of a preset and build the full one that came last stands."""
     entry = coordinator.add_certificate(upload)
     response.headers["Location"] = entry.href
     return entry
