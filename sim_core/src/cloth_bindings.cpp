@@ -7,6 +7,7 @@
 
 #include <tuple>
 
+#include "cloth_intersections.hpp"
 #include "cloth_solver.hpp"
 
 namespace sim_core {
@@ -22,6 +23,8 @@ using BodyTuple = std::tuple<int, double, Eigen::Vector3d, Eigen::Vector3d, Eige
 }  // namespace
 
 void bind_cloth(nb::module_& m) {
+  m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
+        "Internal: see stickslip_sim_core.self_intersections.");
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")
       .def_ro("converged", &StepReport::converged)
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
@@ -34,13 +37,12 @@ void bind_cloth(nb::module_& m) {
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.cloth and cloth_solver.hpp.")
       .def(
           "__init__",
-          [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density, const Table& stretching,
-             const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held, const Edges& clamped,
-             double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
-             int halvings_max) {
-            new (self) ClothSolver(
-                rest, triangles, {density, {stretching}, rigidity}, held, clamped,
-                {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, halvings_max});
+          [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density,
+             const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
+             const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
+             int refactor_after, int halvings_max) {
+            new (self) ClothSolver(rest, triangles, {density, {stretching}, rigidity}, held, clamped,
+                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, halvings_max});
           },
           "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
           "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "halvings_max"_a)
@@ -50,7 +52,8 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
              const std::vector<BodyTuple>& bodies, double damping) {
             std::vector<Body> list;
-            for (const auto& [shape, mu, size, origin, rotation] : bodies) list.push_back({shape, mu, size, origin, rotation});
+            for (const auto& [shape, mu, size, origin, rotation] : bodies)
+              list.push_back({shape, mu, size, origin, rotation});
             nb::gil_scoped_release release;
             return self.step(dt, gravity, held, slopes, list, damping);
           },

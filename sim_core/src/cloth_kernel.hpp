@@ -40,10 +40,11 @@ inline void add_block(float* blocks, int slot, const double (&block)[3][3], doub
   }
 }
 
-// Green's strain G = (F^T F - 1)/2 and W = A (k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2) [Wang et al. 2011]. In the
-// matrix the stress is replaced by its positive part [Teran et al. 2005], which keeps it positive semi-definite.
+// Green's strain G = (F^T F - 1)/2 and W = A (k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2) [Wang et al. 2011]. If
+// `project`, the matrix has the positive part of the stress in place of the stress [Teran et al. 2005] and is positive
+// semi-definite.
 template <bool matrix>
-double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks) {
+double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, bool project) {
   constexpr int W = membrane_lanes;
   Lane energy{};
   for (int group = 0; group < data.groups; ++group) {
@@ -82,13 +83,18 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
       }
     }
     if constexpr (matrix) {
-      const Lane mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11);
-      const Lane radius = root(half * half + s01 * s01) + 1e-30;
-      const Lane big = mean + radius, small = mean - radius, zero{};
-      const Lane big_plus = big > zero ? big : zero, small_plus = small > zero ? small : zero;
-      const Lane middle = 0.5 * (big_plus + small_plus), spread_ratio = 0.5 * (big_plus - small_plus) / radius;
-      const Lane t00 = area * (middle + spread_ratio * half), t11 = area * (middle - spread_ratio * half);
-      const Lane t01 = area * spread_ratio * s01;
+      const Lane zero{};
+      Lane t00 = area * s00, t11 = area * s11, t01 = area * s01;
+      if (project) {
+        const Lane mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11);
+        const Lane radius = root(half * half + s01 * s01) + 1e-30;
+        const Lane big = mean + radius, small = mean - radius;
+        const Lane big_plus = big > zero ? big : zero, small_plus = small > zero ? small : zero;
+        const Lane middle = 0.5 * (big_plus + small_plus), spread_ratio = 0.5 * (big_plus - small_plus) / radius;
+        t00 = area * (middle + spread_ratio * half);
+        t11 = area * (middle - spread_ratio * half);
+        t01 = area * spread_ratio * s01;
+      }
       const Lane k0 = area * k[0], k1 = area * k[1], k2 = area * k[2], k3 = 0.5 * area * k[3];
       const int* slots = data.slots + 9L * W * group;
       constexpr int first[3] = {0, 0, 1}, second[3] = {1, 2, 2};
@@ -122,15 +128,15 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
   return total;
 }
 
-double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks) {
-  return blocks ? membrane_groups<true>(data, x, gradient, blocks)
-                : membrane_groups<false>(data, x, gradient, nullptr);
+double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks, bool project) {
+  return blocks ? membrane_groups<true>(data, x, gradient, blocks, project)
+                : membrane_groups<false>(data, x, gradient, nullptr, project);
 }
 
 // --- bending ----------------------------------------------------------------------------------------------------
 
-// A fold by theta over the length h has s = h^2 |H|^2 = 4 sin^2(theta/2) where its energy should go as theta^2. The ratio
-// r(s) = theta^2 / s turns the one into the other; beyond `fold_end` theta^2 goes on as a parabola in s.
+// A fold by theta over the length h has s = h^2 |H|^2 = 4 sin^2(theta/2) where its energy should go as theta^2. The
+// ratio r(s) = theta^2 / s turns the one into the other; beyond `fold_end` theta^2 goes on as a parabola in s.
 struct Stiffening {
   double ratio, slope;  // r and dr/ds
 };
@@ -140,8 +146,8 @@ constexpr double fold_series = 0.4, fold_end = 3.8;
 inline Stiffening stiffening_of(double s) {
   if (s < fold_series) {
     // theta^2 = 2 sum_n s^n / (n^2 C(2n, n))
-    constexpr double c[11] = {1.0,           1.0 / 12,      1.0 / 90,       1.0 / 560,      1.0 / 3150,      1.0 / 16632,
-                              1.0 / 84084,   1.0 / 411840,  1.0 / 1969110,  1.0 / 9237800,  1.0 / 42678636};
+    constexpr double c[11] = {1.0,         1.0 / 12,     1.0 / 90,      1.0 / 560,     1.0 / 3150,    1.0 / 16632,
+                              1.0 / 84084, 1.0 / 411840, 1.0 / 1969110, 1.0 / 9237800, 1.0 / 42678636};
     double ratio = c[10], slope = 0.0;
     for (int n = 9; n >= 0; --n) {
       slope = slope * s + ratio;
@@ -289,12 +295,24 @@ inline void subtract_square(const float* a, long ld, int depth, float* c, long l
     const float* left = a + from;
     float* target = c + j * ldc + from;
     switch (columns - j) {
-      case 1: multiply_column<1>(left, a + j, ld, depth, target, ldc, rows - from); break;
-      case 2: multiply_column<2>(left, a + j, ld, depth, target, ldc, rows - from); break;
-      case 3: multiply_column<3>(left, a + j, ld, depth, target, ldc, rows - from); break;
-      case 4: multiply_column<4>(left, a + j, ld, depth, target, ldc, rows - from); break;
-      case 5: multiply_column<5>(left, a + j, ld, depth, target, ldc, rows - from); break;
-      default: multiply_column<6>(left, a + j, ld, depth, target, ldc, rows - from); break;
+      case 1:
+        multiply_column<1>(left, a + j, ld, depth, target, ldc, rows - from);
+        break;
+      case 2:
+        multiply_column<2>(left, a + j, ld, depth, target, ldc, rows - from);
+        break;
+      case 3:
+        multiply_column<3>(left, a + j, ld, depth, target, ldc, rows - from);
+        break;
+      case 4:
+        multiply_column<4>(left, a + j, ld, depth, target, ldc, rows - from);
+        break;
+      case 5:
+        multiply_column<5>(left, a + j, ld, depth, target, ldc, rows - from);
+        break;
+      default:
+        multiply_column<6>(left, a + j, ld, depth, target, ldc, rows - from);
+        break;
     }
   }
 }
@@ -342,7 +360,7 @@ inline void factor_columns(float* panel, long ld, int width, int rows) {
 
 // Sizes of a front in floats. Pivot rows are padded apart from the others, so that both begin on a vector.
 struct FrontSize {
-  int pivots, rows;           // nodes
+  int pivots, rows;  // nodes
   int columns, pivot_rows, other_rows;
   long ld;
 
@@ -404,7 +422,8 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagona
       for (int j = 0; j < below.rows; ++j) {
         const bool pivot = map[j] < size.pivots;
         const long ld = pivot ? size.ld : ldu;
-        float* column = pivot ? panel + 3L * map[j] * size.ld : update + 3L * (map[j] - size.pivots) * ldu - size.pivot_rows;
+        float* column =
+            pivot ? panel + 3L * map[j] * size.ld : update + 3L * (map[j] - size.pivots) * ldu - size.pivot_rows;
         for (int i = j; i < below.rows; ++i) {
           const float* block = source + 3L * j * below.other_rows + 3L * i;
           float* at = column + size.place(map[i]);

@@ -71,7 +71,8 @@ SlopeFit fit_slope(const ClothMesh& mesh, const std::vector<std::vector<int>>& a
         svd.matrixU() * (svd.singularValues().cwiseInverse().asDiagonal() * svd.matrixV().row(2).transpose());
     return {nodes, row.cwiseProduct(weight) / scale};
   }
-  refuse(text("triangles: the nodes around edge (", edge.a, ", ", edge.b, ") must determine a quadratic; refine the mesh"));
+  refuse(text("triangles: the nodes around edge (", edge.a, ", ", edge.b,
+              ") must determine a quadratic; refine the mesh"));
 }
 
 }  // namespace
@@ -99,9 +100,10 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
     area[t] = 0.5 * (u.x() * v.y() - u.y() * v.x());
     const double longest = std::max({u.squaredNorm(), v.squaredNorm(), (u - v).squaredNorm()});
     if (!(area[t] > 1e-3 * longest)) {
-      refuse(text("triangles: must run counter-clockwise and not be slivers (area over longest edge squared > 0.001), "
-                  "and triangle ",
-                  t, " has ", area[t] / longest));
+      refuse(
+          text("triangles: must run counter-clockwise and not be slivers (area over longest edge squared > 0.001), "
+               "and triangle ",
+               t, " has ", area[t] / longest));
     }
     for (int c = 0; c < 3; ++c) {
       const int i = triangles(t, (c + 1) % 3), j = triangles(t, (c + 2) % 3);

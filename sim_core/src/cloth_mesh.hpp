@@ -15,7 +15,7 @@ using Rigidity = Eigen::Matrix3d;  // of (H11, H22, 2 H12), N m
 
 struct ClothMesh {
   struct Edge {
-    int a, b;                           // a < b
+    int a, b;  // a < b
     std::array<int, 2> triangle{-1, -1};
     std::array<int, 2> corner{-1, -1};  // the one opposite, 0 ... 2
     bool boundary() const { return triangle[1] < 0; }
@@ -31,15 +31,15 @@ struct ClothMesh {
   ClothMesh(Points2 rest, Triangles triangles);
 };
 
-// Second derivatives of a triangle, (H11, H22, 2 H12), from the positions of `nodes`. Nodes from mesh.rest.rows() on are
-// the outward slopes that are prescribed at clamped edges, in their order.
+// Second derivatives of a triangle, (H11, H22, 2 H12), from the positions of `nodes`. Nodes from mesh.rest.rows() on
+// are the outward slopes that are prescribed at clamped edges, in their order.
 struct Stencil {
   std::vector<int> nodes;
   Eigen::Matrix<double, Eigen::Dynamic, 3> weights;  // 1/m^2; 1/m for a slope
 };
 
-// Rotation-free Morley element: H = sum over edges e of phi_e |e|/A n_e n_e^T, phi_e = d_e - n_e . grad x_T, with the slope
-// d_e across the middle of the edge taken from a quadratic fitted to the nodes around [Morley 1968; the fit after
+// Rotation-free Morley element: H = sum over edges e of phi_e |e|/A n_e n_e^T, phi_e = d_e - n_e . grad x_T, with the
+// slope d_e across the middle of the edge taken from a quadratic fitted to the nodes around [Morley 1968; the fit after
 // Grinspun et al. 2006]. At a free edge phi_e minimises the energy; at a clamped one d_e is given.
 std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped);
 

@@ -110,8 +110,9 @@ FactorStorage::FactorStorage(const Graph& graph, const Dissection& dissection, c
     rows.insert(rows.end(), own.begin(), own.end());
     row_begin.push_back(static_cast<int>(rows.size()));
     const auto place = [&](int node) {
-      return node < last ? node - first
-                         : last - first + static_cast<int>(std::lower_bound(own.begin(), own.end(), node) - own.begin());
+      return node < last
+                 ? node - first
+                 : last - first + static_cast<int>(std::lower_bound(own.begin(), own.end(), node) - own.begin());
     };
     for (int child : below[f]) {
       for (int r = row_begin[child]; r < row_begin[child + 1]; ++r) {

@@ -12,9 +12,9 @@ namespace sim_core {
 using Graph = std::vector<std::vector<int>>;  // neighbours of each node, sorted, itself included
 
 struct Dissection {
-  std::vector<int> order;         // nodes of the graph in the order of elimination
-  std::vector<int> pivot_begin;   // (fronts + 1): pieces of `order`, children before parents
-  std::vector<int> parent;        // (fronts): -1 at the root
+  std::vector<int> order;        // nodes of the graph in the order of elimination
+  std::vector<int> pivot_begin;  // (fronts + 1): pieces of `order`, children before parents
+  std::vector<int> parent;       // (fronts): -1 at the root
 };
 
 // Bisects along the longer side of what is left, by the coordinates of the mesh at rest [George 1973].

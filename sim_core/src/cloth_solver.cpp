@@ -25,6 +25,8 @@ constexpr float factor_share = 4.0f;
 constexpr double turning_max = 1e3;
 // A matrix of bending is assembled again when its stiffening has changed by more.
 constexpr float stiffening_change = 0.03f;
+// Iterations after which a step is halved rather than pursued, and up to which steps may grow again.
+constexpr int patience = 12, easy = 5;
 
 double cpu_seconds() {
   timespec now{};
@@ -104,7 +106,7 @@ struct ClothSolver::Impl {
   std::vector<int> node_of, vertex_of;  // vertex or slope <-> node
   std::vector<int> held;                // nodes of the held vertices, in the caller's order
   Eigen::VectorXd mass_of_vertex;
-  Buffer<double> mass;                  // (nodes)
+  Buffer<double> mass;  // (nodes)
 
   Buffer<int> membrane_nodes, membrane_slots;
   Buffer<double> membrane_shape, membrane_area, membrane_stiffness;
@@ -116,7 +118,7 @@ struct ClothSolver::Impl {
   double rigidity_size;
 
   std::vector<int> scalar_begin, scalar_node, block_begin, block_node, scalar_diagonal, block_diagonal;
-  Buffer<float> scalars, blocks, diagonal, added;
+  Buffer<float> scalars, blocks, definite_blocks, diagonal, added;
   Buffer<float> stiffening, assembled_stiffening;
   ClothMatrix matrix{};
   std::unique_ptr<FactorStorage> factor_storage;
@@ -126,7 +128,7 @@ struct ClothSolver::Impl {
   int last_krylov = 0;
 
   // State and work, (nodes, 4).
-  Buffer<double> x, v, start, gradient, residual, inertial, trial;
+  Buffer<double> x, v, start, gradient, residual, inertial, trial, unused;
   Buffer<float> rhs, correction, change, work, image;
   // Contact.
   std::vector<Body> bodies, bodies_before;
@@ -137,6 +139,7 @@ struct ClothSolver::Impl {
   Buffer<float> normal, direction, mu, turning;
   ContactRows contact{};
   bool started = false;
+  int depth_hint = 0, hardest = 0;  // halvings that steps need of late, and Newton iterations of the worst part
 
   Impl(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
        const std::vector<std::int32_t>& held_in, const Edges& clamped, const ClothSettings& settings_in)
@@ -157,7 +160,8 @@ struct ClothSolver::Impl {
     for (int i = 0; i < vertices; ++i) mass[node_of[i]] = mass_of_vertex[i];
     build_membrane(mesh);
     build_bending(mesh, stencils, properties.rigidity);
-    for (Buffer<double>* buffer : {&x, &v, &start, &gradient, &residual, &inertial, &trial}) buffer->assign(4 * nodes, 0.0);
+    for (Buffer<double>* buffer : {&x, &v, &start, &gradient, &residual, &inertial, &trial, &unused})
+      buffer->assign(4 * nodes, 0.0);
     for (Buffer<float>* buffer : {&rhs, &correction, &change, &image, &normal, &direction}) {
       buffer->assign(4 * free_nodes + 64, 0.0f);
     }
@@ -179,7 +183,8 @@ struct ClothSolver::Impl {
     std::vector<char> is_held(vertices, 0);
     for (std::int32_t h : held_in) {
       if (h < 0 || h >= vertices) {
-        throw std::invalid_argument("held: must index " + std::to_string(vertices) + " vertices, got " + std::to_string(h));
+        throw std::invalid_argument("held: must index " + std::to_string(vertices) + " vertices, got " +
+                                    std::to_string(h));
       }
       if (is_held[h]) throw std::invalid_argument("held: must not repeat a vertex, and repeats " + std::to_string(h));
       is_held[h] = 1;
@@ -254,10 +259,12 @@ struct ClothSolver::Impl {
     }
     scalars.assign(scalar_node.size(), 0.0f);
     blocks.assign(12 * block_node.size(), 0.0f);
+    definite_blocks = blocks;
     diagonal.assign(free_nodes, 0.0f);
-    matrix = {free_nodes,         scalar_begin.data(), scalar_node.data(), scalars.data(), block_begin.data(),
-              block_node.data(), blocks.data(),       diagonal.data()};
-    factor_storage = std::make_unique<FactorStorage>(ordered, dissection, scalar_begin, scalar_node, block_begin, block_node);
+    matrix = {free_nodes,         scalar_begin.data(), scalar_node.data(), scalars.data(),
+              block_begin.data(), block_node.data(),   blocks.data(),      diagonal.data()};
+    factor_storage =
+        std::make_unique<FactorStorage>(ordered, dissection, scalar_begin, scalar_node, block_begin, block_node);
     factor = factor_storage->view();
   }
 
@@ -387,7 +394,8 @@ struct ClothSolver::Impl {
     const Stopwatch watch(phases.assembly);
     std::fill(gradient.begin(), gradient.end(), 0.0);
     if (with_matrix) std::fill(blocks.begin(), blocks.end(), 0.0f);
-    membrane_energy = kernel.membrane(membrane, at.data(), gradient.data(), with_matrix ? blocks.data() : nullptr);
+    membrane_energy =
+        kernel.membrane(membrane, at.data(), gradient.data(), with_matrix ? blocks.data() : nullptr, false);
     bending_energy = kernel.bending(bending, at.data(), gradient.data(), stiffening.data());
     if (with_matrix) {
       float change_max = 0.0f;
@@ -413,7 +421,7 @@ struct ClothSolver::Impl {
     return diagonal[i] + scalars[scalar_diagonal[i]] + (block[0] + block[5] + block[10]) / 3.0;
   }
 
-  void factorize() {
+  void factorize(const Buffer<double>& now) {
     const Stopwatch watch(phases.factorization);
     for (int i = 0; i < free_nodes; ++i) {
       float* own = &added[6L * i];
@@ -432,7 +440,11 @@ struct ClothSolver::Impl {
         }
       }
     }
-    kernel.factor(factor, matrix, {added.data()});
+    std::fill(definite_blocks.begin(), definite_blocks.end(), 0.0f);
+    kernel.membrane(membrane, now.data(), unused.data(), definite_blocks.data(), true);
+    ClothMatrix definite = matrix;
+    definite.membrane = definite_blocks.data();
+    kernel.factor(factor, definite, {added.data()});
     factored = true;
   }
 
@@ -526,7 +538,7 @@ struct ClothSolver::Impl {
 
   // One implicit Euler step from (start, v) to x, or the best found.
   bool attempt(double dt, double damping, const std::vector<Body>& at_end, const std::vector<Body>& at_start,
-               bool from_rest, StepReport& report, double& residual_out) {
+               bool from_rest, int iterations, StepReport& report, double& residual_out) {
     for (int i = 0; i < free_nodes; ++i) {
       Vector3d p = at(start, i);
       if (!from_rest) p += dt * at(v, i);
@@ -543,12 +555,12 @@ struct ClothSolver::Impl {
     Norms norms = contact_state(x, dt, damping, at_end, at_start);
     double window[4];
     std::fill(window, window + 4, norms.squared);
-    for (int iteration = 0; iteration < settings.newton_max; ++iteration) {
+    for (int iteration = 0; iteration < iterations; ++iteration) {
       if (norms.largest <= settings.tolerance) break;
       if (!std::isfinite(norms.squared)) break;
       ++report.newton;
       if (!factored || last_krylov > settings.refactor_after) {
-        factorize();
+        factorize(x);
         ++report.factorizations;
         factored_dt = dt;
       }
@@ -625,9 +637,18 @@ struct ClothSolver::Impl {
     trial = x;
     update_stretching(start);
     double reached = 0.0;
-    bool converged = attempt(part, damping, at_end, at_start, false, report, reached);
-    if (!converged) converged = attempt(part, damping, at_end, at_start, true, report, reached);
-    if (!converged && depth < settings.halvings_max) {
+    const bool deepest = depth == settings.halvings_max;
+    const int iterations = report.newton;
+    bool converged = false;
+    if (depth >= depth_hint) {
+      converged =
+          attempt(part, damping, at_end, at_start, false, deepest ? settings.newton_max : patience, report, reached);
+      if (!converged && deepest) {
+        converged = attempt(part, damping, at_end, at_start, true, settings.newton_max, report, reached);
+      }
+    }
+    if (!converged && !deepest) {
+      if (depth >= depth_hint) depth_hint = depth + 1;
       x = from;
       v = speed;
       const double middle = 0.5 * (begin + end);
@@ -635,6 +656,7 @@ struct ClothSolver::Impl {
       advance(middle, end, depth + 1, dt, damping, gravity, held_end, slopes_end, now, report);
       return;
     }
+    hardest = std::max(hardest, report.newton - iterations);
     ++report.substeps;
     report.converged = report.converged && converged;
     report.residual = std::max(report.residual, reached);
@@ -656,8 +678,10 @@ struct ClothSolver::Impl {
     started = true;
     if (bodies_before.size() != now.size()) throw std::invalid_argument("bodies: must keep their number");
     StepReport report;
+    hardest = 0;
     advance(0.0, 1.0, 0, dt, damping, gravity, held_end, slopes_end, now, report);
     bodies_before = now;
+    if (hardest <= easy && depth_hint > 0) --depth_hint;
     for (int i = 0; i < free_nodes; ++i) {
       report.contacts += mode[i] != contact_open;
       report.sliding += mode[i] == contact_slip;
@@ -743,7 +767,7 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
   s.set_diagonal(dt, 0.0);
   s.evaluate(at, true);
   std::fill(s.mode.begin(), s.mode.end(), static_cast<int>(contact_open));
-  s.factorize();
+  s.factorize(at);
   s.factored = false;
   Buffer<float> v(4 * s.free_nodes), b(4 * s.free_nodes);
   unsigned state = 1;

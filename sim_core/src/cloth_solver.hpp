@@ -45,8 +45,8 @@ struct ClothProperties {
   Rigidity rigidity;
 };
 
-// A body that cloth touches, at the end of a step. Its own axes: a plane fills z < 0, a sphere has radius size[0], a box
-// reaches from -size to size.
+// A body that cloth touches, at the end of a step. Its own axes: a plane fills z < 0, a sphere has radius size[0], a
+// box reaches from -size to size.
 struct Body {
   enum Shape : int { plane = 0, sphere = 1, box = 2 };
   int shape;
@@ -56,17 +56,17 @@ struct Body {
 };
 
 struct ClothSettings {
-  double tolerance;          // N: largest residual force of a node
-  int newton_max;            // iterations of Newton's method in a step
-  int krylov_max;            // of GMRES in one of those
+  double tolerance;  // N: largest residual force of a node
+  int newton_max;    // iterations of Newton's method in a step
+  int krylov_max;    // of GMRES in one of those
   double krylov_tolerance;
-  int refactor_after;        // GMRES iterations that a stale factor may cost
-  int halvings_max;          // of a step that does not converge
+  int refactor_after;  // GMRES iterations that a stale factor may cost
+  int halvings_max;    // of a step that does not converge
 };
 
 struct StepReport {
   bool converged = true;
-  double residual = 0.0;     // N: worst over the substeps
+  double residual = 0.0;  // N: worst over the substeps
   int substeps = 0, newton = 0, krylov = 0, factorizations = 0, contacts = 0, sliding = 0;
 };
 

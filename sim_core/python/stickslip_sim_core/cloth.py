@@ -33,7 +33,13 @@ class Body:
 
     def as_tuple(self) -> tuple[int, float, Floats, Floats, Floats]:
         """Return what the C++ core takes."""
-        return self.shape, self.mu, np.array(self.size), np.asarray(self.origin, float), np.asarray(self.rotation, float)
+        return (
+            self.shape,
+            self.mu,
+            np.array(self.size),
+            np.asarray(self.origin, float),
+            np.asarray(self.rotation, float),
+        )
 
 
 def plane(mu: float, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
@@ -58,7 +64,7 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
     """Return a box with edges of `size` (3,) [m]."""
     half = 0.5 * np.asarray(size, float)
     if half.shape != (3,) or not (np.isfinite(half).all() and (half > 0.0).all()):
-        raise ValueError(f"size: must be three finite lengths > 0, got {size}")
+        raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
     turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
     return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
 
@@ -147,7 +153,9 @@ class Cloth:
         """(V,): whether a vertex slides on its body."""
         return np.asarray(self._solver.sliding(), dtype=bool)
 
-    def set_state(self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None) -> None:
+    def set_state(
+        self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
+    ) -> None:
         """Put the sheet somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3)."""
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)

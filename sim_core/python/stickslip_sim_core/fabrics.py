@@ -4,9 +4,10 @@ import tomllib
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
@@ -60,9 +61,9 @@ def isotropic(density: float, stretching: float, rigidity: float, poisson: float
 def fabric(name: str) -> Fabric:
     """Return one of the fabrics of [Wang et al. 2011].
 
-    Its stretching numbers are doubled, as the authors' simulator does, negative ones are raised to 0 and the coupling is
-    kept positive definite. Its bending numbers k are coefficients of hinges: a plate of the same stiffness has D = k/4
-    on equilateral triangles. D against curvature along warp, weft and in between comes from hinges across it; with no
+    Its stretching numbers are doubled, as the authors' simulator does, negative ones are raised to 0, and the coupling
+    is kept positive definite. Its bending numbers k are coefficients of hinges: a plate as stiff has D = k/4 on
+    equilateral triangles. D against curvature along warp, weft and in between comes from hinges across it; with no
     coupling D12, D66 = D(45 degrees) - (D11 + D22)/4. D is the mean over the tabulated curvatures.
 
     Raises:
@@ -79,12 +80,12 @@ def fabric(name: str) -> Fabric:
     return Fabric(name, float(facts["density"]), k, np.diag([across_warp, across_weft, twist]))
 
 
-def fabrics() -> tuple[str, ...]:
+def fabric_names() -> tuple[str, ...]:
     """Return the names that `fabric` knows."""
     return tuple(_table())
 
 
 @lru_cache
-def _table() -> dict[str, dict[str, ArrayLike]]:
+def _table() -> dict[str, dict[str, Any]]:
     text = files("stickslip_sim_core").joinpath("fabrics.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)

@@ -36,7 +36,9 @@ class Mesh:
         return np.ascontiguousarray(outer[chosen[outer].all(axis=1)], dtype=np.int32)
 
 
-def grid(width: float, length: float, columns: int, rows: int, diagonals: Diagonals = "alternating", seed: int = 0) -> Mesh:
+def grid(
+    width: float, length: float, columns: int, rows: int, diagonals: Diagonals = "alternating", seed: int = 0
+) -> Mesh:
     """Triangulate [-width/2, width/2] x [-length/2, length/2] by columns x rows cells, each cut along a diagonal.
 
     Raises:
