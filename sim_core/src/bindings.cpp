@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "build_info.hpp"
+#include "cloth_bindings.hpp"
 #include "general_rods.hpp"
 #include "rod_chain.hpp"
 #include "rod_derivatives.hpp"
@@ -223,4 +224,5 @@ NB_MODULE(_sim_core, m) {
       "relax_rod", &relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
       "Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one "
       "level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.");
+  sim_core::bind_cloth(m);
 }

@@ -1,5 +1,6 @@
 """Internal: the C++ core. Use stickslip_sim_core."""
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy
@@ -77,3 +78,69 @@ def relax_rod(gamma: float, phi0: float, phi1: float, twist_stiffness: float, qu
     """
     Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.
     """
+
+def self_intersections(positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')]) -> int:
+    """Internal: see stickslip_sim_core.self_intersections."""
+
+class StepReport:
+    """How a step of cloth went."""
+
+    @property
+    def converged(self) -> bool: ...
+
+    @property
+    def residual(self) -> float:
+        """Largest residual force of a node [N]."""
+
+    @property
+    def substeps(self) -> int: ...
+
+    @property
+    def newton(self) -> int: ...
+
+    @property
+    def krylov(self) -> int: ...
+
+    @property
+    def factorizations(self) -> int: ...
+
+    @property
+    def contacts(self) -> int: ...
+
+    @property
+    def sliding(self) -> int: ...
+
+class ClothSolver:
+    """Internal: see stickslip_sim_core.cloth and cloth_solver.hpp."""
+
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], density: float, stretching: Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], rigidity: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, halvings_max: int) -> None: ...
+
+    def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
+
+    def step(self, dt: float, gravity: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], held: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], bodies: Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], damping: float) -> StepReport: ...
+
+    def positions(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
+
+    def velocities(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
+
+    def reactions(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
+
+    def contacts(self) -> list[int]: ...
+
+    def sliding(self) -> list[int]: ...
+
+    def masses(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')]: ...
+
+    def energies(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> tuple[float, float, Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]]: ...
+
+    def stiffness_times(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], v: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
+
+    def factor_error(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], dt: float) -> float: ...
+
+    def phases(self) -> tuple[float, float, float, float]: ...
+
+    def factor_flops(self) -> float: ...
+
+    def factor_floats(self) -> int: ...
+
+    def kernel(self) -> str: ...

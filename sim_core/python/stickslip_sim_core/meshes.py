@@ -1,0 +1,151 @@
+"""Triangulations of rectangles, structured and unstructured."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Diagonals = Literal["alternating", "left", "right", "random"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangulated rectangle at rest."""
+
+    rest: NDArray[np.float64]
+    """(V, 2) [m]."""
+
+    triangles: NDArray[np.int32]
+    """(T, 3), counter-clockwise."""
+
+    @property
+    def spacing(self) -> float:
+        """Square root of twice the mean area of a triangle [m]: the side of a cell of a grid."""
+        a, b, c = (self.rest[self.triangles[:, i]] for i in range(3))
+        u, v = b - a, c - a
+        return float(np.sqrt(np.mean(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])))
+
+    def boundary(self, on: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int32]:
+        """Return the edges (E, 2) of the boundary of which `on` is true at both ends; it takes positions (V, 2)."""
+        edges = np.sort(np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
+        unique, counts = np.unique(edges, axis=0, return_counts=True)
+        outer = unique[counts == 1]
+        chosen = on(self.rest)
+        return np.ascontiguousarray(outer[chosen[outer].all(axis=1)], dtype=np.int32)
+
+
+def grid(
+    width: float, length: float, columns: int, rows: int, diagonals: Diagonals = "alternating", seed: int = 0
+) -> Mesh:
+    """Triangulate [-width/2, width/2] x [-length/2, length/2] by columns x rows cells, each cut along a diagonal.
+
+    Raises:
+        ValueError: A size is not positive, or there is no such pattern.
+    """
+    _check(width=width, length=length, columns=columns, rows=rows)
+    x, y = np.meshgrid(
+        np.linspace(-0.5, 0.5, columns + 1) * width, np.linspace(-0.5, 0.5, rows + 1) * length, indexing="xy"
+    )
+    rest = np.stack([x.ravel(), y.ravel()], axis=1)
+    column, row = (cells.ravel() for cells in np.meshgrid(np.arange(columns), np.arange(rows), indexing="xy"))
+    a = row * (columns + 1) + column
+    b, c, d = a + 1, a + columns + 2, a + columns + 1
+    match diagonals:
+        case "alternating":
+            rising = (row + column) % 2 == 0
+        case "right":
+            rising = np.ones_like(a, dtype=bool)
+        case "left":
+            rising = np.zeros_like(a, dtype=bool)
+        case "random":
+            rising = np.random.default_rng(seed).random(a.size) < 0.5
+        case _:
+            raise ValueError(f"diagonals: must be alternating, left, right or random, got {diagonals!r}")
+    up = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1)
+    down = np.stack([np.stack([a, b, d], 1), np.stack([b, c, d], 1)], 1)
+    triangles = np.where(rising[:, None, None], up, down).reshape(-1, 3)
+    return Mesh(rest, triangles.astype(np.int32))
+
+
+def unstructured(width: float, length: float, spacing: float, seed: int = 0) -> Mesh:
+    """Triangulate [-width/2, width/2] x [-length/2, length/2] by a Delaunay mesh of scattered vertices.
+
+    Rows of a triangular lattice with edges of about `spacing` are displaced at random by up to 0.3 spacings, and edges
+    are flipped until every circumcircle is empty [Lawson 1977].
+
+    Raises:
+        ValueError: A size is not positive.
+    """
+    _check(width=width, length=length, spacing=spacing)
+    rng = np.random.default_rng(seed)
+    columns = max(1, round(width / spacing))
+    rows = max(1, round(length / (spacing * np.sqrt(0.75))))
+    strips = []
+    for row in range(rows + 1):
+        x = np.linspace(0.0, 1.0, columns + 1)
+        if row % 2 and row != rows:
+            x = np.concatenate([[0.0], (np.arange(columns) + 0.5) / columns, [1.0]])
+        strips.append(np.stack([x * width, np.full_like(x, row / rows * length)], axis=1))
+    rest = np.concatenate(strips)
+    inside = (rest > 1e-9 * max(width, length)) & (rest < np.array([width, length]) * (1.0 - 1e-9))
+    rest += np.where(inside, rng.uniform(-0.3, 0.3, rest.shape) * min(width / columns, length / rows), 0.0)
+    starts = np.concatenate([[0], np.cumsum([len(strip) for strip in strips])])
+    triangles: list[tuple[int, int, int]] = []
+    for row in range(rows):
+        low, high = list(range(starts[row], starts[row + 1])), list(range(starts[row + 1], starts[row + 2]))
+        i = j = 0
+        while i < len(low) - 1 or j < len(high) - 1:
+            along_low = j == len(high) - 1 or (
+                i < len(low) - 1 and rest[low[i + 1], 0] + rest[low[i], 0] <= rest[high[j + 1], 0] + rest[high[j], 0]
+            )
+            if along_low:
+                triangles.append((low[i], low[i + 1], high[j]))
+                i += 1
+            else:
+                triangles.append((low[i], high[j + 1], high[j]))
+                j += 1
+    flipped = _delaunay(rest, triangles)
+    return Mesh(rest - np.array([width, length]) / 2.0, np.array(flipped, dtype=np.int32))
+
+
+def _delaunay(rest: NDArray[np.float64], triangles: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+    """Flip edges whose opposite angles add up to more than pi, until there are none."""
+    cells = [list(t) for t in triangles]
+    sides: dict[tuple[int, int], int] = {}  # directed edge -> triangle on its left
+    for t, (a, b, c) in enumerate(cells):
+        for edge in ((a, b), (b, c), (c, a)):
+            sides[edge] = t
+
+    def cotangent(corner: int, i: int, j: int) -> float:
+        u, v = rest[i] - rest[corner], rest[j] - rest[corner]
+        return float(u @ v / abs(u[0] * v[1] - u[1] * v[0]))
+
+    def area(a: int, b: int, c: int) -> float:
+        u, v = rest[b] - rest[a], rest[c] - rest[a]
+        return float(u[0] * v[1] - u[1] * v[0])
+
+    todo = list(sides)
+    while todo:
+        a, b = todo.pop()
+        if (a, b) not in sides or (b, a) not in sides:
+            continue
+        left, right = sides[a, b], sides[b, a]
+        c = next(v for v in cells[left] if v not in (a, b))
+        d = next(v for v in cells[right] if v not in (a, b))
+        if cotangent(c, a, b) + cotangent(d, a, b) > -1e-9 or min(area(a, d, c), area(d, b, c)) <= 0.0:
+            continue
+        cells[left], cells[right] = [a, d, c], [d, b, c]
+        del sides[a, b], sides[b, a]
+        for t, (p, q, r) in ((left, (a, d, c)), (right, (d, b, c))):
+            for edge in ((p, q), (q, r), (r, p)):
+                sides[edge] = t
+        todo.extend([(a, d), (d, b), (b, c), (c, a)])
+    return [(t[0], t[1], t[2]) for t in cells]
+
+
+def _check(**sizes: float) -> None:
+    for name, value in sizes.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name}: must be finite and > 0, got {value}")
