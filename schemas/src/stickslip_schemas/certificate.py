@@ -42,7 +42,7 @@ class ProtocolReport(Document):
     protocol: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")
     x: str
     y: str
-    tolerance: float = Field(gt=0, description="largest |relative error| that passes")
+    tolerance: float = Field(ge=0, description="largest |relative error| that passes")
     error: float | None = Field(ge=0, description="largest |relative error|; null is infinite")
     passed: bool
     settings: dict[str, Any]

@@ -5,7 +5,6 @@ It lives with the workers because it is their build that is certified, digest an
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -13,8 +12,9 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
+import stickslip_sim_core
 from stickslip_schemas.certificate import Certificate, ProtocolReport
-from stickslip_schemas.keys import canonical_json
+from stickslip_schemas.keys import canonical_json, content_key, sha256
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
@@ -88,7 +88,7 @@ def _broken_off(name: str, error: Exception) -> ProtocolReport:
         protocol=name,
         x="",
         y="",
-        tolerance=sys.float_info.min,
+        tolerance=0.0,
         error=None,
         passed=False,
         settings={},
@@ -110,7 +110,16 @@ def _environment() -> dict[str, str]:
         "sim_core": build.version,
         "compiler": build.compiler,
         "isa": build.isa,
+        "protocol_sources": _protocol_sources(),
     }
+
+
+def _protocol_sources() -> str:
+    """Return the digest of what measures and of what is measured against; neither is part of the core's build."""
+    package = Path(stickslip_sim_core.__file__).parent
+    names = ("master_curves.py", "plate_buckling.py", "boundary_value.py")
+    sources = [package / name for name in names] + sorted((package / "protocols").glob("*.py"))
+    return content_key("protocols", {path.name: sha256(path.read_bytes()) for path in sources})
 
 
 def _processor() -> str:
