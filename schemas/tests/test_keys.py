@@ -151,5 +151,5 @@ PINNED: dict[str, object] = {
     "color_seed": 1423131992,
     "spec": "f9b8c3cfcafcc5fac6634f45c6f4652371cc8cd0843a906cd6364e98eabc7b32",
     "cloth_simulation": "9fbc21cd005d23922f0a1d06e37add03dad9db04cce9e09bac72b323da410f45",
-    "cloth_render": "11c4781a2c74b1bec3ef0c794a4abb63b48563a4f3b458c9946c42dbef2d97ab",
+    "cloth_render": "2fc27dec49b4b9325cf86a4268d9d27c0b30951500b4687875468f4b4a400565",
 }

@@ -72,7 +72,7 @@ def test_the_cloth_is_where_the_camera_projects_it(
 ) -> None:
     """Pixels that have a hue, of brown herringbone, are those of its projected triangles: nothing else has one."""
     sheet = make_sheet(17)
-    lamp = Light(azimuth=-20.0, elevation=60.0, power=1.0, floor=0.02, roughness=0.45)
+    lamp = Light(azimuth=-20.0, elevation=60.0, power=1.2, floor=0.02, roughness=0.45)
     with ClothRenderer(sheet.triangles, sheet.rest, quality=Sampling(samples=16)) as renderer:
         (frame,) = renderer.render(sheet.track[2:3], cameras[view], texture=Texture.herringbone, light=lamp)
     pixels, _ = cameras[view].project(sheet.track[2])
@@ -80,8 +80,8 @@ def test_the_cloth_is_where_the_camera_projects_it(
     for triangle in sheet.triangles:
         ImageDraw.Draw(image).polygon([tuple(corner) for corner in pixels[triangle]], fill=1)
     outline = np.asarray(image)
-    colored = frame.max(axis=2).astype(int) - frame.min(axis=2) > 14
-    assert (colored & outline).sum() / outline.sum() > 0.75  # the rest is in deep shadow
+    colored = frame.max(axis=2).astype(int) - frame.min(axis=2) > 8
+    assert (colored & outline).sum() / outline.sum() > 0.85  # the rest is in shadow
     assert (colored & ~outline).sum() < 0.12 * outline.sum()  # the edge, and the mirror image in the floor
 
 
