@@ -1,8 +1,11 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from stickslip_training.cli import app
+from stickslip_training.local_global_training import load_local_global
+from stickslip_training.train_curvature import CurvatureTraining, estimate_strains, read_test_rods
 from typer.testing import CliRunner
 
 runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
@@ -44,7 +47,24 @@ def test_curvature_trains_and_writes(rods, tmp_path):
     assert len(json.loads((out / "report.json").read_text())["history"]) == 2
 
 
-@pytest.mark.parametrize("command", [["info"], ["curvature", "--out", "out"]])
+def test_local_global_trains_and_writes(rods, tmp_path):
+    out, measured = tmp_path / "out", tmp_path / "reconstructed.npz"
+    true = np.zeros((4, 150, 3))
+    np.savez(measured, true=true, reconstructed=true + 1e-3, verdict=np.full(4, "good"))
+    options = ["--steps", "3", "--noise", "0.001", "0.01", "--judged-at", "0.02", "--reconstruction", str(measured)]
+    result = runner.invoke(app, ["local-global", str(rods.root), "--out", str(out), *options])
+    assert result.exit_code == 0, result.output
+    for line in ("step 3: loss", "network", "quintic spline", "at 2.00% noise", "Note: There are"):
+        assert line in result.output
+    report = json.loads((out / "report.json").read_text())
+    assert report["settings"]["noise"] == [0.001, 0.01]
+    assert report["methods"][0]["method"] == "network"
+    test, noisy = read_test_rods(CurvatureTraining(dataset=str(rods.root), out=out, epochs=1, noise=0.02))
+    strains = estimate_strains(load_local_global(out / "local-global.pt"), noisy)
+    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
+
+
+@pytest.mark.parametrize("command", [["info"], ["curvature", "--out", "out"], ["local-global", "--out", "out"]])
 def test_a_mistake_is_one_line_and_status_1(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = runner.invoke(app, [command[0], "nowhere", *command[1:]])

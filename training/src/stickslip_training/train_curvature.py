@@ -190,14 +190,14 @@ def train_curvature(
     counts. `on_epoch` hears of every epoch.
     """
     with DatasetReader(config.dataset) as reader:
-        rods, notes = _load(reader, config)
+        rods, notes = load_splits(reader, config)
         manifest, digest = reader.manifest, reader.manifest_digest
     threads = torch.get_num_threads()
     torch.set_num_threads(config.threads)
     try:
         net, state = _train(config, rods, digest, resume, on_epoch)
         net.load_state_dict(state.best)
-        methods, test_loss = _evaluate(config, net, rods["test"])
+        methods, test_loss = evaluate(config, net, rods["test"])
     finally:
         torch.set_num_threads(threads)
     report = TrainingReport(
@@ -247,9 +247,9 @@ def load_model(path: str | Path) -> CurvatureNet:
     return net.eval()
 
 
-def estimate_strains(net: CurvatureNet, centerline: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def estimate_strains(net: torch.nn.Module, centerline: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Return the strains (twist, bend1, bend2) times L of centrelines over L, both (rods, 150, 3)."""
-    device = net.output_mean.device
+    device = next(net.parameters()).device
     with torch.inference_mode():
         parts = [
             net(torch.from_numpy(centerline[start : start + _CHUNK]).to(device)).cpu().numpy()
@@ -269,7 +269,7 @@ def read_rods(reader: DatasetReader, slots: npt.NDArray[np.int64]) -> Rods:
 def read_test_rods(config: CurvatureTraining) -> tuple[Rods, npt.NDArray[np.float32]]:
     """Return the rods that a run with `config` is evaluated on, and their centrelines as all methods see them."""
     with DatasetReader(config.dataset) as reader:
-        rods = _load(reader, config, only="test")[0]["test"]
+        rods = load_splits(reader, config, only="test")[0]["test"]
     return rods, _noisy_test(config, rods)
 
 
@@ -277,7 +277,7 @@ def _noisy_test(config: CurvatureTraining, rods: Rods) -> npt.NDArray[np.float32
     return with_white_noise(rods.centerline, config.noise, (config.seed, _TEST))
 
 
-def _load(
+def load_splits(
     reader: DatasetReader, config: CurvatureTraining, only: Split | None = None
 ) -> tuple[dict[str, Rods], list[str]]:
     """Read the three splits; where one is empty, take what there is and say so."""
@@ -422,7 +422,7 @@ def _end_epoch(
 # --- evaluation -----------------------------------------------------------------------------------------------
 
 
-def _evaluate(config: CurvatureTraining, net: CurvatureNet, rods: Rods) -> tuple[tuple[MethodReport, ...], float]:
+def evaluate(config: CurvatureTraining, net: torch.nn.Module, rods: Rods) -> tuple[tuple[MethodReport, ...], float]:
     """Let every method see the same noisy centrelines; return how each did, and the network's loss."""
     noisy = _noisy_test(config, rods)
     truth = bending(rods.strains)
