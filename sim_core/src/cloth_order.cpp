@@ -7,7 +7,7 @@ namespace sim_core {
 namespace {
 
 // Pieces of fewer nodes are eliminated together.
-constexpr int piece_max = 24;
+constexpr int piece_max = 16;
 
 struct Dissector {
   const Graph& graph;

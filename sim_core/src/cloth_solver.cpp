@@ -20,13 +20,15 @@ using Eigen::Vector3d;
 
 // Contact stiffnesses over a node's own: of the complementarity function [Alart & Curnier 1991] and in the factor.
 constexpr double contact_share = 0.2;
-constexpr float factor_share = 4.0f;
+constexpr float factor_share = 100.0f;
 // Slip below this share of the friction force is as good as stuck for the factor.
 constexpr double turning_max = 1e3;
 // A matrix of bending is assembled again when its stiffening has changed by more.
 constexpr float stiffening_change = 0.03f;
 // Iterations after which a step is halved rather than pursued, and up to which steps may grow again.
-constexpr int patience = 12, easy = 5;
+constexpr int patience = 20, easy = 12;
+// GMRES may stop earlier by this factor while nodes still change between open, stick and slip.
+constexpr double coarse = 6.0;
 
 double cpu_seconds() {
   timespec now{};
@@ -125,14 +127,14 @@ struct ClothSolver::Impl {
   Factor factor{};
   bool factored = false;
   double factored_dt = 0.0;
-  int last_krylov = 0;
+  int last_krylov = 0, fresh = -1, excess = 0;  // iterations of the last solve, the first with this factor, beyond that
 
   // State and work, (nodes, 4).
   Buffer<double> x, v, start, gradient, residual, inertial, trial, unused;
   Buffer<float> rhs, correction, change, work, image;
   // Contact.
   std::vector<Body> bodies, bodies_before;
-  std::vector<int> mode, touched;
+  std::vector<int> mode, modes, touched;
   std::vector<Gap> gaps;
   std::vector<double> stiffness;
   std::vector<Vector3d> slip, friction;
@@ -553,16 +555,19 @@ struct ClothSolver::Impl {
     evaluate(x, true);
     for (int i = 0; i < free_nodes; ++i) stiffness[i] = contact_share * own_stiffness(i);
     Norms norms = contact_state(x, dt, damping, at_end, at_start);
+    bool changed = true;
+    modes = mode;
     double window[4];
     std::fill(window, window + 4, norms.squared);
     for (int iteration = 0; iteration < iterations; ++iteration) {
       if (norms.largest <= settings.tolerance) break;
       if (!std::isfinite(norms.squared)) break;
       ++report.newton;
-      if (!factored || last_krylov > settings.refactor_after) {
+      if (!factored || excess > settings.refactor_after || last_krylov >= settings.krylov_max) {
         factorize(x);
         ++report.factorizations;
         factored_dt = dt;
+        excess = fresh = -1;
       }
       {
         const Stopwatch watch(phases.krylov);
@@ -585,10 +590,12 @@ struct ClothSolver::Impl {
         double size = 0.0;
         for (float f : rhs) size += static_cast<double>(f) * f;
         size = std::sqrt(size);
-        const double tolerance = std::max(settings.krylov_tolerance, 0.3 * settings.tolerance / std::max(size, 1e-300));
+        const double tolerance = std::max((changed ? coarse : 1.0) * settings.krylov_tolerance, 0.3 * settings.tolerance / std::max(size, 1e-300));
         const KrylovResult solved = kernel.krylov(matrix, factor, contact, rhs.data(), change.data(), work.data(),
                                                   settings.krylov_max, std::min(tolerance, 0.5));
         last_krylov = solved.iterations;
+        if (fresh < 0) fresh = last_krylov, excess = 0;
+        excess += std::max(0, last_krylov - fresh);
         report.krylov += solved.iterations;
       }
       for (int i = 0; i < 4 * free_nodes; ++i) change[i] += correction[i];
@@ -604,6 +611,8 @@ struct ClothSolver::Impl {
         if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5) break;
         share *= 0.5;
       }
+      changed = mode != modes;
+      modes = mode;
       std::swap(x, trial);
       norms = next;
       window[iteration % 4] = norms.squared;

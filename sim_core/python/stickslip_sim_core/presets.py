@@ -22,11 +22,11 @@ class Preset:
     krylov_max: int = 40
     """Iterations of GMRES in one of those."""
 
-    krylov_tolerance: float = 0.02
+    krylov_tolerance: float = 0.03
     """Residual over right-hand side at which GMRES stops."""
 
-    refactor_after: int = 10
-    """GMRES iterations that a stale factor may cost before it is made anew."""
+    refactor_after: int = 15
+    """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
 
     halvings_max: int = 4
     """Times that a step which does not converge is halved."""
