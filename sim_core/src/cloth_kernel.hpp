@@ -618,12 +618,12 @@ inline void add_multiple(float* a, float factor, const float* b, long count) {
   for (long i = 0; i < count; ++i) a[i] += factor * b[i];
 }
 
-// GMRES [Saad & Schultz 1986], preconditioned from the right by the stale factor. `work`: (krylov_max + 3) vectors.
+// Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `work`: 2 krylov_max + 1 vectors.
 KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b,
                     float* x, float* work, int iterations, double tolerance) {
   const long count = 4L * matrix.nodes;
   float* basis = work;
-  float* z = work + (krylov_max + 1) * count;
+  float* images = work + (krylov_max + 1) * count;
   double h[krylov_max + 1][krylov_max], cosine[krylov_max], sine[krylov_max], g[krylov_max + 1];
   for (long i = 0; i < count; ++i) x[i] = 0.0f;
   for (long i = 0; i < count; ++i) basis[i] = b[i];
@@ -635,7 +635,7 @@ KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const Conta
   if (iterations > krylov_max) iterations = krylov_max;
   int k = 0;
   while (k < iterations) {
-    float* next = basis + (k + 1) * count;
+    float *next = basis + (k + 1) * count, *z = images + k * count;
     solve(factor, matrix.nodes, basis + k * count, z);
     admit(contact, matrix.nodes, z);
     apply_contact(matrix, contact, z, next);
@@ -670,9 +670,7 @@ KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const Conta
     for (int j = i + 1; j < k; ++j) y[i] -= h[i][j] * y[j];
     y[i] /= h[i][i];
   }
-  for (int j = 0; j < k; ++j) add_multiple(x, float(y[j]), basis + j * count, count);
-  solve(factor, matrix.nodes, x, x);
-  admit(contact, matrix.nodes, x);
+  for (int j = 0; j < k; ++j) add_multiple(x, float(y[j]), images + j * count, count);
   return {k, __builtin_fabs(g[k]) / size};
 }
 

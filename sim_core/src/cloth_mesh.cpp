@@ -75,6 +75,26 @@ SlopeFit fit_slope(const ClothMesh& mesh, const std::vector<std::vector<int>>& a
               ") must determine a quadratic; refine the mesh"));
 }
 
+// d/dn at an edge between the slopes of its two triangles, which hold at their centroids.
+SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Vector2d& normal) {
+  SlopeFit fit{{edge.a, edge.b, -1, -1}, VectorXd::Zero(4)};
+  const double areas = mesh.area[edge.triangle[0]] + mesh.area[edge.triangle[1]];
+  for (int side = 0; side < 2; ++side) {
+    const int t = edge.triangle[side], other = edge.triangle[1 - side];
+    const double share = mesh.area[other] / areas;  // heights over the edge are as the areas
+    fit.nodes[2 + side] = mesh.triangles(t, edge.corner[side]);
+    for (int c = 0; c < 3; ++c) {
+      const Vector2d along =
+          (mesh.rest.row(mesh.triangles(t, (c + 2) % 3)) - mesh.rest.row(mesh.triangles(t, (c + 1) % 3))).transpose();
+      const Vector2d gradient = -normal_of(along) * along.norm() / (2.0 * mesh.area[t]);
+      const int node = mesh.triangles(t, c);
+      const int place = node == edge.a ? 0 : node == edge.b ? 1 : 2 + side;
+      fit.weights[place] += share * normal.dot(gradient);
+    }
+  }
+  return fit;
+}
+
 }  // namespace
 
 ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
@@ -122,7 +142,8 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
   }
 }
 
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped) {
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped,
+                                      bool compact) {
   const int vertices = static_cast<int>(mesh.rest.rows()), count = static_cast<int>(mesh.triangles.rows());
   std::vector<std::vector<int>> around(count);
   std::map<std::pair<int, int>, int> edge_of;
@@ -147,7 +168,7 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rig
     const ClothMesh::Edge& edge = mesh.edges[e];
     if (edge.boundary()) continue;
     const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
-    slopes[e] = fit_slope(mesh, around, edge, normal_of(along));
+    slopes[e] = compact ? mean_slope(mesh, edge, normal_of(along)) : fit_slope(mesh, around, edge, normal_of(along));
   }
   std::vector<Stencil> stencils(count);
   for (int t = 0; t < count; ++t) {

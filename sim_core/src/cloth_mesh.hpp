@@ -41,6 +41,8 @@ struct Stencil {
 // Rotation-free Morley element: H = sum over edges e of phi_e |e|/A n_e n_e^T, phi_e = d_e - n_e . grad x_T, with the
 // slope d_e across the middle of the edge taken from a quadratic fitted to the nodes around [Morley 1968; the fit after
 // Grinspun et al. 2006]. At a free edge phi_e minimises the energy; at a clamped one d_e is given.
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped);
+// `compact`: the slope is that of the two triangles alone, an approximation that couples fewer nodes.
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped,
+                                      bool compact = false);
 
 }  // namespace sim_core

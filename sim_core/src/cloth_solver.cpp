@@ -113,14 +113,18 @@ struct ClothSolver::Impl {
   Buffer<int> membrane_nodes, membrane_slots;
   Buffer<double> membrane_shape, membrane_area, membrane_stiffness;
   MembraneData membrane{};
-  std::vector<int> bending_begin, bending_nodes, bending_slot_begin, bending_slots;
-  Buffer<double> bending_weights;
-  std::vector<double> bending_area, bending_spacing2;
-  BendingData bending{};
+  struct Bending {
+    std::vector<int> begin, nodes, slot_begin, slots;
+    Buffer<double> weights;
+    std::vector<double> area, spacing2;
+    BendingData view{};
+  };
+  Bending bending, near_bending;  // the second is compact: of the factor
   double rigidity_size;
 
-  std::vector<int> scalar_begin, scalar_node, block_begin, block_node, scalar_diagonal, block_diagonal;
-  Buffer<float> scalars, blocks, definite_blocks, diagonal, added;
+  std::vector<int> near_begin, near_node, scalar_begin, scalar_node, block_begin, block_node, scalar_diagonal,
+      block_diagonal;
+  Buffer<float> scalars, near_scalars, blocks, definite_blocks, diagonal, added;
   Buffer<float> stiffening, assembled_stiffening;
   ClothMatrix matrix{};
   std::unique_ptr<FactorStorage> factor_storage;
@@ -153,7 +157,8 @@ struct ClothSolver::Impl {
     vertices = static_cast<int>(rest.rows());
     nodes = vertices + slopes;
     const std::vector<Stencil> stencils = bending_stencils(mesh, properties.rigidity, clamped);
-    number(mesh, stencils, held_in);
+    const std::vector<Stencil> near = bending_stencils(mesh, properties.rigidity, clamped, true);
+    number(mesh, stencils, near, held_in);
     mass_of_vertex = Eigen::VectorXd::Zero(vertices);
     for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
       for (int c = 0; c < 3; ++c) mass_of_vertex[triangles(t, c)] += properties.density * mesh.area[t] / 3.0;
@@ -161,13 +166,17 @@ struct ClothSolver::Impl {
     mass.assign(nodes, 0.0);
     for (int i = 0; i < vertices; ++i) mass[node_of[i]] = mass_of_vertex[i];
     build_membrane(mesh);
-    build_bending(mesh, stencils, properties.rigidity);
+    build_bending(mesh, stencils, properties.rigidity, scalar_begin, scalar_node, bending);
+    build_bending(mesh, near, properties.rigidity, near_begin, near_node, near_bending);
+    stiffening.assign(2 * triangles.rows(), 0.0f);
+    assembled_stiffening.assign(2 * triangles.rows(), -1.0f);
+    rigidity_size = properties.rigidity.cwiseAbs().maxCoeff();
     for (Buffer<double>* buffer : {&x, &v, &start, &gradient, &residual, &inertial, &trial, &unused})
       buffer->assign(4 * nodes, 0.0);
     for (Buffer<float>* buffer : {&rhs, &correction, &change, &image, &normal, &direction}) {
       buffer->assign(4 * free_nodes + 64, 0.0f);
     }
-    work.assign((krylov_max + 3) * 4L * free_nodes + 64, 0.0f);
+    work.assign((2 * krylov_max + 1) * 4L * free_nodes + 64, 0.0f);
     mu.assign(free_nodes, 0.0f);
     turning.assign(free_nodes, 0.0f);
     mode.assign(free_nodes, contact_open);
@@ -181,7 +190,8 @@ struct ClothSolver::Impl {
   }
 
   // Nodes: free vertices in the order of elimination, held vertices, slopes.
-  void number(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<std::int32_t>& held_in) {
+  void number(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& near_stencils,
+              const std::vector<std::int32_t>& held_in) {
     std::vector<char> is_held(vertices, 0);
     for (std::int32_t h : held_in) {
       if (h < 0 || h >= vertices) {
@@ -200,22 +210,24 @@ struct ClothSolver::Impl {
     }
     free_nodes = static_cast<int>(free_vertices.size());
     if (free_nodes == 0) throw std::invalid_argument("held: must leave a vertex free");
-    std::vector<std::set<int>> sets(free_nodes);
-    for (const Stencil& stencil : stencils) {
-      for (int a : stencil.nodes) {
-        if (a >= vertices || local[a] < 0) continue;
-        for (int b : stencil.nodes) {
-          if (b < vertices && local[b] >= 0) sets[local[a]].insert(local[b]);
+    const auto coupled = [&](const std::vector<Stencil>& by) {
+      std::vector<std::set<int>> sets(free_nodes);
+      for (const Stencil& stencil : by) {
+        for (int a : stencil.nodes) {
+          if (a >= vertices || local[a] < 0) continue;
+          for (int b : stencil.nodes) {
+            if (b < vertices && local[b] >= 0) sets[local[a]].insert(local[b]);
+          }
         }
       }
-    }
-    Graph graph(free_nodes);
+      Graph graph(free_nodes);
+      for (int i = 0; i < free_nodes; ++i) graph[i].assign(sets[i].begin(), sets[i].end());
+      return graph;
+    };
+    const Graph graph = coupled(stencils), near_graph = coupled(near_stencils);
     Points2 points(free_nodes, 2);
-    for (int i = 0; i < free_nodes; ++i) {
-      graph[i].assign(sets[i].begin(), sets[i].end());
-      points.row(i) = mesh.rest.row(free_vertices[i]);
-    }
-    const Dissection dissection = nested_dissection(graph, points);
+    for (int i = 0; i < free_nodes; ++i) points.row(i) = mesh.rest.row(free_vertices[i]);
+    const Dissection dissection = nested_dissection(near_graph, points);
     node_of.assign(nodes, -1);
     vertex_of.assign(nodes, -1);
     std::vector<int> place(free_nodes);
@@ -231,16 +243,24 @@ struct ClothSolver::Impl {
     for (int i = vertices; i < nodes; ++i) node_of[i] = next++;
     for (int i = 0; i < nodes; ++i) vertex_of[node_of[i]] = i;
 
-    Graph ordered(free_nodes);
-    for (int i = 0; i < free_nodes; ++i) {
-      for (int j : graph[dissection.order[i]]) ordered[i].push_back(place[j]);
-      std::sort(ordered[i].begin(), ordered[i].end());
-    }
-    scalar_begin.assign(1, 0);
-    for (int i = 0; i < free_nodes; ++i) {
-      scalar_node.insert(scalar_node.end(), ordered[i].begin(), ordered[i].end());
-      scalar_begin.push_back(static_cast<int>(scalar_node.size()));
-    }
+    const auto renumbered = [&](const Graph& from) {
+      Graph ordered(free_nodes);
+      for (int i = 0; i < free_nodes; ++i) {
+        for (int j : from[dissection.order[i]]) ordered[i].push_back(place[j]);
+        std::sort(ordered[i].begin(), ordered[i].end());
+      }
+      return ordered;
+    };
+    const auto compress = [&](const Graph& ordered, std::vector<int>& begin, std::vector<int>& node) {
+      begin.assign(1, 0);
+      for (int i = 0; i < free_nodes; ++i) {
+        node.insert(node.end(), ordered[i].begin(), ordered[i].end());
+        begin.push_back(static_cast<int>(node.size()));
+      }
+    };
+    const Graph ordered = renumbered(near_graph);
+    compress(renumbered(graph), scalar_begin, scalar_node);
+    compress(ordered, near_begin, near_node);
     std::vector<std::set<int>> near(free_nodes);
     for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
       for (int a = 0; a < 3; ++a) {
@@ -260,13 +280,14 @@ struct ClothSolver::Impl {
       block_diagonal.push_back(slot(block_begin, block_node, i, i));
     }
     scalars.assign(scalar_node.size(), 0.0f);
+    near_scalars.assign(near_node.size(), 0.0f);
     blocks.assign(12 * block_node.size(), 0.0f);
     definite_blocks = blocks;
     diagonal.assign(free_nodes, 0.0f);
     matrix = {free_nodes,         scalar_begin.data(), scalar_node.data(), scalars.data(),
               block_begin.data(), block_node.data(),   blocks.data(),      diagonal.data()};
     factor_storage =
-        std::make_unique<FactorStorage>(ordered, dissection, scalar_begin, scalar_node, block_begin, block_node);
+        std::make_unique<FactorStorage>(ordered, dissection, near_begin, near_node, block_begin, block_node);
     factor = factor_storage->view();
   }
 
@@ -317,40 +338,38 @@ struct ClothSolver::Impl {
                 membrane_slots.data()};
   }
 
-  void build_bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const Rigidity& d) {
-    bending_begin.assign(1, 0);
+  void build_bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const Rigidity& d,
+                     const std::vector<int>& begin, const std::vector<int>& node, Bending& out) {
+    out.begin.assign(1, 0);
     const int count = static_cast<int>(stencils.size());
     for (int t = 0; t < count; ++t) {
       const Stencil& stencil = stencils[t];
       for (std::size_t i = 0; i < stencil.nodes.size(); ++i) {
-        bending_nodes.push_back(node_of[stencil.nodes[i]]);
-        for (int c = 0; c < 3; ++c) bending_weights.push_back(stencil.weights(i, c));
-        bending_weights.push_back(0.0);
+        out.nodes.push_back(node_of[stencil.nodes[i]]);
+        for (int c = 0; c < 3; ++c) out.weights.push_back(stencil.weights(i, c));
+        out.weights.push_back(0.0);
       }
-      bending_slot_begin.push_back(static_cast<int>(bending_slots.size() / 2));
+      out.slot_begin.push_back(static_cast<int>(out.slots.size() / 2));
       for (std::size_t i = 0; i < stencil.nodes.size(); ++i) {
         for (std::size_t j = 0; j <= i; ++j) {
           const int a = node_of[stencil.nodes[i]], b = node_of[stencil.nodes[j]];
-          bending_slots.push_back(slot(scalar_begin, scalar_node, a, b));
-          bending_slots.push_back(slot(scalar_begin, scalar_node, b, a));
+          out.slots.push_back(slot(begin, node, a, b));
+          out.slots.push_back(slot(begin, node, b, a));
         }
       }
-      bending_begin.push_back(static_cast<int>(bending_nodes.size()));
-      bending_area.push_back(mesh.area[t]);
-      bending_spacing2.push_back(2.0 * mesh.area[t]);
+      out.begin.push_back(static_cast<int>(out.nodes.size()));
+      out.area.push_back(mesh.area[t]);
+      out.spacing2.push_back(2.0 * mesh.area[t]);
     }
-    stiffening.assign(2 * count, 0.0f);
-    assembled_stiffening.assign(2 * count, -1.0f);
-    rigidity_size = d.cwiseAbs().maxCoeff();
-    bending = {count,
-               bending_begin.data(),
-               bending_nodes.data(),
-               bending_weights.data(),
-               bending_area.data(),
-               bending_spacing2.data(),
-               {d(0, 0), d(0, 1), d(0, 2), d(1, 1), d(1, 2), d(2, 2)},
-               bending_slot_begin.data(),
-               bending_slots.data()};
+    out.view = {count,
+                out.begin.data(),
+                out.nodes.data(),
+                out.weights.data(),
+                out.area.data(),
+                out.spacing2.data(),
+                {d(0, 0), d(0, 1), d(0, 2), d(1, 1), d(1, 2), d(2, 2)},
+                out.slot_begin.data(),
+                out.slots.data()};
   }
 
   // Stiffnesses of the table at the strain at hand; they stay for the whole step.
@@ -398,7 +417,7 @@ struct ClothSolver::Impl {
     if (with_matrix) std::fill(blocks.begin(), blocks.end(), 0.0f);
     membrane_energy =
         kernel.membrane(membrane, at.data(), gradient.data(), with_matrix ? blocks.data() : nullptr, false);
-    bending_energy = kernel.bending(bending, at.data(), gradient.data(), stiffening.data());
+    bending_energy = kernel.bending(bending.view, at.data(), gradient.data(), stiffening.data());
     if (with_matrix) {
       float change_max = 0.0f;
       for (std::size_t t = 0; t < stiffening.size(); t += 2) {
@@ -408,7 +427,7 @@ struct ClothSolver::Impl {
       }
       if (change_max > stiffening_change) {
         std::fill(scalars.begin(), scalars.end(), 0.0f);
-        kernel.bending_matrix(bending, stiffening.data(), scalars.data());
+        kernel.bending_matrix(bending.view, stiffening.data(), scalars.data());
         assembled_stiffening = stiffening;
       }
     }
@@ -446,6 +465,9 @@ struct ClothSolver::Impl {
     kernel.membrane(membrane, now.data(), unused.data(), definite_blocks.data(), true);
     ClothMatrix definite = matrix;
     definite.membrane = definite_blocks.data();
+    std::fill(near_scalars.begin(), near_scalars.end(), 0.0f);
+    kernel.bending_matrix(near_bending.view, stiffening.data(), near_scalars.data());
+    definite.bending = near_scalars.data();
     kernel.factor(factor, definite, {added.data()});
     factored = true;
   }
@@ -590,7 +612,8 @@ struct ClothSolver::Impl {
         double size = 0.0;
         for (float f : rhs) size += static_cast<double>(f) * f;
         size = std::sqrt(size);
-        const double tolerance = std::max((changed ? coarse : 1.0) * settings.krylov_tolerance, 0.3 * settings.tolerance / std::max(size, 1e-300));
+        const double tolerance = std::max((changed ? coarse : 1.0) * settings.krylov_tolerance,
+                                          0.3 * settings.tolerance / std::max(size, 1e-300));
         const KrylovResult solved = kernel.krylov(matrix, factor, contact, rhs.data(), change.data(), work.data(),
                                                   settings.krylov_max, std::min(tolerance, 0.5));
         last_krylov = solved.iterations;
