@@ -14,6 +14,7 @@ from stickslip_sim_core import master_curves
 from stickslip_sim_core.protocols.bend_twist import POISSON, lower_boundary, upper_boundary
 from stickslip_sim_core.protocols.result import ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import extrapolated
+from stickslip_sim_core.protocols.stick_slip import EXTENDED, SLIP, STICK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,5 +97,30 @@ def plot_bend_twist_phases(*, poisson: Sequence[float] = POISSON, points: int = 
     return figure
 
 
-PLOTS: Mapping[str, tuple[Callable[[ProtocolResult], "Figure"], ...]] = {}
+def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
+    """Draw what the strips of a Stick-Slip did at which friction and strain, over the master curve."""
+    from matplotlib.figure import Figure
+
+    strain_c, mu_c = master_curves.stick_slip_triple_point()
+    figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    strain = strain_c * np.linspace(0.0, 1.0, 60)[1:] ** 2
+    axes.plot(np.append(0.0, master_curves.stick_slip(strain)), np.append(0.0, strain), color="black")
+    axes.plot([mu_c, 0.55], [strain_c, strain_c], color="black", linestyle="--", linewidth=1)
+    axes.plot([mu_c, mu_c], [strain_c, 0.45], color="black", linestyle="--", linewidth=1)
+    axes.plot(mu_c, strain_c, "*", color="black", markersize=10, label="triple point")
+    mu, at, regime = (np.array(result.settings[f"phase_{name}"]) for name in ("mu", "strain", "regime"))
+    for value, name, colour in zip(
+        (STICK, SLIP, EXTENDED), ("stick", "slip", "extended contact"), COLOURS, strict=False
+    ):
+        axes.plot(mu[regime == value], at[regime == value], "o", color=colour, markersize=4, label=f"measured: {name}")
+    axes.text(mu_c + 0.005, 0.445, "mu_c", va="top")
+    axes.text(0.548, strain_c + 0.004, "eps_c", ha="right")
+    axes.set(xlabel="mu", ylabel="eps (strain)", xlim=(0.0, 0.55), ylim=(0.0, 0.45))
+    axes.set_title("Stick-Slip: master curve (line), measured (dots)")
+    axes.legend(fontsize="small", loc="upper left")
+    return figure
+
+
+PLOTS: Mapping[str, tuple[Callable[[ProtocolResult], "Figure"], ...]] = {"stick-slip": (plot, plot_stick_slip_phases)}
 """By protocol: its pictures, where they are others than `plot`."""
