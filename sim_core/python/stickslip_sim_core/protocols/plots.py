@@ -118,7 +118,7 @@ def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
     axes.text(0.548, strain_c + 0.004, "eps_c", ha="right")
     axes.set(xlabel="mu", ylabel="eps (strain)", xlim=(0.0, 0.55), ylim=(0.0, 0.45))
     axes.set_title("Stick-Slip: master curve (line), measured (dots)")
-    axes.legend(fontsize="small", loc="upper left")
+    figure.legend(fontsize="small", loc="outside lower center", ncols=4)
     return figure
 
 
