@@ -85,10 +85,27 @@ def run(
 
 def threshold(strip: Strip, poisson: float, preset: Preset) -> float:
     """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
-    weight = DENSITY * GRAVITY * LENGTH  # N/m
+    sheet, flat = loaded(strip, poisson, RIGIDITY, preset)
+    free = np.setdiff1d(np.arange(len(flat)), strip.held)
+    bending = out_of_plane(sheet, flat, free)
+    for step in range(STEPS):
+        sheet.step(preset.time_step * GROWTH**step, held=flat[strip.held])
+    stress = out_of_plane(sheet, sheet.positions, free) - bending
+    if not np.isfinite(stress).all():
+        return np.nan
+    # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of L^-1 (-stress) L^-T.
+    lower = np.linalg.cholesky(bending)
+    half = np.linalg.solve(lower, -stress)
+    turned = np.linalg.solve(lower, half.T)
+    largest = float(np.linalg.eigvalsh(0.5 * (turned + turned.T))[-1])
+    return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
+
+
+def loaded(strip: Strip, poisson: float, rigidity: float, preset: Preset) -> tuple[Cloth, Floats]:
+    """Return a flat strip at rest, to bear its weight along its width, and where its vertices are."""
     sheet = Cloth(
         strip.mesh,
-        isotropic(DENSITY, STRETCHING * weight, RIGIDITY, poisson),
+        isotropic(DENSITY, STRETCHING * DENSITY * GRAVITY * LENGTH, rigidity, poisson),
         preset,
         held=strip.held,
         clamped=strip.clamped,
@@ -97,17 +114,7 @@ def threshold(strip: Strip, poisson: float, preset: Preset) -> float:
     flat = np.stack([strip.along, strip.across, np.zeros_like(strip.along)], axis=1)
     sheet.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
     sheet.gravity[:] = [0.0, -GRAVITY, 0.0]
-    free = np.setdiff1d(np.arange(len(flat)), strip.held)
-    bending = out_of_plane(sheet, flat, free)
-    for step in range(STEPS):
-        sheet.step(preset.time_step * GROWTH**step, held=flat[strip.held])
-    stress = out_of_plane(sheet, sheet.positions, free) - bending
-    # bending - lambda stress is singular first at the largest 1/lambda of L^-1 (-stress) L^-T, bending = L L^T.
-    lower = np.linalg.cholesky(bending)
-    half = np.linalg.solve(lower, -stress)
-    turned = np.linalg.solve(lower, half.T)
-    largest = float(np.linalg.eigvalsh(0.5 * (turned + turned.T))[-1])
-    return float(weight * LENGTH**2 / RIGIDITY / largest) if largest > 0.0 else np.nan
+    return sheet, flat
 
 
 def out_of_plane(sheet: Cloth, at: Floats, free: NDArray[np.int64]) -> Floats:
