@@ -31,17 +31,27 @@ def figures(result: ProtocolResult) -> Iterator["Figure"]:
 
 
 def plot(result: ProtocolResult) -> "Figure":
-    """Draw the measured curves over their master curves, and the relative errors below."""
+    """Draw the measured curves over their master curves, and the relative errors below.
+
+    Curves that differ in their mesh only have a master curve, and a colour, in common.
+    """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import ScalarFormatter
+    from matplotlib.ticker import LogLocator, ScalarFormatter
 
     figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    for curve, colour in zip(result.curves, cycle(COLOURS), strict=False):
-        label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items())
-        above.plot(curve.x, curve.master, color=colour, label=f"master curve {label}".strip())
-        above.plot(curve.x, curve.measured, "o", color=colour, markerfacecolor="none", label="measured")
-        below.plot(curve.x, np.maximum(np.abs(curve.errors), 1e-16), "o", color=colour, markersize=3)
+    colours = cycle(COLOURS)
+    drawn: dict[str, str] = {}
+    errors = [abs(e) for curve in result.curves for e in curve.errors if 0.0 < abs(e) < np.inf]
+    floor = 0.3 * min([0.01 * result.tolerance, *errors])
+    for curve in result.curves:
+        label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items() if name != "mesh")
+        if first := label not in drawn:
+            drawn[label] = next(colours)
+            above.plot(curve.x, curve.master, color=drawn[label], label=f"master curve {label}".strip())
+        measured = "measured" if first else None
+        above.plot(curve.x, curve.measured, "o", color=drawn[label], markerfacecolor="none", label=measured)
+        below.plot(curve.x, np.maximum(np.abs(curve.errors), floor), "o", color=drawn[label], markersize=3)
     scale = "log" if min(result.curves[0].x) > 0.0 else "linear"
     above.set(xscale=scale, yscale=scale, ylabel=result.y_name, title=f"{result.protocol}: {_verdict(result)}")
     if scale == "linear":
@@ -51,8 +61,9 @@ def plot(result: ProtocolResult) -> "Figure":
     below.text(
         0.01, result.tolerance, "tolerance", transform=below.get_yaxis_transform(), va="bottom", fontsize="small"
     )
-    below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(1e-16, 50 * result.tolerance))
+    below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(0.3 * floor, 50 * result.tolerance))
     if scale == "log" and max(result.curves[0].x) < 100.0 * min(result.curves[0].x):
+        below.xaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
         below.xaxis.set_major_formatter(ScalarFormatter())
         below.xaxis.set_minor_formatter(ScalarFormatter())
     return figure
@@ -118,7 +129,7 @@ def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
     axes.text(0.548, strain_c + 0.004, "eps_c", ha="right")
     axes.set(xlabel="mu", ylabel="eps (strain)", xlim=(0.0, 0.55), ylim=(0.0, 0.45))
     axes.set_title("Stick-Slip: master curve (line), measured (dots)")
-    figure.legend(fontsize="small", loc="outside lower center", ncols=4)
+    figure.legend(fontsize="small", loc="outside lower center", ncols=2)
     return figure
 
 

@@ -164,9 +164,9 @@ def press(strip: Strip, mu: float, preset: Preset, strain_end: float) -> Press:
     strain_at, ratio, moved_at = np.array(history).T
     if not moved_at[-1] <= MOVED:
         stuck = np.flatnonzero(np.abs(np.diff(moved_at, prepend=0.0)) <= LET_GO)
-        first = int(stuck[-1]) if len(stuck) else 0
-        slip = float(strain_at[first])
-        strain_at, ratio = strain_at[:first], ratio[:first]
+        last = int(stuck[-1]) if len(stuck) else 0
+        slip = float(strain_at[last])
+        strain_at, ratio = strain_at[:last], ratio[:last]
     on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
         strain_at <= master_curves.stick_slip_triple_point()[0]
     )
