@@ -11,7 +11,9 @@ TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
 CORE_SOURCES = $(wildcard sim_core/src/*) sim_core/CMakeLists.txt sim_core/pyproject.toml
 # reconstruction.py calls render_rod_set.py with Blender's interpreter.
-BENCHMARKS = $(filter-out benchmarks/render_rod_set.py,$(wildcard benchmarks/*.py))
+# rod_families.py is imported, and the last two need what others write, or train for a quarter of an hour.
+BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py curvature_methods.py \
+  natural_from_pictures.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(wildcard sim_core/src/*.hpp sim_core/src/*.cpp)
 
 .PHONY: setup demo test check bench constraints clean

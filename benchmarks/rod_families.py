@@ -1,5 +1,6 @@
 """Random rods for the benchmarks: the thesis's family of three numbers, and rods that vary along their length."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,14 +50,27 @@ def family_rods(count: int, random: np.random.Generator) -> Rods:
 
 
 def varying_rods(count: int, random: np.random.Generator) -> Rods:
-    """Return rods whose natural curvature has three cosines per component on top of the thesis's (phi0, 0, phi1).
+    """Return rods whose natural curvature has three cosines per component on top of the thesis's (phi0, 0, phi1)."""
+    return _hung(count, random, lambda missing: cosines(random.normal(size=(missing, WAVES, 3))))
 
-    One in ten thousand hangs in no stable shape that the solver finds: another is drawn in its place.
-    """
+
+def bumpy_rods(count: int, random: np.random.Generator) -> Rods:
+    """Return rods whose natural curvature has a bump of each component somewhere on top of the thesis's."""
+
+    def bumps(missing: int) -> Floats:
+        place, width = random.uniform([0.1, 0.05], [0.9, 0.2], (missing, 3, 2)).transpose(2, 0, 1)[:, :, None]
+        height = 1.5 * DEVIATION * random.normal(size=(missing, 1, 3))
+        return np.asarray(height * np.exp(-0.5 * ((S[:, None] - place) / width) ** 2))
+
+    return _hung(count, random, bumps)
+
+
+def _hung(count: int, random: np.random.Generator, variation: Callable[[int], Floats]) -> Rods:
+    """Hang rods of the thesis's ranges plus a variation; for the one in 10,000 that does not hang, take another."""
     parts: list[Rods] = []
     while (missing := count - sum(map(len, parts))) > 0:
         gamma, phi0, phi1 = draw_parameters(missing, random)
-        natural = np.stack([phi0, 0 * phi0, phi1], axis=1)[:, None] + cosines(random.normal(size=(missing, WAVES, 3)))
+        natural = np.stack([phi0, 0 * phi0, phi1], axis=1)[:, None] + variation(missing)
         solution = solve_general_rods(natural, gamma)
         good = np.flatnonzero(solution.stable)
         parts.append(Rods(gamma, natural, solution.centerline, solution.curvature)[good])

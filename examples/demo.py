@@ -15,14 +15,16 @@ import numpy as np
 from PIL import Image
 from rich.console import Console
 from stickslip_services.client import Client
-from stickslip_training.datasets import RodDataset
+from stickslip_training.datasets import ClipDataset, RodDataset
 
 BIN = Path(sys.executable).parent
 RODS = Path(__file__).with_name("demo-rods.yaml")
+CLOTH = Path(__file__).with_name("demo-cloth.yaml")
 MORE_RODS = Path(__file__).with_name("sampled-rods.yaml")
 OUT = Path("demo-out")
 START_SECONDS = 60
 SHEET_COLUMNS = 4
+CLIP_FRAMES = 10
 
 console = Console()
 
@@ -39,14 +41,17 @@ def main() -> None:
         run("stickslip", "pull", rods, OUT / "dataset", "--url", url)
         run("stickslip", "verify", OUT / "dataset")
         look_at(OUT / "dataset")
+        cloth = submit(CLOTH, url)
+        run("stickslip", "pull", cloth, OUT / "cloth-dataset", "--url", url)
+        look_at_cloth(OUT / "cloth-dataset")
         console.rule("2,500 more rods, without pictures, to learn from")
         more_rods = submit(MORE_RODS, url)
         run("stickslip", "pull", more_rods, OUT / "training-dataset", "--url", url)
     run("stickslip-train", "curvature", OUT / "training-dataset", "--out", OUT / "training", "--minutes", "1")
     console.rule(f"done in {time.monotonic() - started:.0f} s")
-    console.print(f"contact sheet  {OUT / 'contact-sheet.png'}")
+    console.print(f"contact sheets {OUT / 'contact-sheet.png'}, {OUT / 'cloth-sheet.png'}")
     console.print(f"training       {OUT / 'training' / 'curvature.png'}")
-    console.print(f"datasets       {OUT / 'dataset'}, {OUT / 'training-dataset'}")
+    console.print(f"datasets       {OUT / 'dataset'}, {OUT / 'cloth-dataset'}, {OUT / 'training-dataset'}")
 
 
 def submit(spec: Path, url: str) -> str:
@@ -97,8 +102,27 @@ def look_at(directory: Path) -> None:
     console.print(f"{len(rods)} rods in batches of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }")
     rows += [np.zeros_like(rows[0])] * (-len(rows) % SHEET_COLUMNS)
     lines = [np.concatenate(rows[i : i + SHEET_COLUMNS], axis=1) for i in range(0, len(rows), SHEET_COLUMNS)]
-    image = Image.fromarray(np.concatenate(lines))
-    image.resize((image.width // 2, image.height // 2), Image.Resampling.LANCZOS).save(OUT / "contact-sheet.png")
+    save_half_size(np.concatenate(lines), OUT / "contact-sheet.png")
+
+
+def look_at_cloth(directory: Path) -> None:
+    """Draw a batch of clips with their meshes, and lay frames of them out on a sheet: one clip a row."""
+    console.rule("clips")
+    clips = ClipDataset(directory, mesh=True)
+    (batch,) = clips.loader(len(clips))
+    console.print(
+        f"{len(clips)} clips in one batch of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }"
+    )
+    video = batch["video"].numpy()
+    shown = np.linspace(0, video.shape[1] - 1, CLIP_FRAMES).round().astype(int)
+    rows = [np.concatenate(list(clip[shown]), axis=1) for clip in video]
+    save_half_size(np.concatenate(rows), OUT / "cloth-sheet.png")
+
+
+def save_half_size(picture: np.ndarray, path: Path) -> None:
+    """Save a picture (height, width, 3) at half its size."""
+    image = Image.fromarray(picture)
+    image.resize((image.width // 2, image.height // 2), Image.Resampling.LANCZOS).save(path)
 
 
 if __name__ == "__main__":

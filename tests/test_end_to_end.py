@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import tensorstore
 import xarray
-import yaml
 from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.chunks import CorruptChunkError
 from stickslip_schemas.keys import sha256
@@ -213,9 +212,3 @@ def test_nan_is_refused(service: Service) -> None:
     assert response.json()["errors"] == [
         {"pointer": "/axes/gamma/0", "rule": "Input should be a finite number", "value": "NaN"}
     ]
-
-
-def test_cloth_is_refused_by_name_until_there_is_a_core(service: Service) -> None:
-    spec = yaml.safe_load((Path(__file__).parents[1] / "examples" / "demo-cloth.yaml").read_text())
-    response = httpx.post(f"{service.url}/v1/jobs", json=spec)
-    assert (response.status_code, response.json()["code"]) == (422, "kind_not_available")

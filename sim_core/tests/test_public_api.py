@@ -8,21 +8,36 @@ import stickslip_sim_core
 
 def test_exported_names() -> None:
     assert set(stickslip_sim_core.__all__) == {
+        "Body",
         "BuildInfo",
+        "Cloth",
+        "DropAndDrag",
+        "Fabric",
         "NaturalCurvature",
         "NaturalFit",
         "OtherMinima",
+        "PRESETS",
         "ParameterFit",
+        "Preset",
         "RodSolution",
+        "box",
         "build_info",
+        "drop_and_drag",
+        "fabric",
+        "fabric_names",
         "fit_natural_curvature",
         "fit_parameters",
+        "isotropic",
         "natural_curvature",
         "other_minima",
+        "plane",
+        "preset_named",
         "reach",
         "self_contact_distance",
+        "self_intersections",
         "solve_general_rods",
         "solve_rods",
+        "sphere",
     }
 
 

@@ -170,7 +170,7 @@ def test_a_crash_of_blender_leaves_everything_as_it_was(
 def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> None:
     description = actor.describe()
     assert is_sha256(description["build"])
-    assert description["kinds"] == ["rod_hang"]
+    assert description["kinds"] == ["rod_hang", "cloth_drag"]
     assert set(description["versions"]) == {"bpy", "blender_build"}
     assert RenderActor(str(tmp_path / "elsewhere")).describe() == description
 

@@ -33,9 +33,10 @@ class Settings:
     """Resident memory at which a process gives way to a fresh one [bytes]."""
 
     exec_seconds: dict[Stage, float] = field(
-        default_factory=lambda: {Stage.simulate: 3600, Stage.render: 1800, Stage.pack: 600, Stage.publish: 3600}
+        default_factory=lambda: {Stage.simulate: 6 * 3600, Stage.render: 1800, Stage.pack: 600, Stage.publish: 3600}
     )
-    """Limit of one task, or batch of simulations, by stage; then its process is killed."""
+    """Limit of one task, or batch of simulations, by stage; then its process is killed. Cloth takes minutes, and hours
+    with the thesis's time steps."""
     start_seconds: float = 120
     """Limit for a process to be scheduled by Ray and to start; then the dispatcher ends with an error."""
     drop_seconds: float = 5

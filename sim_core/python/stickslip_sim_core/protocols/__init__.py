@@ -4,7 +4,15 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_sim_core.protocols import bend_twist, rod_cantilever, rod_lateral_buckling
+from stickslip_sim_core.protocols import (
+    bend_twist,
+    cantilever,
+    inclined_plane,
+    lateral_buckling,
+    rod_cantilever,
+    rod_lateral_buckling,
+    stick_slip,
+)
 from stickslip_sim_core.protocols.certification import CERTIFICATION, Certification
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 
@@ -13,6 +21,10 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
         "bend-twist": bend_twist.run,
         "rod-cantilever": rod_cantilever.run,
         "rod-lateral-buckling": rod_lateral_buckling.run,
+        "stick-slip": stick_slip.run,
+        "cantilever": cantilever.run,
+        "lateral-buckling": lateral_buckling.run,
+        "inclined-plane": inclined_plane.run,
     }
 )
 

@@ -1,9 +1,11 @@
 """Which protocols a preset has to pass before data are made with it, and the numbers that it stands for."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any
+
+from stickslip_sim_core.presets import PRESETS
 
 
 @dataclass(frozen=True)
@@ -25,9 +27,18 @@ _ROD_QUICK: Mapping[str, Mapping[str, Any]] = {
     "rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512},
 }
 
+_CLOTH = ("inclined-plane", "lateral-buckling", "stick-slip", "cantilever")
+_CLOTH_QUICK: Mapping[str, Mapping[str, Any]] = {
+    "inclined-plane": {"friction": (0.3,)},
+    "lateral-buckling": {"aspect": (0.2,), "poisson": (0.3,), "structured": 1, "unstructured": 1},
+    "stick-slip": {"friction": (0.1, 0.3), "structured": 1, "unstructured": 1, "phases": False},
+    "cantilever": {"gamma": (1.0, 100.0), "unstructured": 1},
+}
+
 CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
     {
         "rods": Certification(("rod-lateral-buckling", "rod-cantilever", "bend-twist"), quick=_ROD_QUICK),
+        **{name: Certification(_CLOTH, asdict(preset), _CLOTH_QUICK) for name, preset in PRESETS.items()},
     }
 )
 """By preset; "rods" stands for the rod solver, which has none."""

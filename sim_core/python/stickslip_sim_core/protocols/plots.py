@@ -14,6 +14,7 @@ from stickslip_sim_core import master_curves
 from stickslip_sim_core.protocols.bend_twist import POISSON, lower_boundary, upper_boundary
 from stickslip_sim_core.protocols.result import ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import extrapolated
+from stickslip_sim_core.protocols.stick_slip import EXTENDED, SLIP, STICK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,17 +31,27 @@ def figures(result: ProtocolResult) -> Iterator["Figure"]:
 
 
 def plot(result: ProtocolResult) -> "Figure":
-    """Draw the measured curves over their master curves, and the relative errors below."""
+    """Draw the measured curves over their master curves, and the relative errors below.
+
+    Curves that differ in their mesh only have a master curve, and a colour, in common.
+    """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import ScalarFormatter
+    from matplotlib.ticker import LogLocator, ScalarFormatter
 
     figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    for curve, colour in zip(result.curves, cycle(COLOURS), strict=False):
-        label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items())
-        above.plot(curve.x, curve.master, color=colour, label=f"master curve {label}".strip())
-        above.plot(curve.x, curve.measured, "o", color=colour, markerfacecolor="none", label="measured")
-        below.plot(curve.x, np.maximum(np.abs(curve.errors), 1e-16), "o", color=colour, markersize=3)
+    colours = cycle(COLOURS)
+    drawn: dict[str, str] = {}
+    errors = [abs(e) for curve in result.curves for e in curve.errors if 0.0 < abs(e) < np.inf]
+    floor = 0.3 * min([0.01 * result.tolerance, *errors])
+    for curve in result.curves:
+        label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items() if name != "mesh")
+        if first := label not in drawn:
+            drawn[label] = next(colours)
+            above.plot(curve.x, curve.master, color=drawn[label], label=f"master curve {label}".strip())
+        measured = "measured" if first else None
+        above.plot(curve.x, curve.measured, "o", color=drawn[label], markerfacecolor="none", label=measured)
+        below.plot(curve.x, np.maximum(np.abs(curve.errors), floor), "o", color=drawn[label], markersize=3)
     scale = "log" if min(result.curves[0].x) > 0.0 else "linear"
     above.set(xscale=scale, yscale=scale, ylabel=result.y_name, title=f"{result.protocol}: {_verdict(result)}")
     if scale == "linear":
@@ -50,8 +61,9 @@ def plot(result: ProtocolResult) -> "Figure":
     below.text(
         0.01, result.tolerance, "tolerance", transform=below.get_yaxis_transform(), va="bottom", fontsize="small"
     )
-    below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(1e-16, 50 * result.tolerance))
+    below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(0.3 * floor, 50 * result.tolerance))
     if scale == "log" and max(result.curves[0].x) < 100.0 * min(result.curves[0].x):
+        below.xaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
         below.xaxis.set_major_formatter(ScalarFormatter())
         below.xaxis.set_minor_formatter(ScalarFormatter())
     return figure
@@ -96,5 +108,30 @@ def plot_bend_twist_phases(*, poisson: Sequence[float] = POISSON, points: int = 
     return figure
 
 
-PLOTS: Mapping[str, tuple[Callable[[ProtocolResult], "Figure"], ...]] = {}
+def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
+    """Draw what the strips of a Stick-Slip did at which friction and strain, over the master curve."""
+    from matplotlib.figure import Figure
+
+    strain_c, mu_c = master_curves.stick_slip_triple_point()
+    figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    strain = strain_c * np.linspace(0.0, 1.0, 60)[1:] ** 2
+    axes.plot(np.append(0.0, master_curves.stick_slip(strain)), np.append(0.0, strain), color="black")
+    axes.plot([mu_c, 0.55], [strain_c, strain_c], color="black", linestyle="--", linewidth=1)
+    axes.plot([mu_c, mu_c], [strain_c, 0.45], color="black", linestyle="--", linewidth=1)
+    axes.plot(mu_c, strain_c, "*", color="black", markersize=10, label="triple point")
+    mu, at, regime = (np.array(result.settings[f"phase_{name}"]) for name in ("mu", "strain", "regime"))
+    for value, name, colour in zip(
+        (STICK, SLIP, EXTENDED), ("stick", "slip", "extended contact"), COLOURS, strict=False
+    ):
+        axes.plot(mu[regime == value], at[regime == value], "o", color=colour, markersize=4, label=f"measured: {name}")
+    axes.text(mu_c + 0.005, 0.445, "mu_c", va="top")
+    axes.text(0.548, strain_c + 0.004, "eps_c", ha="right")
+    axes.set(xlabel="mu", ylabel="eps (strain)", xlim=(0.0, 0.55), ylim=(0.0, 0.45))
+    axes.set_title("Stick-Slip: master curve (line), measured (dots)")
+    figure.legend(fontsize="small", loc="outside lower center", ncols=2)
+    return figure
+
+
+PLOTS: Mapping[str, tuple[Callable[[ProtocolResult], "Figure"], ...]] = {"stick-slip": (plot, plot_stick_slip_phases)}
 """By protocol: its pictures, where they are others than `plot`."""

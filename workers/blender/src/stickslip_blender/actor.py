@@ -63,7 +63,7 @@ class RenderActor:
 
     def describe(self) -> dict[str, Any]:
         """Say which renderer this is; the same for every process of one build."""
-        return {"build": build_digest(), "kinds": ["rod_hang"], "versions": blender_version()}
+        return {"build": build_digest(), "kinds": ["rod_hang", "cloth_drag"], "versions": blender_version()}
 
     def render(self, task: dict[str, Any]) -> dict[str, Any]:
         """Render the sample of a `RenderTask`; return a `TaskResult`."""

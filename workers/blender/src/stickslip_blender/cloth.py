@@ -33,7 +33,7 @@ _LAMP_DISTANCE = 1.2  # [m]
 _LAMP_SIZE = 0.5  # [m], diameter
 _LAMP_POWER = 24.0  # [W]
 _AMBIENT = 0.012  # radiance of the black curtains around the stage; cameras see none of it
-_HOLDER = (0.006, 0.01, 0.01)  # [m]
+_HOLDER = (0.004, 0.01, 0.01)  # [m], in the plane of the cloth as in the simulation
 _ROD = (0.003, 0.003, 0.5)  # [m]
 
 
@@ -85,6 +85,8 @@ class ClothRenderer:
         low, high = flat.min(axis=0), flat.max(axis=0)
         corners = np.array([(low[0], high[1]), (high[0], high[1])])
         self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
+        inward = np.sign((low + high) / 2 - corners) * _HOLDER[1] / 2
+        self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
         self._levels, faces, uv = _refined(np.asarray(triangles), flat)
         self._scene = new_scene()
         set_sampling(self._scene, quality if isinstance(quality, Sampling) else CLOTH_SAMPLING[quality])
@@ -130,8 +132,8 @@ class ClothRenderer:
 
     def _frames(self, track: npt.NDArray[np.float64]) -> Iterator[npt.NDArray[np.uint8]]:
         for vertices in track:
-            for holder, corner in zip(self._holders, vertices[self._held], strict=True):
-                holder.location = corner
+            for holder, middle in zip(self._holders, vertices[self._held] + self._grips, strict=True):
+                holder.location = middle
             fine = vertices
             for level in self._levels:
                 fine = level(fine)
@@ -253,7 +255,7 @@ def _add_fabric(mesh: Any) -> Any:
 
 
 def _add_holder(scene: Any) -> Any:
-    """Add a clip of one centimetre and the rod it hangs on; their place is the corner that they hold."""
+    """Add a clip of one centimetre and the rod it hangs on; it holds a square at a corner of the cloth."""
     bpy = import_bpy()
     metal = bpy.data.materials.get("metal") or _new_material(
         "metal", Base_Color=(0.05, 0.05, 0.052, 1.0), Roughness=0.45, Metallic=0.0

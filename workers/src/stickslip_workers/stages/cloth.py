@@ -7,7 +7,7 @@ from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import ClothSimulation, RecordRef, SimulateOutput, TaskResult
 
-from stickslip_workers.stages.records import encode_records
+from stickslip_workers.stages.records import Array, encode_records
 
 RECORD_ARRAYS = ("mesh", "rest", "triangles", "self_intersections", "contact_force", "holder_force")
 """What a record holds, under the names of the dataset."""
@@ -36,7 +36,7 @@ def _simulate(cloth: ClothSimulation, store: Store) -> TaskResult:
             message=f"{run.reason} at material = {cloth.material}, mu = {cloth.mu:g} with preset {cloth.preset}, "
             f"{cloth.mesh} vertices a side, seed {cloth.seed}",
         )
-    record = {
+    record: dict[str, Array] = {
         "mesh": np.asarray(run.positions, dtype=np.float32),
         "rest": np.asarray(run.rest, dtype=np.float32),
         "triangles": np.asarray(run.triangles, dtype=np.int32),

@@ -1,0 +1,131 @@
+"""Lateral buckling: the weight at which a strip clamped with its width vertical turns sideways [Romero et al. 2021].
+
+The strip takes up its weight in its plane, by steps of the solver. What its stress then adds to the stiffness against
+moving out of the plane goes with the weight, what bending adds with the rigidity: the flat state loses stability where
+the smallest eigenvalue of their sum is zero, which is an eigenvalue problem for the weight. Both matrices are central
+differences of the solver's own gradient.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stickslip_sim_core import build_info, master_curves
+from stickslip_sim_core.cloth import GRAVITY, Cloth
+from stickslip_sim_core.fabrics import isotropic
+from stickslip_sim_core.presets import Preset, preset_named
+from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+
+Floats = NDArray[np.float64]
+
+ASPECT = (0.1, 0.2, 0.5)
+POISSON = (0.0, 0.3)
+
+DENSITY, RIGIDITY = 0.2, 1e-5  # kg/m^2, N m
+STRETCHING = 1e5  # over rho_A g L: the strip sags by 1e-3 L at most
+FORCE_SHARE = 0.01  # of a node's weight: the force that residuals are measured in
+STEPS, GROWTH = 30, 1.5  # of the time step, until inertia is nothing beside stiffness
+DIFFERENCE = 1e-7  # of the length
+
+
+def run(
+    *,
+    preset: str | Preset = "certified",
+    aspect: Sequence[float] = ASPECT,
+    poisson: Sequence[float] = POISSON,
+    cells: int = 50,
+    structured: int = 2,
+    unstructured: int = 2,
+    tolerance: float = 0.03,
+) -> ProtocolResult:
+    """Measure the weight Gamma* at which flat strips lose stability; compare it with `master_curves.lateral_buckling`.
+
+    Args:
+        preset: Solver settings, or their name. Its time step is the first one; the others grow.
+        aspect: Widths over length.
+        poisson: Poisson's ratios.
+        cells: Of a mesh along the strip.
+        structured: Number of structured meshes, 0 ... 4.
+        unstructured: Number of unstructured ones.
+        tolerance: Largest |relative error| that passes.
+    """
+    settings = preset_named(preset) if isinstance(preset, str) else preset
+    measured: dict[tuple[float, int], list[float]] = {}
+    names: list[str] = []
+    for ratio in aspect:
+        for number, strip in enumerate(strips(ratio * LENGTH, cells, structured, unstructured)):
+            for nu in poisson:
+                measured.setdefault((nu, number), []).append(threshold(strip, nu, settings))
+            if number == len(names):
+                names.append(f"{number} {strip.name}")
+    curves = []
+    for (nu, number), weights in measured.items():
+        master = tuple(float(g) for g in master_curves.lateral_buckling(aspect, nu))
+        parameters = {"poisson": float(nu), "mesh": float(number)}
+        curves.append(Curve(parameters, tuple(float(a) for a in aspect), tuple(weights), master))
+    return ProtocolResult(
+        "lateral-buckling",
+        "w/L",
+        "Gamma* = rho_A g L^3 / D",
+        tuple(curves),
+        tolerance,
+        {
+            "preset": settings.name,
+            "first_time_step": settings.time_step,
+            "cells": cells,
+            "meshes": ", ".join(names),
+            "stretching_over_weight": STRETCHING,
+            "force_scale_over_node_weight": FORCE_SHARE,
+        },
+        build_info().build_hash,
+    )
+
+
+def threshold(strip: Strip, poisson: float, preset: Preset) -> float:
+    """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
+    sheet, flat = loaded(strip, poisson, RIGIDITY, preset)
+    free = np.setdiff1d(np.arange(len(flat)), strip.held)
+    bending = out_of_plane(sheet, flat, free)
+    for step in range(STEPS):
+        sheet.step(preset.time_step * GROWTH**step, held=flat[strip.held])
+    stress = out_of_plane(sheet, sheet.positions, free) - bending
+    if not np.isfinite(stress).all():
+        return np.nan
+    # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of L^-1 (-stress) L^-T.
+    lower = np.linalg.cholesky(bending)
+    half = np.linalg.solve(lower, -stress)
+    turned = np.linalg.solve(lower, half.T)
+    largest = float(np.linalg.eigvalsh(0.5 * (turned + turned.T))[-1])
+    return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
+
+
+def loaded(strip: Strip, poisson: float, rigidity: float, preset: Preset) -> tuple[Cloth, Floats]:
+    """Return a flat strip at rest, to bear its weight along its width, and where its vertices are."""
+    sheet = Cloth(
+        strip.mesh,
+        isotropic(DENSITY, STRETCHING * DENSITY * GRAVITY * LENGTH, rigidity, poisson),
+        preset,
+        held=strip.held,
+        clamped=strip.clamped,
+        force_scale=FORCE_SHARE * DENSITY * GRAVITY * strip.mesh.spacing**2,
+    )
+    flat = np.stack([strip.along, strip.across, np.zeros_like(strip.along)], axis=1)
+    sheet.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
+    sheet.gravity[:] = [0.0, -GRAVITY, 0.0]
+    return sheet, flat
+
+
+def out_of_plane(sheet: Cloth, at: Floats, free: NDArray[np.int64]) -> Floats:
+    """Return the stiffness (F, F) of the free vertices of a flat sheet against moving out of its plane."""
+    columns = np.empty((len(free), len(free)))
+    moved = at.copy()
+    for column, vertex in enumerate(free):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved[vertex, 2] = at[vertex, 2] + sign * DIFFERENCE * LENGTH
+            ends.append(sheet._solver.energies(moved, sheet.slopes)[2][free, 2])
+        moved[vertex, 2] = at[vertex, 2]
+        columns[:, column] = (ends[0] - ends[1]) / (2.0 * DIFFERENCE * LENGTH)
+    return 0.5 * (columns + columns.T)

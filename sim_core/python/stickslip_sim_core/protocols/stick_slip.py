@@ -1,0 +1,185 @@
+"""Stick-Slip: the friction at which the tip of a buckled strip slips on a wall [Sano et al. 2017; Romero et al. 2021].
+
+A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (RATE t)^2 times its length, so
+that Q/P, which goes with the square root of that strain, grows at an even pace, and the strain at which the tip leaves
+its place is the friction that the solver has, by `master_curves.stick_slip`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stickslip_sim_core import build_info, master_curves
+from stickslip_sim_core.cloth import Cloth, plane
+from stickslip_sim_core.fabrics import isotropic
+from stickslip_sim_core.presets import Preset, preset_named
+from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+
+FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)
+CELLS_ACROSS = 2
+
+DENSITY, RIGIDITY, STRETCHING = 0.05, 1e-4, 3e4  # kg/m^2, N m, N/m
+RATE = 5e-3  # 1/s: root of the strain
+DAMPING = 20.0  # 1/s: the bounce of a buckling strip must not tear its tip off
+
+# Of the load, sideways, until the strip has decided for a side: without it a straight strip stays straight.
+BIAS = 2e-4
+BIAS_UNTIL = 2e-3  # strain
+
+# Force in which a node's residual is measured, over its share of the buckling load.
+FORCE_SHARE = 0.03
+
+MOVED = 2e-4  # of the length: a tip that has come so far has slipped,
+LET_GO = 1e-6  # and it began with the step, the last of its kind, before it moved by more than this.
+
+# Strains at which the phase diagram says what a strip does, and frictions beyond the triple point.
+PHASE_STRAIN = tuple(round(0.02 * i, 2) for i in range(1, 23))
+PHASE_FRICTION = (0.38, 0.5)
+STICK, SLIP, EXTENDED = 0.0, 1.0, 2.0
+
+
+@dataclass(frozen=True)
+class Press:
+    """A strip that was pressed until its tip slipped, or to the end."""
+
+    slip: float
+    """Strain at which the tip slipped, or NaN."""
+
+    extended: float
+    """Strain at which more than the tip's vertices first touched the wall, or NaN."""
+
+    static_error: float
+    """Largest |relative error| of Q/P while the tip stuck, over the second half of its range; NaN if there is none."""
+
+    steps: int
+    unconverged_steps: int
+
+
+def run(
+    *,
+    preset: str | Preset = "certified",
+    friction: Sequence[float] = FRICTION,
+    cells: int = 50,
+    structured: int = 2,
+    unstructured: int = 2,
+    phases: bool = True,
+    tolerance: float = 0.01,
+) -> ProtocolResult:
+    """Measure the friction at which tips slip, and compare it with that of the wall.
+
+    Args:
+        preset: Solver settings, or their name.
+        friction: Of the wall, between 0 and the triple point's 0.356370.
+        cells: Of a mesh along the strip.
+        structured: Number of structured meshes, 0 ... 4.
+        unstructured: Number of unstructured ones.
+        phases: Whether to look beyond the triple point, too, for the phase diagram.
+        tolerance: Largest |relative error| of the friction that passes.
+
+    Raises:
+        ValueError: A friction is not on the master curve.
+    """
+    settings = preset_named(preset) if isinstance(preset, str) else preset
+    master_curves.stick_slip_strain(friction)  # refuses what is not on it
+    end = master_curves.stick_slip_triple_point()[0]
+    curves, names, static, steps, unconverged = [], [], [0.0], 0, 0
+    diagram: list[tuple[float, float, float]] = []
+    for number, strip in enumerate(strips(CELLS_ACROSS * LENGTH / cells, cells, structured, unstructured)):
+        presses = [press(strip, mu, settings, end) for mu in friction]
+        slip = np.array([one.slip for one in presses])
+        measured = np.full(len(slip), np.nan)
+        measured[np.isfinite(slip)] = master_curves.stick_slip(slip[np.isfinite(slip)])
+        exact = tuple(float(mu) for mu in friction)
+        curves.append(Curve({"mesh": float(number)}, exact, tuple(measured.tolist()), exact))
+        names.append(f"{number} {strip.name}")
+        if number == 0:
+            diagram += [point for mu, one in zip(exact, presses, strict=True) for point in _phases(mu, one, end)]
+            if phases:
+                beyond = [press(strip, mu, settings, PHASE_STRAIN[-1]) for mu in PHASE_FRICTION]
+                pairs = zip(PHASE_FRICTION, beyond, strict=True)
+                diagram += [point for mu, one in pairs for point in _phases(mu, one, PHASE_STRAIN[-1])]
+                presses += beyond
+        static += [one.static_error for one in presses if np.isfinite(one.static_error)]
+        steps += sum(one.steps for one in presses)
+        unconverged += sum(one.unconverged_steps for one in presses)
+    mu, strain, regime = (tuple(column) for column in zip(*diagram, strict=True)) if diagram else ((), (), ())
+    return ProtocolResult(
+        "stick-slip",
+        "mu",
+        "mu at which the tip slips",
+        tuple(curves),
+        tolerance,
+        {
+            "preset": settings.name,
+            "time_step": settings.time_step,
+            "cells": cells,
+            "meshes": ", ".join(names),
+            "static_ratio_error": max(static),
+            "steps": steps,
+            "unconverged_steps": unconverged,
+            "phase_mu": mu,
+            "phase_strain": strain,
+            "phase_regime": regime,
+        },
+        build_info().build_hash,
+    )
+
+
+def press(strip: Strip, mu: float, preset: Preset, strain_end: float) -> Press:
+    """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`."""
+    width = float(np.ptp(strip.across))
+    buckling = 20.1907 * RIGIDITY * width / LENGTH**2  # N
+    sheet = Cloth(
+        strip.mesh,
+        isotropic(DENSITY, STRETCHING, RIGIDITY),
+        preset,
+        held=strip.held,
+        clamped=strip.clamped,
+        force_scale=FORCE_SHARE * buckling / len(strip.tip),
+    )
+    # The wall is the floor, the clamp above it; the outward slope at the clamp points up.
+    upright = np.stack([np.zeros_like(strip.along), strip.across, LENGTH - strip.along], axis=1)
+    slopes = np.tile([0.0, 0.0, 1.0], (len(strip.clamped), 1))
+    sheet.set_state(upright, None, slopes)
+    wall, clamp = [plane(mu)], upright[strip.held]
+    mass = float(sheet.masses.sum())
+    dt = preset.time_step
+    history: list[tuple[float, float, float]] = []
+    slip = extended = np.nan
+    for step in range(1, int(np.sqrt(strain_end) / (RATE * dt)) + 1):
+        strain = (RATE * step * dt) ** 2
+        load = min(STRETCHING * width * strain, buckling)
+        sheet.gravity[:] = [BIAS * load / mass * max(0.0, 1.0 - strain / BIAS_UNTIL), 0.0, 0.0]
+        sheet.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
+        force = sheet.reactions[strip.tip].sum(axis=0)
+        moved = abs(sheet.positions[strip.tip, 0].mean()) / LENGTH
+        history.append((strain, float(np.hypot(force[0], force[1]) / max(force[2], 1e-15)), float(moved)))
+        touching = np.flatnonzero(sheet.contacts >= 0)
+        if np.isnan(extended) and not np.isin(touching, strip.tip).all():
+            extended = strain
+        if not moved <= MOVED:
+            break
+    strain_at, ratio, moved_at = np.array(history).T
+    if not moved_at[-1] <= MOVED:
+        stuck = np.flatnonzero(np.abs(np.diff(moved_at, prepend=0.0)) <= LET_GO)
+        last = int(stuck[-1]) if len(stuck) else 0
+        slip = float(strain_at[last])
+        strain_at, ratio = strain_at[:last], ratio[:last]
+    on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
+        strain_at <= master_curves.stick_slip_triple_point()[0]
+    )
+    some = np.flatnonzero(on_curve)[:: max(1, int(on_curve.sum()) // 20)]
+    static = np.abs(ratio[some] / master_curves.stick_slip(strain_at[some]) - 1.0)
+    return Press(slip, extended, float(static.max()) if len(static) else np.nan, sheet.steps, sheet.unconverged_steps)
+
+
+def _phases(mu: float, one: Press, end: float) -> list[tuple[float, float, float]]:
+    """Return (mu, strain, what the strip does there); a tip that has slipped once is called slipping from then on."""
+    points = []
+    for strain in PHASE_STRAIN:
+        if strain <= end or np.isfinite(one.slip):
+            regime = SLIP if strain >= one.slip else EXTENDED if strain >= one.extended else STICK
+            points.append((mu, strain, regime))
+    return points

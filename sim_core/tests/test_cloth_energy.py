@@ -1,0 +1,223 @@
+"""Energies of a sheet: derivatives by finite differences, what costs nothing, and plates."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stickslip_sim_core import Cloth, Fabric, fabric, isotropic, meshes, preset_named
+from stickslip_sim_core.meshes import Mesh
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+
+Floats = NDArray[np.float64]
+
+SHEET = isotropic(0.2, 50.0, 1e-5, 0.3)
+MESHES = {
+    "grid": meshes.grid(0.04, 0.05, 4, 5),
+    "random": meshes.grid(0.04, 0.05, 4, 5, "random", 2),
+    "unstructured": meshes.unstructured(0.04, 0.05, 0.01, 1),
+}
+
+
+def sheet_of(mesh: Mesh, material: Fabric = SHEET, clamp: bool = False) -> Cloth:
+    def root(p: Floats) -> NDArray[np.bool_]:
+        below: NDArray[np.bool_] = p[:, 1] < -0.025 + 1e-9
+        return below
+
+    if not clamp:
+        return Cloth(mesh, material, preset_named("certified"))
+    held = np.flatnonzero(root(mesh.rest))
+    return Cloth(mesh, material, preset_named("certified"), held=held, clamped=mesh.boundary(root))
+
+
+def energy(sheet: Cloth, at: Floats, slopes: Floats | None = None) -> tuple[float, float, Floats]:
+    membrane, bending, gradient = sheet._solver.energies(at, sheet.slopes if slopes is None else slopes)
+    return membrane, bending, np.asarray(gradient)
+
+
+def total(sheet: Cloth, at: Floats) -> float:
+    return sum(energy(sheet, at)[:2])
+
+
+def flat(mesh: Mesh) -> Floats:
+    return np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
+
+
+def waved(mesh: Mesh) -> Floats:
+    """Bent and stretched by a few per cent, with no symmetry."""
+    x, y = mesh.rest.T
+    noise = np.random.default_rng(0).normal(0.0, 1e-4, (len(x), 3))
+    return np.column_stack([1.03 * x + 0.1 * y, 0.98 * y, 0.01 * np.sin(100.0 * x + 60.0 * y)]) + noise
+
+
+def folded(mesh: Mesh) -> Floats:
+    """Folded back over a cylinder whose radius is less than a cell: nearly 180 degrees over one edge."""
+    x, y = mesh.rest.T
+    radius = 0.002
+    angle = np.clip(y / radius, 0.0, np.pi)
+    beyond = np.maximum(y - np.pi * radius, 0.0)
+    noise = np.random.default_rng(1).normal(0.0, 1e-4, (len(x), 3))
+    at = np.column_stack([x, np.minimum(y, 0.0) + radius * np.sin(angle) - beyond, radius * (1.0 - np.cos(angle))])
+    return at + noise
+
+
+STATES: dict[str, Callable[[Mesh], Floats]] = {"flat": flat, "waved": waved, "folded": folded}
+
+
+@pytest.mark.parametrize("material", ["isotropic", "gray-interlock"])
+@pytest.mark.parametrize("clamp", [False, True])
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("name", MESHES)
+def test_gradient(name: str, state: str, clamp: bool, material: str) -> None:
+    """The table's stiffness is that at the start of a step, here at no strain: the gradient is exact for it."""
+    mesh = MESHES[name]
+    sheet = sheet_of(mesh, SHEET if material == "isotropic" else fabric(material), clamp)
+    sheet.slopes = np.tile([0.1, -0.9, 0.3], (len(sheet.slopes), 1))
+    at = STATES[state](mesh)
+    gradient = energy(sheet, at)[2]
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        direction = rng.normal(size=at.shape)
+        h = 1e-7
+        ends = [total(sheet, at + sign * h * direction) for sign in (2.0, 1.0, -1.0, -2.0)]
+        difference = (-ends[0] + 8.0 * ends[1] - 8.0 * ends[2] + ends[3]) / (12.0 * h)
+        scale = float(np.linalg.norm(gradient)) + 1e-6
+        assert float((gradient * direction).sum()) == pytest.approx(difference, abs=2e-6 * scale, rel=2e-6)
+
+
+@pytest.mark.parametrize("state", ["flat", "waved"])
+@pytest.mark.parametrize("name", MESHES)
+def test_matrix(name: str, state: str) -> None:
+    """The matrix, in single precision, is the gradient's derivative, where no fold is sharp."""
+    mesh = MESHES[name]
+    sheet = sheet_of(mesh)
+    at = STATES[state](mesh)
+    direction = np.random.default_rng(3).normal(size=at.shape)
+    h = 1e-8
+    difference = (energy(sheet, at + h * direction)[2] - energy(sheet, at - h * direction)[2]) / (2.0 * h)
+    product = np.asarray(sheet._solver.stiffness_times(at, sheet.slopes, direction))
+    error = np.linalg.norm(product - difference) / np.linalg.norm(difference)
+    assert error < (2e-6 if state == "flat" else 2e-3)
+
+
+def test_matrix_of_a_fold_is_that_of_bending_stiffened() -> None:
+    """At a fold the matrix leaves out a rank-one part: it is close, symmetric, and no softer by half."""
+    mesh = MESHES["grid"]
+    sheet = sheet_of(mesh)
+    at = folded(mesh)
+    rng = np.random.default_rng(4)
+    v, w = rng.normal(size=at.shape), rng.normal(size=at.shape)
+    Kv, Kw = (np.asarray(sheet._solver.stiffness_times(at, sheet.slopes, u)) for u in (v, w))
+    assert float((Kv * w).sum()) == pytest.approx(float((Kw * v).sum()), rel=1e-4)
+    h = 1e-8
+    difference = (energy(sheet, at + h * v)[2] - energy(sheet, at - h * v)[2]) / (2.0 * h)
+    assert np.linalg.norm(Kv - difference) < 0.2 * np.linalg.norm(difference)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_factor_solves(name: str) -> None:
+    """In single precision, where the matrix is definite by itself: flat, and pulled."""
+    mesh = MESHES[name]
+    sheet = sheet_of(mesh)
+    for stretch in (1.0, 1.05):
+        assert sheet._solver.factor_error(stretch * flat(mesh), sheet.slopes, 0.01) < 1e-4
+
+
+def rotation(seed: int) -> Floats:
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0.0 else -q
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_rigid_motions_cost_nothing(name: str) -> None:
+    mesh = MESHES[name]
+    sheet = sheet_of(mesh)
+    turn = rotation(5)
+    moved = flat(mesh) @ turn.T + [0.3, -0.2, 0.5]
+    membrane, bending, gradient = energy(sheet, moved)
+    assert membrane < 1e-20
+    assert bending < 1e-20
+    assert np.abs(gradient).max() < 1e-10
+    bent = waved(mesh)
+    first, second = energy(sheet, bent), energy(sheet, bent @ turn.T + [0.3, -0.2, 0.5])
+    assert second[:2] == pytest.approx(first[:2], rel=1e-10)
+    assert second[2] == pytest.approx(first[2] @ turn.T, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_no_net_force_or_torque(name: str) -> None:
+    at = folded(MESHES[name])
+    gradient = energy(sheet_of(MESHES[name]), at)[2]
+    scale = np.abs(gradient).sum()
+    assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * scale
+    assert np.abs(np.cross(at, gradient).sum(axis=0)).max() < 1e-12 * scale
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_homogeneous_stretch(name: str) -> None:
+    """The energy of a strain that is the same everywhere is exact on any mesh."""
+    mesh = MESHES[name]
+    x, y = mesh.rest.T
+    area = 0.04 * 0.05
+    Y, nu = 50.0, 0.3
+    strained = np.column_stack([1.02 * x + 0.01 * y, 0.99 * y, 0.0 * x])
+    F = np.array([[1.02, 0.01], [0.0, 0.99]])
+    G = 0.5 * (F.T @ F - np.eye(2))
+    exact = 0.5 * Y / (1 - nu**2) * (G[0, 0] ** 2 + G[1, 1] ** 2 + 2 * nu * G[0, 0] * G[1, 1])
+    exact += 0.5 * Y / (1 + nu) * 2 * G[0, 1] ** 2
+    assert energy(sheet_of(mesh), strained)[0] == pytest.approx(exact * area, rel=1e-12)
+
+
+@pytest.mark.parametrize(("along", "row"), [(0, 1), (1, 5)])
+def test_table_of_stiffness(along: int, row: int) -> None:
+    """Pulled by 1/12 along warp or weft, a fabric is halfway between its first row and that at 1/6."""
+    mesh = MESHES["grid"]
+    material = fabric("gray-interlock")
+    inner = int(np.argmin(np.linalg.norm(mesh.rest, axis=1)))
+    held = np.delete(np.arange(len(mesh.rest)), inner)
+    sheet = Cloth(mesh, material, preset_named("certified"), held=held)
+    sheet.gravity[:] = 0.0
+    at = flat(mesh)
+    at[:, along] *= 1.0 + 1.0 / 12.0
+    sheet.set_state(at)
+    sheet.step(1e-3, held=at[held])
+    k = 0.5 * (material.stretching[0] + material.stretching[row])
+    green = 0.5 * ((1.0 + 1.0 / 12.0) ** 2 - 1.0)
+    assert energy(sheet, at)[0] == pytest.approx(0.5 * k[2 * along] * green**2 * 0.04 * 0.05, rel=1e-9)
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3])
+def test_pure_bending(poisson: float) -> None:
+    """A narrow strip under end curvature: W per area between D (1 - nu^2) and D, times kappa^2/2."""
+    mesh = meshes.unstructured(0.02, 0.1, 0.004, 0)
+    sheet = Cloth(mesh, isotropic(0.2, 50.0, 1e-5, poisson), preset_named("certified"))
+    at = flat(mesh)
+    at[:, 2] = 0.5 * mesh.rest[:, 1] ** 2
+    bending = energy(sheet, at)[1] / (0.02 * 0.1 * 0.5 * 1e-5)
+    assert (1.0 - poisson**2) * 0.9 < bending < 1.0 + 1e-9  # triangles at the ends are free to lie flat
+
+
+@pytest.mark.parametrize("strip", list(strips(0.02, 50, 2, 2)), ids=lambda strip: strip.name)
+def test_linear_plate(strip: Strip) -> None:
+    """The tip of a horizontal cantilever, nu = 0, sags by rho g L^4 / 8D: to 0.05 %."""
+    density, rigidity, g = 0.2, 1e-5, 9.81
+    sheet = Cloth(
+        strip.mesh,
+        isotropic(density, 500.0, rigidity),
+        preset_named("certified"),
+        held=strip.held,
+        clamped=strip.clamped,
+    )
+    at = flat(strip.mesh)
+    slopes = np.tile([0.0, -1.0, 0.0], (len(strip.clamped), 1))
+    free = np.setdiff1d(np.arange(len(at)), strip.held)
+    K = np.empty((len(free), len(free)))
+    for column, vertex in enumerate(free):
+        moved = at.copy()
+        moved[vertex, 2] = 1e-7
+        K[:, column] = energy(sheet, moved, slopes)[2][free, 2] / 1e-7
+    sag = np.zeros(len(at))
+    sag[free] = np.linalg.solve(K, sheet.masses[free] * g)
+    assert sag[strip.tip].mean() == pytest.approx(density * g * LENGTH**4 / (8.0 * rigidity), rel=5e-4)

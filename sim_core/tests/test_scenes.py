@@ -1,0 +1,157 @@
+"""Scenes: the path of the stage, drop-and-drag on a coarse mesh, and a sphere that turns."""
+
+import numpy as np
+import pytest
+
+from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric, meshes, scenes
+from stickslip_sim_core.cloth import GRAVITY
+from stickslip_sim_core.more_scenes import RADIUS, SETTLING, SPEED, rotating_sphere, turned
+
+
+@pytest.fixture(scope="module")
+def dragged() -> DropAndDrag:
+    """The first leg and the turn, mu = 0.5."""
+    return drop_and_drag("gray-interlock", 0.5, vertices=11, frames=110)
+
+
+class TestStage:
+    def test_lengths_and_times(self) -> None:
+        """6 cm down, 30 cm to, fro, to, fro, at 1 cm/s after a second of 1 cm/s^2: 7 s and four times 31 s."""
+        assert scenes.duration_of(0.06) == pytest.approx(7.0)
+        assert scenes.duration_of(0.3) == pytest.approx(31.0)
+        assert pytest.approx(131.0) == scenes.DURATION
+        ends = [scenes.stage(t).tolist() for t in (0.0, 7.0, 38.0, 69.0, 100.0, 131.0, 140.0)]
+        x = [0.0, 0.0, 0.3, 0.0, 0.3, 0.0, 0.0]
+        assert np.array(ends) == pytest.approx(np.column_stack([x, [0.0] + [-0.06] * 6]), abs=1e-12)
+
+    def test_speeds(self) -> None:
+        t = np.arange(0.0, 131.0, 1e-2)
+        path = np.stack([scenes.stage(time) for time in t])
+        speed = np.diff(path, axis=0) / 1e-2
+        assert np.abs(speed).max() == pytest.approx(0.01, rel=1e-9)
+        assert np.abs(np.diff(speed, axis=0) / 1e-2).max() < 0.01 * 2.0 + 1e-6
+        down, drag = t[:-1] < 7.0, t[:-1] >= 7.0
+        assert (speed[down][:, 1] <= 1e-12).all()
+        assert np.abs(speed[down][:, 0]).max() == 0.0
+        assert np.abs(speed[drag][:, 1]).max() < 1e-12
+        assert np.mean(np.isclose(np.abs(speed[drag][:, 0]), 0.01)) == pytest.approx(29.0 / 31.0, abs=0.01)
+
+    def test_frames_cover_it(self) -> None:
+        assert scenes.FRAMES == 300
+        assert scenes.FRAME_RATE == 2.4
+        assert 124.0 < (scenes.FRAMES - 1) / scenes.FRAME_RATE <= scenes.DURATION
+
+
+class TestDropAndDrag:
+    def test_is_valid(self, dragged: DropAndDrag) -> None:
+        assert dragged.valid, dragged.reason
+        assert dragged.reason == ""
+        assert dragged.positions.shape == (110, 121, 3)
+        assert dragged.unconverged_steps == 0
+        assert 0.0 < dragged.worst_residual <= 1e-3
+        assert dragged.self_intersections.shape == (110,)
+
+    def test_frames_are_at_their_times(self, dragged: DropAndDrag) -> None:
+        """Held corners are where the stage is at k/2.4 s."""
+        assert dragged.times == pytest.approx(np.arange(110) / 2.4)
+        corner = int(np.argmax(dragged.rest.sum(axis=1)))
+        came = dragged.positions[:, corner] - dragged.positions[0, corner]
+        stage = np.stack([scenes.stage(t) for t in dragged.times])
+        assert came[:, [0, 2]] == pytest.approx(stage, abs=1e-12)
+        assert np.abs(came[:, 1]).max() == 0.0
+
+    def test_starts_at_rest_over_the_floor(self, dragged: DropAndDrag) -> None:
+        assert dragged.positions[0, :, 2].min() == pytest.approx(scenes.CLEARANCE, abs=2e-3)  # it sags
+        assert dragged.positions[:, :, 2].min() > -1e-9
+        assert dragged.positions[60, :, 2].min() < 1e-9
+
+    def test_friction_in_the_steady_drag(self, dragged: DropAndDrag) -> None:
+        """Against the motion, and mu times the normal force, from the balance of momentum."""
+        steady = (dragged.times > 22.0) & (dragged.times < 37.0)
+        force = dragged.contact_force[steady]
+        assert (force[:, 0] < 0.0).all()
+        ratio = np.hypot(force[:, 0], force[:, 1]) / force[:, 2]
+        assert np.median(ratio) == pytest.approx(0.5, rel=1e-3)
+        assert ratio == pytest.approx(0.5, rel=1e-2)
+
+    def test_forces_carry_the_weight(self, dragged: DropAndDrag) -> None:
+        weight = fabric("gray-interlock").density * 0.04 * GRAVITY
+        assert dragged.holder_force[0] == pytest.approx([0.0, 0.0, weight], rel=1e-9)
+        steady = (dragged.times > 22.0) & (dragged.times < 37.0)
+        lifted = (dragged.holder_force + dragged.contact_force)[steady]
+        assert lifted[:, 2] == pytest.approx(weight, rel=0.02)
+        assert np.abs(lifted[:, :2]).max() < 0.02 * weight
+
+    def test_side_is_drawn_from_the_seed_and_followed(self) -> None:
+        """The belly of the falling cloth goes to the side that the label names."""
+        seen = set()
+        for seed in range(4):
+            fallen = drop_and_drag("gray-interlock", 0.5, vertices=7, frames=18, seed=seed)
+            assert 1e-3 <= fallen.bias <= 3e-3
+            middle = np.abs(fallen.rest[:, 0]) < 0.02
+            assert np.sign(fallen.positions[-1, middle, 0].mean()) == fallen.side
+            seen.add(fallen.side)
+        assert seen == {-1, 1}
+
+    def test_rerun_is_bit_identical(self) -> None:
+        first, second = (drop_and_drag("gray-interlock", 0.3, vertices=7, frames=30) for _ in range(2))
+        assert first.positions.tobytes() == second.positions.tobytes()
+        assert first.contact_force.tobytes() == second.contact_force.tobytes()
+
+    def test_other_meshes_and_presets(self) -> None:
+        mesh = meshes.unstructured(scenes.SIDE, scenes.SIDE, 0.02, 1)
+        assert drop_and_drag("gray-interlock", 0.3, mesh=mesh, frames=8, preset="fast").valid
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"frames": 0}, r"frames: must be 1 \.\.\. 300, got 0"),
+            ({"frames": 301}, r"frames: must be 1 \.\.\. 300, got 301"),
+            ({"vertices": 4}, "vertices: must be at least 5, got 4"),
+            ({"preset": "best"}, "preset: must be one of"),
+            ({"material": "silk"}, "fabric: must be one of"),
+            ({"mu": -0.1}, "mu: must be finite and >= 0, got -0.1"),
+            ({"mu": float("nan")}, "mu: must be finite and >= 0, got nan"),
+        ],
+    )
+    def test_refusals(self, settings: dict[str, object], message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            drop_and_drag(**{"material": "gray-interlock", "mu": 0.5, **settings})  # type: ignore[arg-type]
+
+
+class TestRotatingSphere:
+    def test_turn(self) -> None:
+        assert turned(SETTLING) == 0.0
+        assert turned(2.0 * SETTLING) == pytest.approx(0.5 * SPEED * SETTLING)
+        assert turned(3.0 * SETTLING) - turned(2.0 * SETTLING) == pytest.approx(SPEED * SETTLING)
+
+    def test_rough_sphere_takes_the_cloth_along(self) -> None:
+        scene = rotating_sphere("gray-interlock", 0.2, 0.5, vertices=13, frames=76)
+        assert scene.valid, scene.reason
+        assert scene.times[-1] == pytest.approx(5.0)
+        assert scene.angle[-1] == pytest.approx(2.0)
+        corner = np.unwrap(np.arctan2(scene.positions[:, -1, 1], scene.positions[:, -1, 0]))
+        assert corner[-1] - corner[0] == pytest.approx(scene.angle[-1], abs=0.4)
+        assert (scene.contacts[-1] == 0).any()  # its hem on the floor
+        assert (scene.contacts[-1] == 1).any()
+        assert scene.positions[:, :, 2].min() > -1e-9
+        centre = np.array([0.0, 0.0, RADIUS])
+        assert np.linalg.norm(scene.positions - centre, axis=2).min() > RADIUS - 1e-9
+        assert np.hypot(*scene.bias) > 0.0
+
+    def test_smooth_sphere_does_not(self) -> None:
+        scene = rotating_sphere("gray-interlock", 0.2, 0.0, vertices=9, frames=76)
+        corner = np.unwrap(np.arctan2(scene.positions[:, -1, 1], scene.positions[:, -1, 0]))
+        assert abs(corner[-1] - corner[30]) < 0.3
+
+    def test_refusals(self) -> None:
+        for settings, message in (
+            ({"mu_floor": -1.0}, "mu_floor: must be finite and >= 0, got -1.0"),
+            ({"mu_sphere": float("nan")}, "mu_sphere: must be finite and >= 0, got nan"),
+            ({"frames": 0}, "frames: must be at least 1, got 0"),
+            ({"vertices": 3}, "vertices: must be at least 5, got 3"),
+            ({"frame_rate": 0.0}, "frame_rate: must be finite and > 0, got 0.0"),
+        ):
+            good = {"material": "gray-interlock", "mu_floor": 0.2, "mu_sphere": 0.5}
+            with pytest.raises(ValueError, match=message):
+                rotating_sphere(**{**good, **settings})  # type: ignore[arg-type]

@@ -1,0 +1,91 @@
+"""Cloth on real parts: spec, core, Blender, Zarr, training, and one simulation for all its renders."""
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from harness import STICKSLIP, Service, read_arrays
+from stickslip_schemas.manifest import Manifest
+from stickslip_sim_core import drop_and_drag
+from stickslip_training.datasets import ClipDataset
+
+SPEC: dict[str, Any] = {
+    "kind": "cloth_drag",
+    "allow_uncertified": True,
+    "axes": {
+        "material": "gray-interlock",
+        "mu": 0.4,
+        "texture": ["checker", "dots"],
+        "viewpoint": ["calibrated", "left"],
+    },
+    "preset": "fast",
+    "mesh": 7,
+    "frames": 3,
+    "quality": "draft",
+    "samples_per_shard": 3,
+    "splits": {"train": 1, "validation": 0, "test": 0},
+}
+
+
+@pytest.fixture(scope="module")
+def job(service: Service) -> dict[str, Any]:
+    return service.finished(service.submit(SPEC))
+
+
+@pytest.fixture(scope="module")
+def directory(service: Service, job: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("pulled") / "clips"
+    command = [STICKSLIP, "pull", job["dataset"]["dataset"], target, "--url", service.url]
+    subprocess.run(command, check=True, capture_output=True)
+    return target
+
+
+def test_one_simulation_makes_all_clips(service: Service, job: dict[str, Any]) -> None:
+    assert job["state"] == "succeeded"
+    counts = {stage: item["counts"] for stage, item in job["progress"]["stages"].items()}
+    assert counts["simulate"] == {"succeeded": 1}
+    assert counts["render"] == {"succeeded": 4}
+    more = SPEC | {"axes": SPEC["axes"] | {"texture": ["checker", "dots", "plaid"]}}
+    grown = service.finished(service.submit(more))["progress"]["stages"]
+    assert (grown["simulate"]["cached"], grown["render"]["cached"]) == (1, 4)
+    assert sum(grown["render"]["counts"].values()) == 6
+
+
+def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
+    run = drop_and_drag("gray-interlock", 0.4, preset="fast", vertices=7, seed=0)
+    arrays = read_arrays(directory)
+    assert arrays["valid"].all()
+    assert arrays["mesh"].shape == (4, 300, 49, 3)
+    for slot in range(4):
+        assert np.array_equal(arrays["mesh"][slot], run.positions.astype(np.float32))
+        assert np.array_equal(arrays["rest"][slot], run.rest.astype(np.float32))
+        assert np.array_equal(arrays["triangles"][slot], run.triangles)
+        assert np.array_equal(arrays["contact_force"][slot], run.contact_force.astype(np.float32))
+        assert np.array_equal(arrays["holder_force"][slot], run.holder_force.astype(np.float32))
+        assert np.array_equal(arrays["self_intersections"][slot], run.self_intersections)
+        for name in ("side", "bias", "steps", "unconverged_steps", "worst_residual"):
+            assert arrays[name][slot] == getattr(run, name), name
+    assert len(set(arrays["light_seed"].tolist())) == 4
+
+
+def test_clips_show_the_cloth_of_their_sample(directory: Path) -> None:
+    """What changes between two frames is where the cloth was or is, and the light it throws on the floor about."""
+    manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+    cameras = {camera.name: camera for camera in manifest.cameras}
+    clips = ClipDataset(directory, mesh=True)
+    assert clips.instants == (0, 100, 200)
+    for index in range(len(clips)):
+        item = clips[index]
+        camera = cameras[clips.categories("viewpoint")[item["viewpoint"]]]
+        centers = []
+        for frame, instant in zip(item["video"].numpy(), clips.instants, strict=True):
+            bright = np.argwhere(frame.max(axis=2) > 110)
+            pixels, _ = camera.project(item["mesh"][instant].numpy())
+            low, high = pixels.min(axis=0) - 3, pixels.max(axis=0) + 3
+            inside = ((bright[:, ::-1] >= low) & (bright[:, ::-1] <= high)).all(axis=1)
+            assert len(bright) > 100
+            assert inside.mean() > 0.95
+            centers.append(pixels.mean(axis=0))
+        assert np.linalg.norm(centers[1] - centers[0]) > 20.0  # it has been dragged
