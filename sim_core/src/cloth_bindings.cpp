@@ -23,6 +23,10 @@ using BodyTuple = std::tuple<int, double, Eigen::Vector3d, Eigen::Vector3d, Eige
 }  // namespace
 
 void bind_cloth(nb::module_& m) {
+  m.def(
+      "check_mesh", [](const Points2& rest, const Triangles& triangles) { ClothMesh(rest, triangles); }, "rest"_a,
+      "triangles"_a,
+      "Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")

@@ -19,7 +19,7 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 // Contact stiffnesses over a node's own: of the complementarity function [Alart & Curnier 1991] and in the factor.
-constexpr double contact_share = 0.2;
+constexpr double contact_share = 0.1;
 constexpr float factor_share = 100.0f;
 // Slip below this share of the friction force is as good as stuck for the factor.
 constexpr double turning_max = 1e3;
@@ -129,12 +129,12 @@ struct ClothSolver::Impl {
   ClothMatrix matrix{};
   std::unique_ptr<FactorStorage> factor_storage;
   Factor factor{};
-  bool factored = false;
+  bool factored = false, definite = false;
   double factored_dt = 0.0;
   int last_krylov = 0, fresh = -1, excess = 0;  // iterations of the last solve, the first with this factor, beyond that
 
   // State and work, (nodes, 4).
-  Buffer<double> x, v, start, gradient, residual, inertial, trial, unused;
+  Buffer<double> x, v, start, gradient, residual, inertial, trial, best, unused;
   Buffer<float> rhs, correction, change, work, image;
   // Contact.
   std::vector<Body> bodies, bodies_before;
@@ -171,7 +171,7 @@ struct ClothSolver::Impl {
     stiffening.assign(2 * triangles.rows(), 0.0f);
     assembled_stiffening.assign(2 * triangles.rows(), -1.0f);
     rigidity_size = properties.rigidity.cwiseAbs().maxCoeff();
-    for (Buffer<double>* buffer : {&x, &v, &start, &gradient, &residual, &inertial, &trial, &unused})
+    for (Buffer<double>* buffer : {&x, &v, &start, &gradient, &residual, &inertial, &trial, &best, &unused})
       buffer->assign(4 * nodes, 0.0);
     for (Buffer<float>* buffer : {&rhs, &correction, &change, &image, &normal, &direction}) {
       buffer->assign(4 * free_nodes + 64, 0.0f);
@@ -397,6 +397,7 @@ struct ClothSolver::Impl {
         const double mean = 0.5 * (g00 + g11), half = 0.5 * (g00 - g11), radius = std::hypot(half, g01);
         const double stretch = std::sqrt(std::max(0.0, 1.0 + 2.0 * (mean + radius))) - 1.0;
         const double share = std::clamp(stretch / table_stretch, 0.0, 1.0);
+        if (!std::isfinite(radius)) continue;
         const double angle = 0.5 * std::abs(std::atan2(g01, half));  // of the larger principal stretch, 0 ... pi/2
         const double place = std::min(angle / (M_PI / 8.0), 4.0);
         const int row = std::min(static_cast<int>(place), 3);
@@ -416,7 +417,7 @@ struct ClothSolver::Impl {
     std::fill(gradient.begin(), gradient.end(), 0.0);
     if (with_matrix) std::fill(blocks.begin(), blocks.end(), 0.0f);
     membrane_energy =
-        kernel.membrane(membrane, at.data(), gradient.data(), with_matrix ? blocks.data() : nullptr, false);
+        kernel.membrane(membrane, at.data(), gradient.data(), with_matrix ? blocks.data() : nullptr, definite);
     bending_energy = kernel.bending(bending.view, at.data(), gradient.data(), stiffening.data());
     if (with_matrix) {
       float change_max = 0.0f;
@@ -463,12 +464,12 @@ struct ClothSolver::Impl {
     }
     std::fill(definite_blocks.begin(), definite_blocks.end(), 0.0f);
     kernel.membrane(membrane, now.data(), unused.data(), definite_blocks.data(), true);
-    ClothMatrix definite = matrix;
-    definite.membrane = definite_blocks.data();
+    ClothMatrix approximate = matrix;
+    approximate.membrane = definite_blocks.data();
     std::fill(near_scalars.begin(), near_scalars.end(), 0.0f);
     kernel.bending_matrix(near_bending.view, stiffening.data(), near_scalars.data());
-    definite.bending = near_scalars.data();
-    kernel.factor(factor, definite, {added.data()});
+    approximate.bending = near_scalars.data();
+    kernel.factor(factor, approximate, {added.data()});
     factored = true;
   }
 
@@ -581,6 +582,8 @@ struct ClothSolver::Impl {
     modes = mode;
     double window[4];
     std::fill(window, window + 4, norms.squared);
+    best = x;
+    double least = norms.squared;
     for (int iteration = 0; iteration < iterations; ++iteration) {
       if (norms.largest <= settings.tolerance) break;
       if (!std::isfinite(norms.squared)) break;
@@ -639,6 +642,12 @@ struct ClothSolver::Impl {
       std::swap(x, trial);
       norms = next;
       window[iteration % 4] = norms.squared;
+      if (norms.squared < least) least = norms.squared, best = x;
+    }
+    if (!(norms.largest <= settings.tolerance)) {
+      x = best;
+      evaluate(x, true);
+      norms = contact_state(x, dt, damping, at_end, at_start);
     }
     residual_out = norms.largest;
     return norms.largest <= settings.tolerance;
@@ -673,6 +682,7 @@ struct ClothSolver::Impl {
     const int iterations = report.newton;
     bool converged = false;
     if (depth >= depth_hint) {
+      definite = depth > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
       converged =
           attempt(part, damping, at_end, at_start, false, deepest ? settings.newton_max : patience, report, reached);
       if (!converged && deepest) {
@@ -691,7 +701,7 @@ struct ClothSolver::Impl {
     hardest = std::max(hardest, report.newton - iterations);
     ++report.substeps;
     report.converged = report.converged && converged;
-    report.residual = std::max(report.residual, reached);
+    if (!(reached <= report.residual)) report.residual = reached;  // a NaN stays
     for (int i = 0; i < nodes; ++i) at(v, i) = (at(x, i) - at(start, i)) / part;
   }
 

@@ -79,6 +79,11 @@ def relax_rod(gamma: float, phi0: float, phi1: float, twist_stiffness: float, qu
     Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.
     """
 
+def check_mesh(rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')]) -> None:
+    """
+    Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.
+    """
+
 def self_intersections(positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')]) -> int:
     """Internal: see stickslip_sim_core.self_intersections."""
 

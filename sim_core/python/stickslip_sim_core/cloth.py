@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, StepReport
+from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh
 from stickslip_sim_core.fabrics import Fabric
 from stickslip_sim_core.meshes import Mesh
 from stickslip_sim_core.presets import Preset
@@ -98,6 +98,7 @@ class Cloth:
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
         edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
         self.slopes = np.zeros((len(edges), 3))
+        check_mesh(mesh.rest, mesh.triangles)
         node_weight = fabric.density * mesh.spacing**2 * GRAVITY
         self.force_scale = node_weight if force_scale is None else force_scale
         """Force that residuals are measured in [N]: the weight of a node, unless another is given."""
@@ -174,6 +175,8 @@ class Cloth:
     ) -> StepReport:
         """Advance by dt [s]; positions of held vertices (K, 3), slopes and bodies are those at its end.
 
+        In the first step after `set_state` bodies are taken to have been where they are.
+
         `damping` is proportional to mass [1/s]. A step that does not converge is counted and its best iterate kept.
         """
         if slopes is not None:
@@ -183,7 +186,9 @@ class Cloth:
         self.time += dt
         self.steps += 1
         self.unconverged_steps += not report.converged
-        self.worst_residual = max(self.worst_residual, report.residual / self.force_scale)
+        residual = report.residual / self.force_scale
+        if not residual <= self.worst_residual:  # a NaN stays
+            self.worst_residual = residual
         self.newton += report.newton
         self.krylov += report.krylov
         self.factorizations += report.factorizations

@@ -13,7 +13,7 @@ class Preset:
     time_step: float
     """Longest step [s]; scenes shorten it so that frames fall on steps."""
 
-    tolerance: float = 1e-3
+    tolerance: float = 1e-4
     """Largest residual force of a node in a converged step, in weights of a node."""
 
     newton_max: int = 40
@@ -28,7 +28,7 @@ class Preset:
     refactor_after: int = 15
     """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
 
-    halvings_max: int = 4
+    halvings_max: int = 6
     """Times that a step which does not converge is halved."""
 
     unconverged_share_max: float = 0.002
@@ -40,9 +40,9 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
         preset.name: preset
         for preset in (
             Preset("certified", 0.02),
-            Preset("fast", 0.04, tolerance=1e-2),
+            Preset("fast", 0.04, tolerance=2e-4),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
-            Preset("thesis-high", 0.0005, tolerance=1e-4),
+            Preset("thesis-high", 0.0005),
             Preset("thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, unconverged_share_max=1.0),
             Preset("thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, unconverged_share_max=1.0),
         )

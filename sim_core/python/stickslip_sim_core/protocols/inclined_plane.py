@@ -28,7 +28,7 @@ DRIFT_MAX = 1e-5  # m
 
 # Of a node's weight: the force that residuals are measured in. A resting node may bear a force beyond friction by the
 # preset's tolerance times this, and slides late by as much over mu.
-FORCE_SHARE = 0.1
+FORCE_SHARE = 1.0
 
 
 def run(
