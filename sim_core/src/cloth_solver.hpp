@@ -104,7 +104,7 @@ class ClothSolver {
   Energies energies(const Points3& positions, const Points3& slopes);
   // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
   Points3 stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v);
-  // Relative error of a solve with the factor of that matrix plus mass/dt^2: for tests.
+  // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
   double factor_error(const Points3& positions, const Points3& slopes, double dt);
 
   const Eigen::VectorXd& masses() const;
