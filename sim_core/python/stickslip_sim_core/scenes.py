@@ -108,6 +108,49 @@ class DropAndDrag:
     """Why it is not valid, or empty."""
 
 
+@dataclass(frozen=True, eq=False)
+class Tilt:
+    """Gravity along x, over that along -z, which breaks the symmetry of the drop."""
+
+    side: int
+    bias: float
+    of_vertices: Floats
+    """(V,)"""
+
+
+def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
+    """Return the vertices of the square of cloth under the holders, at the two corners of its upper edge."""
+    inner = SIDE / 2 - HOLDER - 1e-9
+    return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
+
+
+def hang(sheet: cloth.Cloth, floor: list[cloth.Body], *, seed: int) -> tuple[Floats, Tilt]:
+    """Let the sheet come to rest under its holders; return their vertices' positions (K, 3) and the tilt of gravity."""
+    rest = sheet.mesh.rest
+    hung = np.zeros((len(rest), 3))
+    hung[:, 1] = rest[:, 0]
+    hung[:, 2] = rest[:, 1] + SIDE / 2 + CLEARANCE
+    rng = np.random.default_rng(seed)
+    side = 1 if rng.random() < 0.5 else -1
+    bias = float(rng.uniform(1e-3, 3e-3))
+    twist = float(rng.uniform(-0.3, 0.3))
+    tilt = Tilt(side, bias, side * bias * (1.0 + twist * rest[:, 0] / (SIDE / 2)))
+    sheet.set_state(hung)
+    sheet.gravity[:, 0] = tilt.of_vertices * cloth.GRAVITY
+    for _ in range(SETTLING_STEPS):
+        sheet.step(0.05, held=hung[sheet.held], bodies=floor, damping=5.0)
+    sheet.set_state(sheet.positions)
+    return hung[sheet.held], tilt
+
+
+def drag(sheet: cloth.Cloth, floor: list[cloth.Body], hung: Floats, tilt: Tilt, time: float, dt: float) -> None:
+    """Step the sheet to `time` after the start of the stage; gravity is upright one second after the drop."""
+    upright = min(max(time - duration_of(DROP), 0.0), 1.0)
+    sheet.gravity[:, 0] = tilt.of_vertices * cloth.GRAVITY * (1.0 - upright)
+    x, z = stage(time)
+    sheet.step(dt, held=hung + np.array([x, 0.0, z]), bodies=floor)
+
+
 def drop_and_drag(
     material: str,
     mu: float,
@@ -142,40 +185,19 @@ def drop_and_drag(
     if vertices < 5:
         raise ValueError(f"vertices: must be at least 5, got {vertices}")
     sheet = meshes.grid(SIDE, SIDE, vertices - 1, vertices - 1) if mesh is None else mesh
-    held = np.flatnonzero(
-        (np.abs(sheet.rest[:, 0]) > SIDE / 2 - HOLDER - 1e-9) & (sheet.rest[:, 1] > SIDE / 2 - HOLDER - 1e-9)
-    )
+    held = held_by_holders(sheet)
     floor = [cloth.plane(mu)]
     simulated = cloth.Cloth(sheet, fabrics.fabric(material), settings, held=held)
-    hung = np.zeros((len(sheet.rest), 3))
-    hung[:, 1] = sheet.rest[:, 0]
-    hung[:, 2] = sheet.rest[:, 1] + SIDE / 2 + CLEARANCE
-
-    rng = np.random.default_rng(seed)
-    side = 1 if rng.random() < 0.5 else -1
-    bias = float(rng.uniform(1e-3, 3e-3))
-    twist = float(rng.uniform(-0.3, 0.3))
-    tilt = side * bias * (1.0 + twist * sheet.rest[:, 0] / (SIDE / 2))
-
-    simulated.set_state(hung)
-    simulated.gravity[:, 0] = tilt * cloth.GRAVITY
-    for _ in range(SETTLING_STEPS):
-        simulated.step(0.05, held=hung[held], bodies=floor, damping=5.0)
-    simulated.set_state(simulated.positions)
-
+    hung, tilt = hang(simulated, floor, seed=seed)
     per_frame = int(np.ceil(1.0 / (FRAME_RATE * settings.time_step)))
     dt = 1.0 / (FRAME_RATE * per_frame)
     masses = simulated.masses[:, None]
     weight = simulated.masses.sum() * np.array([0.0, 0.0, -cloth.GRAVITY])
     positions, contact, holders = [simulated.positions], [np.zeros(3)], [-weight]
-    drop = duration_of(DROP)
     for frame in range(1, frames):
         for step in range(1, per_frame + 1):
-            time = (frame - 1) / FRAME_RATE + step * dt
-            simulated.gravity[:, 0] = tilt * cloth.GRAVITY * min(max(1.0 - (time - drop), 0.0), 1.0)
-            x, z = stage(time)
             before = (masses * simulated.velocities).sum(axis=0) if step == per_frame else None
-            simulated.step(dt, held=hung[held] + np.array([x, 0.0, z]), bodies=floor)
+            drag(simulated, floor, hung, tilt, (frame - 1) / FRAME_RATE + step * dt, dt)
             if before is not None:
                 pushed = ((masses * simulated.velocities).sum(axis=0) - before) / dt
                 pulled = simulated.reactions[held].sum(axis=0)
@@ -202,8 +224,8 @@ def drop_and_drag(
         contact_force=np.stack(contact),
         holder_force=np.stack(holders),
         self_intersections=np.array([self_intersections(p, sheet.triangles) if finite else 0 for p in path], np.int32),
-        side=side,
-        bias=bias,
+        side=tilt.side,
+        bias=tilt.bias,
         steps=simulated.steps,
         unconverged_steps=simulated.unconverged_steps,
         worst_residual=simulated.worst_residual,
