@@ -12,7 +12,7 @@ PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
 CORE_SOURCES = $(wildcard sim_core/src/*) sim_core/CMakeLists.txt sim_core/pyproject.toml
 # reconstruction.py calls render_rod_set.py with Blender's interpreter.
 # rod_families.py is imported, and the last two need what others write, or train for a quarter of an hour.
-BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py curvature_methods.py \
+BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py cloth_grid.py curvature_methods.py \
   natural_from_pictures.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(wildcard sim_core/src/*.hpp sim_core/src/*.cpp)
 

@@ -5,7 +5,7 @@ import pytest
 
 from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric, meshes, scenes
 from stickslip_sim_core.cloth import GRAVITY
-from stickslip_sim_core.more_scenes import RADIUS, SETTLING, SPEED, rotating_sphere, turned
+from stickslip_sim_core.rotating_sphere import RADIUS, SETTLING, SPEED, rotating_sphere, turned
 
 
 @pytest.fixture(scope="module")
