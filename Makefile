@@ -11,7 +11,7 @@ TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
 CORE_SOURCES = $(wildcard sim_core/src/*) sim_core/CMakeLists.txt sim_core/pyproject.toml
 # reconstruction.py calls render_rod_set.py with Blender's interpreter.
-# rod_families.py is imported, and the last two need what others write, or train for a quarter of an hour.
+# rod_families.py is imported, cloth_grid.py takes half an hour, and the last two need what others write, or train.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py cloth_grid.py curvature_methods.py \
   natural_from_pictures.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(wildcard sim_core/src/*.hpp sim_core/src/*.cpp)

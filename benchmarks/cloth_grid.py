@@ -2,9 +2,9 @@
 
     python benchmarks/cloth_grid.py [--vertices 21] [--spread] [--out cloth-grid.jsonl]
 
-Each simulation becomes a line of JSON when it is done, and a run goes on where a file ends. The ratio |Ft|/Fn is that of
-the floor's force from the balance of momentum, over the frames 22 to 29 s along a leg; `ratio_error` is its median over
-mu, less one.
+Each simulation becomes a line of JSON when it is done, and a run goes on where a file ends. The ratio |Ft|/Fn is that
+of the floor's force from the balance of momentum, over the frames 22 to 29 s along a leg; `ratio_error` is its median
+over mu, less one.
 """
 
 import argparse
