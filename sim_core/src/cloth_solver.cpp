@@ -129,7 +129,8 @@ struct ClothSolver::Impl {
   ClothMatrix matrix{};
   std::unique_ptr<FactorStorage> factor_storage;
   Factor factor{};
-  bool factored = false, definite = false;
+  bool factored = false;
+  bool definite = false;  // whether the matrix has the positive part of the stress only
   double factored_dt = 0.0;
   int last_krylov = 0, fresh = -1, excess = 0;  // iterations of the last solve, the first with this factor, beyond that
 
@@ -139,9 +140,7 @@ struct ClothSolver::Impl {
   // Contact.
   std::vector<Body> bodies, bodies_before;
   std::vector<int> mode, modes, touched;
-  std::vector<Gap> gaps;
   std::vector<double> stiffness;
-  std::vector<Vector3d> slip, friction;
   Buffer<float> normal, direction, mu, turning;
   ContactRows contact{};
   bool started = false;
@@ -181,9 +180,6 @@ struct ClothSolver::Impl {
     turning.assign(free_nodes, 0.0f);
     mode.assign(free_nodes, contact_open);
     touched.assign(free_nodes, -1);
-    gaps.assign(free_nodes, {std::numeric_limits<double>::infinity(), Vector3d::UnitZ()});
-    slip.assign(free_nodes, Vector3d::Zero());
-    friction.assign(free_nodes, Vector3d::Zero());
     stiffness.assign(free_nodes, 0.0);
     added.assign(6 * free_nodes, 0.0f);
     contact = {mode.data(), normal.data(), direction.data(), mu.data(), turning.data()};
@@ -505,7 +501,6 @@ struct ClothSolver::Impl {
         const Gap one = gap_of(at_end[b], p);
         if (one.distance < gap.distance) gap = one, which = static_cast<int>(b);
       }
-      gaps[i] = gap;
       const double k = stiffness[i];
       const double pressing = r.dot(gap.normal);
       auto force = row(rhs, i), held_back = row(correction, i);
@@ -551,7 +546,6 @@ struct ClothSolver::Impl {
         held_back = (-gap.distance * n).cast<float>();
         count(norms, open * open + (tangential - bound * t).squaredNorm());
       }
-      slip[i] = u;
     }
     return norms;
   }
@@ -561,7 +555,24 @@ struct ClothSolver::Impl {
     if (!(squared <= norms.largest * norms.largest)) norms.largest = std::sqrt(squared);  // a NaN stays
   }
 
-  // One implicit Euler step from (start, v) to x, or the best found.
+  // What contact prescribes, `correction`, goes to the right-hand side.
+  void subtract_corrections() {
+    if (std::all_of(correction.begin(), correction.end(), [](float c) { return c == 0.0f; })) return;
+    kernel.apply(matrix, correction.data(), image.data());
+    for (int i = 0; i < free_nodes; ++i) {
+      if (mode[i] == contact_stick) continue;
+      auto force = row(rhs, i), pulled = row(image, i);
+      if (mode[i] == contact_open) {
+        force -= pulled;
+        continue;
+      }
+      const auto n = row(normal, i), t = row(direction, i);
+      const float pressing = n.dot(pulled);
+      force -= pulled - pressing * n - mu[i] * pressing * t;
+    }
+  }
+
+  // One implicit Euler step from (start, v) to x, or the best found. `from_rest`: begin at `start`, not where v leads.
   bool attempt(double dt, double damping, const std::vector<Body>& at_end, const std::vector<Body>& at_start,
                bool from_rest, int iterations, StepReport& report, double& residual_out) {
     for (int i = 0; i < free_nodes; ++i) {
@@ -596,22 +607,7 @@ struct ClothSolver::Impl {
       }
       {
         const Stopwatch watch(phases.krylov);
-        bool moved = false;
-        for (float c : correction) moved = moved || c != 0.0f;
-        if (moved) {
-          kernel.apply(matrix, correction.data(), image.data());
-          for (int i = 0; i < free_nodes; ++i) {
-            auto force = row(rhs, i), pulled = row(image, i);
-            if (mode[i] == contact_stick) continue;
-            if (mode[i] == contact_slip) {
-              const auto n = row(normal, i), t = row(direction, i);
-              const float pressing = n.dot(pulled);
-              force -= pulled - pressing * n - mu[i] * pressing * t;
-            } else {
-              force -= pulled;
-            }
-          }
-        }
+        subtract_corrections();
         double size = 0.0;
         for (float f : rhs) size += static_cast<double>(f) * f;
         size = std::sqrt(size);
@@ -625,7 +621,7 @@ struct ClothSolver::Impl {
         report.krylov += solved.iterations;
       }
       for (int i = 0; i < 4 * free_nodes; ++i) change[i] += correction[i];
-      // Far along a line, non-monotone [Grippo et al. 1986].
+      // Along the line, non-monotone [Grippo et al. 1986].
       const double limit = *std::max_element(window, window + 4);
       double share = 1.0;
       Norms next;
@@ -788,6 +784,7 @@ ClothSolver::Energies ClothSolver::energies(const Points3& positions, const Poin
 Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v) {
   Buffer<double> at = impl_->x;
   impl_->load(positions, slopes, at);
+  impl_->definite = false;
   impl_->evaluate(at, true);
   std::fill(impl_->diagonal.begin(), impl_->diagonal.end(), 0.0f);
   Buffer<float> in(4 * impl_->free_nodes), out(4 * impl_->free_nodes);
