@@ -15,6 +15,7 @@ from itertools import cycle
 
 import numpy as np
 import numpy.typing as npt
+from render_rods import psnr
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, Sampling
@@ -94,11 +95,6 @@ def cloth_pixels(sheet: Sheet) -> npt.NDArray[np.bool_]:
         column, row = np.rint(rig[number % 3].project(points)[0]).astype(int).clip(0, 223).T
         masks[number, row, column] = True
     return masks
-
-
-def psnr(frames: npt.NDArray[np.uint8], reference: npt.NDArray[np.uint8]) -> float:
-    error = frames.astype(np.float64) - reference
-    return float(10.0 * np.log10(255.0**2 / np.mean(error**2)))
 
 
 def main() -> None:

@@ -194,6 +194,17 @@ class Cloth:
         self.factorizations += report.factorizations
         return report
 
+    def why_invalid(self, path: Floats) -> str:
+        """Return why a simulation with these positions (frames, V, 3) is not valid, or an empty text."""
+        if not np.isfinite(path).all():
+            return f"positions are not finite from frame {len(path) - 1} on"
+        if self.unconverged_steps > self.preset.unconverged_share_max * self.steps:
+            return (
+                f"{self.unconverged_steps} of {self.steps} steps did not converge, "
+                f"and {self.preset.name} allows a share of {self.preset.unconverged_share_max:g}"
+            )
+        return ""
+
     def phases(self) -> dict[str, float]:
         """Return CPU seconds by phase since the start."""
         return dict(zip(("assembly", "factorization", "krylov", "contact"), self._solver.phases(), strict=True))

@@ -50,12 +50,14 @@ PRESETS: Mapping[str, Preset] = MappingProxyType(
 )
 
 
-def preset_named(name: str) -> Preset:
-    """Return a preset.
+def preset_named(preset: str | Preset) -> Preset:
+    """Return the preset of this name; one that is a preset already is returned as it is.
 
     Raises:
         ValueError: There is none of this name.
     """
-    if name not in PRESETS:
-        raise ValueError(f"preset: must be one of {', '.join(PRESETS)}, got {name!r}")
-    return PRESETS[name]
+    if isinstance(preset, Preset):
+        return preset
+    if preset not in PRESETS:
+        raise ValueError(f"preset: must be one of {', '.join(PRESETS)}, got {preset!r}")
+    return PRESETS[preset]

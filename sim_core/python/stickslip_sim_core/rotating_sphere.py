@@ -98,7 +98,7 @@ def rotating_sphere(
     Raises:
         ValueError: An argument breaks its rule.
     """
-    settings = preset_named(preset) if isinstance(preset, str) else preset
+    settings = preset_named(preset)
     if frames < 1:
         raise ValueError(f"frames: must be at least 1, got {frames}")
     if vertices < 5:
@@ -131,14 +131,7 @@ def rotating_sphere(
             break
     path = np.stack(positions)
     times = np.arange(len(path)) / frame_rate
-    reason = ""
-    if not np.isfinite(path).all():
-        reason = f"positions are not finite from frame {len(path) - 1} on"
-    elif simulated.unconverged_steps > settings.unconverged_share_max * simulated.steps:
-        reason = (
-            f"{simulated.unconverged_steps} of {simulated.steps} steps did not converge, "
-            f"and {settings.name} allows a share of {settings.unconverged_share_max:g}"
-        )
+    reason = simulated.why_invalid(path)
     return RotatingSphere(
         positions=path,
         rest=sheet.rest,

@@ -179,7 +179,7 @@ def drop_and_drag(
     Raises:
         ValueError: An argument breaks its rule.
     """
-    settings = preset_named(preset) if isinstance(preset, str) else preset
+    settings = preset_named(preset)
     if not 1 <= frames <= FRAMES:
         raise ValueError(f"frames: must be 1 ... {FRAMES}, got {frames}")
     if vertices < 5:
@@ -208,14 +208,7 @@ def drop_and_drag(
             break
     path = np.stack(positions)
     finite = bool(np.isfinite(path).all())
-    reason = ""
-    if not finite:
-        reason = f"positions are not finite from frame {len(path) - 1} on"
-    elif simulated.unconverged_steps > settings.unconverged_share_max * simulated.steps:
-        reason = (
-            f"{simulated.unconverged_steps} of {simulated.steps} steps did not converge, "
-            f"and {settings.name} allows a share of {settings.unconverged_share_max:g}"
-        )
+    reason = simulated.why_invalid(path)
     return DropAndDrag(
         positions=path,
         rest=sheet.rest,

@@ -50,7 +50,7 @@ def run(
         unstructured: Number of unstructured ones.
         tolerance: Largest |relative error| that passes.
     """
-    settings = preset_named(preset) if isinstance(preset, str) else preset
+    settings = preset_named(preset)
     master = tuple(float(v) for v in master_curves.cantilever(gamma)) if len(gamma) else ()
     curves, names, steps, unconverged = [], [], 0, 0
     pairs = zip(

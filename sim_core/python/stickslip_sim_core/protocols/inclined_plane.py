@@ -55,7 +55,7 @@ def run(
         force_share: Force that residuals are measured in, over a node's weight.
         tolerance: Largest |relative error| that passes.
     """
-    settings = preset_named(preset) if isinstance(preset, str) else preset
+    settings = preset_named(preset)
     curves, names, furthest = [], [], 0.0
     for number, (name, mesh) in enumerate(_patches(cells, structured, unstructured)):
         measured = []

@@ -51,7 +51,7 @@ def run(
         unstructured: Number of unstructured ones.
         tolerance: Largest |relative error| that passes.
     """
-    settings = preset_named(preset) if isinstance(preset, str) else preset
+    settings = preset_named(preset)
     measured: dict[tuple[float, int], list[float]] = {}
     names: list[str] = []
     for ratio in aspect:

@@ -81,7 +81,7 @@ def run(
     Raises:
         ValueError: A friction is not on the master curve.
     """
-    settings = preset_named(preset) if isinstance(preset, str) else preset
+    settings = preset_named(preset)
     master_curves.stick_slip_strain(friction)  # refuses what is not on it
     end = master_curves.stick_slip_triple_point()[0]
     curves, names, static, steps, unconverged = [], [], [0.0], 0, 0
