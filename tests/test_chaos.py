@@ -11,8 +11,8 @@ import pytest
 import yaml
 from harness import Service, descendants, read_arrays, wait_for
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import job_spec_adapter
 from stickslip_schemas.keys import sha256
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import samples
 from stickslip_schemas.store import Store

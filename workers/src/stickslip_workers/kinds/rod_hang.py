@@ -1,22 +1,24 @@
-"""Rods at rest: from parameters to one artifact of shapes."""
+"""Rods that hang: from parameters to one artifact of shapes at rest."""
 
 from collections.abc import Sequence
 from itertools import groupby
+from typing import TYPE_CHECKING
 
 import numpy as np
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RecordRef, RodSimulation, SimulateOutput, TaskResult
+from stickslip_schemas.tasks import RecordRef, SimulateOutput, TaskResult
 
+from stickslip_workers.kinds import Kind
 from stickslip_workers.stages.records import Array, encode_records
+
+if TYPE_CHECKING:
+    from stickslip_schemas.kinds.rod_hang import RodHangSimulation
 
 CURVES = ("centerline", "curvature", "frame")
 
-RECORD_ARRAYS = (*CURVES, "multistable", "self_contact_distance", "reach")
-"""What a record holds, under the names of the dataset: curves in float32, and labels."""
 
-
-def simulate_rods(simulations: Sequence[RodSimulation], store: Store) -> list[TaskResult]:
+def _simulate(simulations: Sequence["RodHangSimulation"], store: Store) -> list[TaskResult]:
     """Solve all rods together. A rod's numbers do not depend on which others are with it."""
     results: dict[int, TaskResult] = {}
 
@@ -31,7 +33,9 @@ def simulate_rods(simulations: Sequence[RodSimulation], store: Store) -> list[Ta
     return [results[index] for index in range(len(simulations))]
 
 
-def _solve(rods: Sequence[RodSimulation], poisson: float, elements: int, points: int, store: Store) -> list[TaskResult]:
+def _solve(
+    rods: Sequence["RodHangSimulation"], poisson: float, elements: int, points: int, store: Store
+) -> list[TaskResult]:
     # Here, so that packing needs no compiled core.
     from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
 
@@ -56,7 +60,7 @@ def _solve(rods: Sequence[RodSimulation], poisson: float, elements: int, points:
             outcome="succeeded",
             output=SimulateOutput(
                 record=RecordRef(digest=digest, row=rows[index]),
-                labels={"energy": float(solution.energy[index]), "stable": True},
+                labels={"energy": float(solution.energy[index])},
             ),
         )
         if index in rows
@@ -65,7 +69,7 @@ def _solve(rods: Sequence[RodSimulation], poisson: float, elements: int, points:
     ]
 
 
-def _rejection(rod: RodSimulation, *, converged: bool) -> TaskResult:
+def _rejection(rod: "RodHangSimulation", *, converged: bool) -> TaskResult:
     what = "no stable equilibrium was found" if converged else "the solver did not converge"
     return TaskResult(
         outcome="rejected",
@@ -73,3 +77,10 @@ def _rejection(rod: RodSimulation, *, converged: bool) -> TaskResult:
         message=f"{what} at gamma = {rod.gamma:g}, phi0 = {rod.phi0:g}, phi1 = {rod.phi1:g}, "
         f"poisson = {rod.poisson:g} with {rod.elements} elements",
     )
+
+
+KIND = Kind(
+    simulate=_simulate,
+    batch=512,  # small enough that a lost batch costs little: 512 rods are well below a second
+    solver="stickslip_sim_core.rods",
+)

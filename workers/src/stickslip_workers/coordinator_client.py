@@ -39,7 +39,7 @@ class RefusedError(CoordinatorError):
     """A request that will be refused every time."""
 
 
-class Coordinator:
+class CoordinatorClient:
     """A client, for any number of threads."""
 
     def __init__(self, url: str) -> None:

@@ -9,20 +9,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.cameras import Camera, load_rig
 from stickslip_schemas.jobs import Quality
 
 from stickslip_blender.blender import import_bpy
-from stickslip_blender.color import Color, to_linear
+from stickslip_blender.color import Color, silicone_color, to_linear
 from stickslip_blender.engine import SAMPLING, Sampling, new_scene, set_sampling
 from stickslip_blender.environment import SoftBox, panorama, set_environment
 from stickslip_blender.pixels import FrameReader, Window
 from stickslip_blender.tube import tube_faces, tube_vertices
 from stickslip_blender.view import new_view, set_view
+from stickslip_blender.workshop import Workshop, why_unfit
+
+if TYPE_CHECKING:
+    from stickslip_schemas.kinds.rod_hang import RodHangRender
+    from stickslip_schemas.tasks import RenderTask, TaskResult
 
 POINTS = 150
 RADIUS = 0.008  # [L], the default
@@ -36,6 +41,20 @@ SOFT_BOXES = (
     SoftBox(azimuth=160.0, elevation=25.0, radiance=0.9, sharpness=4.0),
     SoftBox(azimuth=270.0, elevation=40.0, radiance=2.1, sharpness=4.0),
 )
+
+
+def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskResult:
+    """Render the views of one rod."""
+    cameras = load_rig(look.rig)
+    (line,) = workshop.record(task.record, "centerline")
+    if rejected := why_unfit("rod", line, look.radius, cameras):
+        return rejected
+    color = silicone_color(look.color_seed)
+    renderer = workshop.renderer(
+        ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality, scratch=workshop.scratch)
+    )
+    views = renderer.render(line, cameras, color=color, radius=look.radius)
+    return workshop.rendered("views", views, views if task.preview else None, {"color": list(to_linear(color))})
 
 
 class RodRenderer:
