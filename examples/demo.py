@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 from rich.console import Console
 from stickslip_services.client import Client
-from stickslip_training.datasets import ClipDataset, RodDataset
+from stickslip_training.kinds import ClipDataset, RodDataset
 
 BIN = Path(sys.executable).parent
 RODS = Path(__file__).with_name("demo-rods.yaml")

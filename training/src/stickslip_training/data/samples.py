@@ -1,4 +1,4 @@
-"""Torch datasets of rods and of cloth clips.
+"""What the torch datasets of all kinds have in common; `stickslip_training.kinds` says what the samples of a kind hold.
 
 They are map-style, and read a whole batch at a time (`__getitems__`) into one buffer, so that `collate` has nothing to
 do: give it to a DataLoader as `collate_fn`, or let `loader()` do that.
@@ -10,23 +10,44 @@ buffer of its own whatever `ring` says, for a worker reads ahead and hands its b
 """
 
 import os
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.jobs import ClothDragSpec
 from stickslip_schemas.layout import SAMPLE_KEY_BYTES
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
-from stickslip_training.reader import Array, DatasetReader, Split
+from stickslip_training.arrays import Array
+from stickslip_training.data.reader import DatasetReader, Split
 
-Item = dict[str, torch.Tensor]
+
+class Item(dict[str, torch.Tensor]):
+    """Tensors by name, of one sample; `name("material")` says what the code of a categorical label means."""
+
+    def __init__(self, tensors: Mapping[str, torch.Tensor], categories: Mapping[str, tuple[str, ...]]) -> None:
+        super().__init__(tensors)
+        self.categories = categories
+        """Names of the codes 0, 1, ... of each categorical label."""
+
+    def name(self, label: str) -> str:
+        """Return the name of this sample's category."""
+        return self._names(label)[int(self[label])]
+
+    def _names(self, label: str) -> tuple[str, ...]:
+        try:
+            return self.categories[label]
+        except KeyError:
+            raise ValueError(f"label must be one of {', '.join(self.categories)}, and is {label!r}") from None
 
 
 class Batch(Item):
-    """Tensors by name, the first dimension of each is the sample."""
+    """Tensors by name, the first dimension of each is the sample; `names("material")` says what the codes mean."""
+
+    def names(self, label: str) -> list[str]:
+        """Return the name of each sample's category."""
+        names = self._names(label)
+        return [names[code] for code in self[label].tolist()]
 
     def __missing__(self, key: Any) -> torch.Tensor:
         if isinstance(key, int):  # torch's own collate function takes a list of items, and asks for its first
@@ -40,15 +61,17 @@ def collate(batch: Any) -> Batch:
     return batch
 
 
-class _SampleDataset(Dataset[Item]):
+class SampleDataset(Dataset[Item]):
     """Samples of one split: `arrays` are read sample by sample, `labels` are in memory."""
+
+    kind: ClassVar[str]
+    """The kind of dataset that the class reads."""
 
     def __init__(
         self,
         source: str | os.PathLike[str] | DatasetReader,
         split: Split | None,
         *,
-        kind: Literal["rod_hang", "cloth_drag"],
         arrays: Sequence[str],
         labels: Sequence[str],
         ring: int,
@@ -56,9 +79,9 @@ class _SampleDataset(Dataset[Item]):
         if ring < 0:
             raise ValueError(f"ring must be a number of buffers, 0 for a new one each time, and is {ring}")
         self.reader = source if isinstance(source, DatasetReader) else DatasetReader(source)
-        if self.reader.kind != kind:
+        if self.reader.kind != self.kind:
             raise ValueError(
-                f"kind of the dataset must be {kind} for a {type(self).__name__}: it is {self.reader.kind}"
+                f"kind of the dataset must be {self.kind} for a {type(self).__name__}: it is {self.reader.kind}"
             )
         for name in arrays:
             if name not in self.reader.arrays:
@@ -68,8 +91,10 @@ class _SampleDataset(Dataset[Item]):
         """Slot in the dataset of each item, int64 (items,)."""
         self._arrays = tuple(arrays)
         self._labels = {name: _for_torch(self.reader.label(name)[self.slots]) for name in labels}
+        self.categories = {name: self.reader.categories(name) for name in labels if self.reader.categories(name)}
+        """Names of the codes 0, 1, ... of each categorical label."""
         self._ring_length = ring
-        self._ring: list[Item] = []
+        self._ring: list[dict[str, torch.Tensor]] = []
         self._drawn = 0
 
     def __len__(self) -> int:
@@ -84,13 +109,14 @@ class _SampleDataset(Dataset[Item]):
         slot = self.slots[[index]]
         item = {name: torch.from_numpy(self.reader.read(name, slot)[0]) for name in self._arrays}
         item |= {name: torch.from_numpy(values[index : index + 1].copy())[0] for name, values in self._labels.items()}
-        return item | {"slot": torch.tensor(int(slot[0])), "sample_key": self._sample_keys(slot)[0]}
+        item |= {"slot": torch.tensor(int(slot[0])), "sample_key": self._sample_keys(slot)[0]}
+        return Item(item, self.categories)
 
     def __getitems__(self, indices: Sequence[int]) -> Batch:
         """Return a batch of samples, read into one buffer for each array; see the module on `ring`."""
         chosen = np.asarray(indices, dtype=np.int64)
         slots = self.slots[chosen]
-        batch = Batch(self._buffers(len(slots)))
+        batch = Batch(self._buffers(len(slots)), self.categories)
         for name in self._arrays:
             self.reader.read_into(name, slots, batch[name].numpy())
         for name, values in self._labels.items():
@@ -111,7 +137,7 @@ class _SampleDataset(Dataset[Item]):
         keys = b"".join(bytes.fromhex(self.reader.manifest.sample_keys[slot]) for slot in slots.tolist())
         return torch.frombuffer(bytearray(keys), dtype=torch.uint8).reshape(len(slots), SAMPLE_KEY_BYTES)
 
-    def _buffers(self, count: int) -> Item:
+    def _buffers(self, count: int) -> dict[str, torch.Tensor]:
         """Return a tensor (count, *sample shape) for each array, new or of the ring."""
         if self._ring_length == 0 or get_worker_info() is not None:
             return self._new_buffers(count)
@@ -123,82 +149,12 @@ class _SampleDataset(Dataset[Item]):
             self._ring[place] = self._new_buffers(count)
         return {name: tensor[:count] for name, tensor in self._ring[place].items()}
 
-    def _new_buffers(self, count: int) -> Item:
+    def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
         buffers = {}
         for name in self._arrays:
             array = self.reader.arrays[name]
             buffers[name] = torch.from_numpy(np.empty((count, *array.shape), dtype=array.dtype))
         return buffers
-
-
-class RodDataset(_SampleDataset):
-    """Rods at rest.
-
-    An item holds `centerline` (150, 3) float32, positions over L; `curvature` (150, 3) float32, (twist, bend1, bend2)
-    times L; `gamma`, `phi0`, `phi1` float32; `slot` int64; `sample_key` uint8 (32,). With `frame`, also `frame`
-    (150, 3, 3) float32; with `views`, also `views` (4, 224, 224, 3) uint8 and `color` (3,) float32.
-    """
-
-    def __init__(
-        self,
-        source: str | os.PathLike[str] | DatasetReader,
-        split: Split | None = None,
-        *,
-        views: bool = False,
-        frame: bool = False,
-        ring: int = 0,
-    ) -> None:
-        """Open `split` of a dataset of rods, or all of it; `source` is a directory, a URL or an open reader."""
-        arrays = ["centerline", "curvature"] + ["frame"] * frame + ["views"] * views
-        labels = ["gamma", "phi0", "phi1"] + ["color"] * views
-        super().__init__(source, split, kind="rod_hang", arrays=arrays, labels=labels, ring=ring)
-
-
-class ClipDataset(_SampleDataset):
-    """Clips of dragged cloth.
-
-    An item holds `video` (frames, 224, 224, 3) uint8; `material`, `texture`, `viewpoint` int64, codes that
-    `categories()` names; `mu` float32; `side` int64, the side to which the drop went; `slot` int64; `sample_key` uint8
-    (32,). With `mesh`, also `mesh` (300, vertices, 3) float32 [m], and `rest()` and `triangles()` say what mesh it is.
-    """
-
-    def __init__(
-        self,
-        source: str | os.PathLike[str] | DatasetReader,
-        split: Split | None = None,
-        *,
-        mesh: bool = False,
-        ring: int = 0,
-    ) -> None:
-        """Open `split` of a dataset of clips, or all of it; `source` is a directory, a URL or an open reader."""
-        labels = ["material", "mu", "texture", "viewpoint", "side"]
-        arrays = ["video"] + ["mesh"] * mesh
-        super().__init__(source, split, kind="cloth_drag", arrays=arrays, labels=labels, ring=ring)
-
-    @property
-    def instants(self) -> tuple[int, ...]:
-        """Index into the first dimension of `mesh` of each frame of `video`."""
-        spec = self.reader.spec
-        assert isinstance(spec, ClothDragSpec)
-        return shown_frames(spec.frames)
-
-    def rest(self) -> torch.Tensor:
-        """Return the flat cloth of all samples, (vertices, 2) float32 [m]."""
-        return self._of_any_sample("rest")
-
-    def triangles(self) -> torch.Tensor:
-        """Return the triangles of the mesh of all samples, (triangles, 3) int32."""
-        return self._of_any_sample("triangles")
-
-    def _of_any_sample(self, name: str) -> torch.Tensor:
-        valid = self.reader.slots()
-        if name not in self.reader.arrays or not len(valid):
-            raise ValueError(f"the dataset has no {name}: it was made with store_mesh: false, or has no valid sample")
-        return torch.from_numpy(self.reader.read(name, valid[:1])[0].copy())
-
-    def categories(self, name: str) -> tuple[str, ...]:
-        """Return the names of the codes 0, 1, ... of the label `name`."""
-        return tuple(map(str, self.reader.arrays[name].categories))
 
 
 def _for_torch(values: Array) -> Array:

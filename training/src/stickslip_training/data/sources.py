@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.tasks import FileEntry
 
-from stickslip_training.errors import CorruptDataError, MissingFileError, SourceError
+from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 
 API_KEY_VARIABLE = "STICKSLIP_API_KEY"
 """Environment variable with the key that is sent to a server where none is given."""

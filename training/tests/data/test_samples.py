@@ -4,8 +4,10 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from stickslip_training.datasets import ClipDataset, RodDataset, collate
-from stickslip_training.reader import DatasetReader
+from stickslip_training.data.clips import ClipSamples
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.samples import Item, collate
+from stickslip_training.kinds import KINDS, ClipDataset, RodDataset, open_samples
 from torch.utils.data import DataLoader
 
 
@@ -42,9 +44,11 @@ def test_a_clip(clips):
     item = dataset[8]
     assert item["video"].shape == (2, 224, 224, 3)
     assert np.array_equal(item["video"].numpy(), clips.arrays["video"][10])
-    assert dataset.categories("material")[item["material"]] == "camel-ponte-roma"
-    assert dataset.categories("texture")[item["texture"]] == "plaid"
-    assert dataset.categories("viewpoint")[item["viewpoint"]] == "left"
+    assert isinstance(item, Item)
+    assert [item.name(label) for label in ("material", "texture", "viewpoint")] == ["camel-ponte-roma", "plaid", "left"]
+    assert dataset.categories["material"][item["material"]] == "camel-ponte-roma"
+    with pytest.raises(ValueError, match="label must be one of material, texture, viewpoint, and is 'mu'"):
+        item.name("mu")
     assert item["mu"] == np.float32(0.4)
     assert item["side"] == clips.arrays["side"][10]
     assert "mesh" not in item
@@ -77,6 +81,29 @@ def test_a_batch_is_its_items(clips):
     for place, index in enumerate(indices):
         for name, value in dataset[index].items():
             assert torch.equal(batch[name][place], value)
+        assert batch.names("material")[place] == dataset[index].name("material")
+
+
+def test_the_kind_of_a_dataset_chooses_its_class(clips, rods, monkeypatch):
+    assert type(open_samples(clips.root, "test", mesh=True)) is ClipDataset
+    assert type(open_samples(rods.root)) is RodDataset
+    monkeypatch.delitem(KINDS, "rod_hang")
+    with pytest.raises(ValueError, match="kind of the dataset must be one of cloth_drag, and is 'rod_hang'"):
+        open_samples(rods.root)
+
+
+def test_a_new_kind_is_one_class(clips, monkeypatch):
+    class Sphere(ClipSamples):
+        kind = "cloth_sphere"
+        labels = ("material", "mu")
+
+    with pytest.raises(ValueError, match="must be cloth_sphere for a Sphere: it is cloth_drag"):
+        Sphere(clips.root)
+    monkeypatch.setattr(Sphere, "kind", "cloth_drag")
+    monkeypatch.setitem(KINDS, "cloth_drag", Sphere)
+    item = open_samples(clips.root)[0]
+    assert set(item) == {"video", "material", "mu", "slot", "sample_key"}
+    assert item.name("material") == "gray-interlock"
 
 
 def test_what_does_not_fit_is_refused(clips, rods):
@@ -131,7 +158,7 @@ def test_workers_read_what_one_process_reads(clips, method):
 
 
 def test_an_error_in_a_worker_arrives_as_itself(clips, tmp_path):
-    from stickslip_training.errors import MissingFileError
+    from stickslip_training.data.errors import MissingFileError
 
     made = clips.copy(tmp_path / "v1")
     dataset = ClipDataset(made.root)

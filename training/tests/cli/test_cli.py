@@ -4,8 +4,9 @@ import re
 import numpy as np
 import pytest
 from stickslip_training.cli import app
-from stickslip_training.local_global_training import load_local_global
-from stickslip_training.train_curvature import CurvatureTraining, estimate_strains, read_test_rods
+from stickslip_training.rods.curvature import CurvatureTraining, read_test_rods
+from stickslip_training.rods.evaluation import estimate_strains
+from stickslip_training.rods.local_global import load_local_global
 from typer.testing import CliRunner
 
 runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 import torch
-from stickslip_training.local_global_net import LocalGlobalNet, relative_loss
-from stickslip_training.local_global_training import (
+from stickslip_training.rods.local_global import (
     LocalGlobalTraining,
     draw_noise,
     load_local_global,
     save_local_global,
     train_local_global,
 )
-from stickslip_training.noise import ReconstructionNoise
+from stickslip_training.rods.local_global_net import LocalGlobalNet, relative_loss
+from stickslip_training.rods.noise import ReconstructionNoise
 
 SMALL = {"width": 32, "blocks": 2, "local": 4}
 
@@ -83,7 +83,7 @@ def test_the_same_run_gives_the_same_weights_and_reports():
     settings = LocalGlobalTraining(steps=7, batch_size=8, **SMALL)
     heard: list[int] = []
     torch.manual_seed(5)
-    first = train_local_global(*rods, settings, on_step=lambda report: heard.append(report.step), every=3)
+    first = train_local_global(*rods, settings, on_epoch=lambda report: heard.append(report.step), every=3)
     torch.manual_seed(6)
     second = train_local_global(*rods, settings)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))

@@ -9,12 +9,11 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from stickslip_training.arrays import AnyFloats, Floats
 
 
-def finite_difference_curvature(centerline: npt.NDArray[np.floating]) -> Floats:
+def finite_difference_curvature(centerline: AnyFloats) -> Floats:
     """Take the derivatives from a point and its two neighbours; x'' at an end is that of the point next to it."""
     x = np.asarray(centerline, dtype=np.float64)
     h = 1.0 / (x.shape[-2] - 1)
@@ -25,7 +24,7 @@ def finite_difference_curvature(centerline: npt.NDArray[np.floating]) -> Floats:
     return _curvature(first, second)
 
 
-def cubic_spline_curvature(centerline: npt.NDArray[np.floating]) -> Floats:
+def cubic_spline_curvature(centerline: AnyFloats) -> Floats:
     """Take the derivatives from cubic smoothing splines, the usual ones.
 
     They minimise the sum of squares plus lambda ∫ |x''|^2, for which they are straight at their ends: at the free
@@ -35,7 +34,7 @@ def cubic_spline_curvature(centerline: npt.NDArray[np.floating]) -> Floats:
     return _spline_curvature(centerline, 2)
 
 
-def quintic_spline_curvature(centerline: npt.NDArray[np.floating]) -> Floats:
+def quintic_spline_curvature(centerline: AnyFloats) -> Floats:
     """Take the derivatives from quintic smoothing splines, which penalise ∫ |x'''|^2 and may be bent at their ends.
 
     They halve the error of cubic ones on hanging rods. One order more takes another sixth off, and was not worth it.
@@ -92,7 +91,7 @@ _MOST_FREEDOM = 0.7
 """Most degrees of freedom of a spline, as a share of the points: near 1, cross-validation divides 0 by 0."""
 
 
-def _spline_curvature(centerline: npt.NDArray[np.floating], order: int) -> Floats:
+def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
     """Smooth each coordinate by itself, with the lambda of least generalised cross-validation [Craven, Wahba 1979]:
 
     GCV = (|y - f|^2 / n) / (1 - tr(A) / n)^2, f = A y.

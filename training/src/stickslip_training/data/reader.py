@@ -21,24 +21,24 @@ from stickslip_schemas.chunks import (
     decode_trajectory,
     shard_index_size,
 )
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
+from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.layout import ArrayLayout, layout
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import SPLITS
 from stickslip_schemas.tasks import FileEntry
 
-from stickslip_training.errors import (
+from stickslip_training.arrays import Array
+from stickslip_training.data.errors import (
     CorruptDataError,
     InvalidDatasetError,
     MissingFileError,
     RejectedSampleError,
 )
-from stickslip_training.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
-from stickslip_training.sources import open_source
+from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
+from stickslip_training.data.sources import open_source
 
 Split = Literal["train", "validation", "test"]
-Array = npt.NDArray[Any]
 Slots = Sequence[int] | npt.NDArray[np.integer[Any]]
 
 
@@ -84,14 +84,14 @@ class DatasetReader:
         self._check_manifested()
 
     @property
-    def spec(self) -> RodHangSpec | ClothDragSpec:
+    def spec(self) -> JobSpec:
         """What was asked for when the dataset was made."""
         return self.manifest.spec
 
     @property
     def kind(self) -> str:
-        """The kind of the dataset, `rod_hang` or `cloth_drag`."""
-        return self.spec.kind
+        """The kind of the dataset, `rod_hang` for example."""
+        return str(self.spec.kind)
 
     @property
     def valid(self) -> Array:
@@ -152,6 +152,10 @@ class DatasetReader:
     def label_names(self) -> tuple[str, ...]:
         """Names of the labels."""
         return tuple(array.name for array in self.arrays.values() if not array.per_sample and len(array.shape) < 2)
+
+    def categories(self, name: str) -> tuple[str, ...]:
+        """Return the names of the codes 0, 1, ... of a categorical label; none where it is no such label."""
+        return tuple(map(str, self._array(name).categories))
 
     # --- samples ----------------------------------------------------------------------------------------------
 

@@ -6,6 +6,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from stickslip_training.cli.errors import errors_told
+
 
 def reconstruct(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="one picture for each camera, named as the camera")],
@@ -22,7 +24,7 @@ def reconstruct(
     # Heavy, and not needed by the other commands.
     from stickslip_training.reconstruction.photographs import reconstruct_folder, write_results
 
-    try:
+    with errors_told():
         result = reconstruct_folder(
             folder,
             calibration,
@@ -34,9 +36,6 @@ def reconstruct(
             radius=radius,
         )
         written = write_results(result, out)
-    except (ValueError, OSError, ImportError) as error:
-        Console(stderr=True).print(f"stickslip-train: {error}", style="red", soft_wrap=True, markup=False)
-        raise typer.Exit(1) from error
     found, console = result.reconstruction, Console()
     console.print(
         f"{found.verdict}: misfit {found.misfit:.1%}, residual {found.residual_rms:.2f} px, radius {found.radius:.4g}"

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from stickslip_training.curvature_net import POINTS
+from stickslip_training.rods.curvature_net import POINTS
 
 _COORDINATES = 3 * POINTS
 _STRIDE = 6

@@ -6,22 +6,21 @@ see. So errors that compare methods are errors of |kappa|.
 """
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.floating]
+from stickslip_training.arrays import AnyFloats, Floats
 
 
-def bending(strains: Floats) -> npt.NDArray[np.float64]:
+def bending(strains: AnyFloats) -> Floats:
     """Return |kappa| L, (..., points), of strains (..., points, 3)."""
     return np.asarray(np.hypot(strains[..., 1], strains[..., 2]), dtype=np.float64)
 
 
-def rms(difference: Floats) -> float:
+def rms(difference: AnyFloats) -> float:
     """Return the root mean square of all entries."""
     return float(np.sqrt(np.mean(np.square(difference, dtype=np.float64))))
 
 
-def relative_rms_error(estimate: Floats, truth: Floats) -> npt.NDArray[np.float64]:
+def relative_rms_error(estimate: AnyFloats, truth: AnyFloats) -> Floats:
     """Return the RMS relative error of each rod, (rods,), of |kappa| L, (rods, points):
 
     sqrt(mean_s (estimate - truth)^2) / sqrt(mean_s truth^2), over all points, the ends included.

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
+from stickslip_training.arrays import AnyFloats, SingleFloats
 
 
-def with_white_noise(centerline: npt.NDArray[np.floating], share: float, seed: tuple[int, ...]) -> Floats:
+def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...]) -> SingleFloats:
     """Add independent normal noise of standard deviation `share` (of L) to every coordinate of every point.
 
     The same `seed` gives the same noise. `centerline` is over L, (..., points, 3).
@@ -23,7 +22,7 @@ def with_white_noise(centerline: npt.NDArray[np.floating], share: float, seed: t
 class ReconstructionNoise:
     """What a reconstruction from pictures does to a centreline: correlated along the rod, and largest at its end."""
 
-    errors: Floats
+    errors: SingleFloats
     """Reconstructed less true centrelines [L], (rods, points, 3), of rods like those that it is meant for."""
 
     @staticmethod
@@ -33,7 +32,7 @@ class ReconstructionNoise:
             good = file["verdict"] == "good"
             return ReconstructionNoise((file["reconstructed"] - file["true"])[good].astype(np.float32))
 
-    def draw(self, count: int, generator: np.random.Generator) -> Floats:
+    def draw(self, count: int, generator: np.random.Generator) -> SingleFloats:
         """Return `count` new errors, (count, points, 3).
 
         Each is the mean, plus a cos(x) + b sin(x) of the deviations a, b of two measured errors and a random angle x:

@@ -5,17 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stickslip_training.curvature_baselines import quintic_spline_curvature
-from stickslip_training.curvature_errors import bending, relative_rms_error
-from stickslip_training.curvature_net import POINTS
-from stickslip_training.train_curvature import (
-    MODEL_NAME,
-    CurvatureTraining,
-    TrainingReport,
-    estimate_strains,
-    load_model,
-    read_test_rods,
-)
+from stickslip_training.engine.files import MODEL_NAME
+from stickslip_training.rods.baselines import quintic_spline_curvature
+from stickslip_training.rods.curvature import CurvatureTraining, TrainingReport, load_model, read_test_rods
+from stickslip_training.rods.curvature_net import POINTS
+from stickslip_training.rods.errors import bending, relative_rms_error
+from stickslip_training.rods.evaluation import estimate_strains
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

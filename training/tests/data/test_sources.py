@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stickslip_training.datasets import RodDataset
-from stickslip_training.errors import CorruptDataError, MissingFileError, SourceError
-from stickslip_training.reader import DatasetReader
-from stickslip_training.sources import HttpSource
+from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.sources import HttpSource
+from stickslip_training.kinds import RodDataset
 
 
 class _Server(http.server.ThreadingHTTPServer):

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from stickslip_training.errors import (
+from stickslip_training.data.errors import (
     CorruptDataError,
     InvalidDatasetError,
     MissingFileError,
     RejectedSampleError,
 )
-from stickslip_training.reader import DatasetReader
+from stickslip_training.data.reader import DatasetReader
 
 
 @pytest.mark.parametrize("name", ["clips", "rods", "seen_rods"])

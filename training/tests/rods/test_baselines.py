@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
-from stickslip_training.curvature_baselines import (
+from stickslip_training.rods.baselines import (
     cubic_spline_curvature,
     finite_difference_curvature,
     quintic_spline_curvature,
 )
-from stickslip_training.curvature_errors import bending, relative_rms_error, rms
-from stickslip_training.noise import with_white_noise
+from stickslip_training.rods.errors import bending, relative_rms_error, rms
+from stickslip_training.rods.noise import with_white_noise
 
 S = np.linspace(0.0, 1.0, 150)
 METHODS = [finite_difference_curvature, cubic_spline_curvature, quintic_spline_curvature]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from stickslip_schemas.layout import ArrayLayout
 
-from stickslip_training.errors import InvalidDatasetError
+from stickslip_training.data.errors import InvalidDatasetError
 
 GROUP_METADATA = "zarr.json"
 
