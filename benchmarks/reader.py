@@ -41,7 +41,7 @@ from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.tasks import FileEntry
-from stickslip_training.kinds import ClipDataset
+from stickslip_training.kinds.cloth_drag import ClipDataset
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
 Bytes = NDArray[np.uint8]

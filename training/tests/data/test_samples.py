@@ -7,7 +7,9 @@ import torch
 from stickslip_training.data.clips import ClipSamples
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Item, collate
-from stickslip_training.kinds import KINDS, ClipDataset, RodDataset, open_samples
+from stickslip_training.kinds import open_samples
+from stickslip_training.kinds.cloth_drag import ClipDataset
+from stickslip_training.kinds.rod_hang import RodDataset
 from torch.utils.data import DataLoader
 
 
@@ -51,15 +53,15 @@ def test_a_clip(clips):
         item.name("mu")
     assert item["mu"] == np.float32(0.4)
     assert item["side"] == clips.arrays["side"][10]
-    assert "mesh" not in item
+    assert "positions" not in item
 
 
 def test_a_clip_with_its_mesh(clips):
-    dataset = ClipDataset(clips.root, mesh=True)
-    assert np.array_equal(dataset[8]["mesh"].numpy(), clips.arrays["mesh"][10])
+    dataset = ClipDataset(clips.root, positions=True)
+    assert np.array_equal(dataset[8]["positions"].numpy(), clips.arrays["positions"][10])
     batch = dataset.__getitems__([8, 0, 3])
-    assert batch["mesh"].shape == (3, 300, 25, 3)
-    assert np.array_equal(batch["mesh"].numpy(), clips.arrays["mesh"][dataset.slots[[8, 0, 3]]])
+    assert batch["positions"].shape == (3, 300, 25, 3)
+    assert np.array_equal(batch["positions"].numpy(), clips.arrays["positions"][dataset.slots[[8, 0, 3]]])
     assert np.array_equal(dataset.rest().numpy(), clips.arrays["rest"][10])
     assert np.array_equal(dataset.triangles().numpy(), clips.arrays["triangles"][10])
     assert dataset.instants == (0, 150)
@@ -69,7 +71,7 @@ def test_a_dataset_without_meshes_says_so(make_clips):
     made = make_clips(store_mesh=False)
     assert ClipDataset(made.root)[1]["video"].shape == (2, 224, 224, 3)
     with pytest.raises(ValueError, match="the dataset has no array mesh; it has video"):
-        ClipDataset(made.root, mesh=True)
+        ClipDataset(made.root, positions=True)
     with pytest.raises(ValueError, match="the dataset has no rest: it was made with store_mesh: false"):
         ClipDataset(made.root).rest()
 
@@ -85,7 +87,7 @@ def test_a_batch_is_its_items(clips):
 
 
 def test_the_kind_of_a_dataset_chooses_its_class(clips, rods, monkeypatch):
-    assert type(open_samples(clips.root, "test", mesh=True)) is ClipDataset
+    assert type(open_samples(clips.root, "test", positions=True)) is ClipDataset
     assert type(open_samples(rods.root)) is RodDataset
     monkeypatch.delitem(KINDS, "rod_hang")
     with pytest.raises(ValueError, match="kind of the dataset must be one of cloth_drag, and is 'rod_hang'"):
