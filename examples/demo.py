@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from rich.console import Console
-from stickslip_services.client import Client
+from stickslip_services.client.http import Client
 from stickslip_training.datasets import ClipDataset, RodDataset
 
 BIN = Path(sys.executable).parent

@@ -12,12 +12,20 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
 from stickslip_schemas.states import JobState
 from stickslip_schemas.worker_api import Lease
-from stickslip_services.audit import audit
 from stickslip_services.errors import ConflictError
-from stickslip_services.operations import Coordinator
-from stickslip_services.paging import PageRequest
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rejection, rods
+from stickslip_services.testing import (
+    ManualClock,
+    PretendWorker,
+    failure,
+    list_datasets,
+    list_jobs,
+    parsed,
+    rejection,
+    rods,
+)
 
 SPECS = (
     rods(gamma=(1.0,)),
@@ -155,12 +163,12 @@ class QueueMachine(RuleBasedStateMachine):
 
     @invariant()
     def what_has_ended_stays_so(self) -> None:
-        for job in self.coordinator.list_jobs(PageRequest(1000, None)).items:
+        for job in list_jobs(self.coordinator):
             if job.state.is_terminal:
                 assert self.ended.setdefault(job.id, job.state) is job.state
             else:
                 assert job.id not in self.ended
-        for dataset in self.coordinator.list_datasets(PageRequest(1000, None)).items:
+        for dataset in list_datasets(self.coordinator):
             for version in dataset.versions:
                 key = (dataset.id, version.version)
                 assert self.manifests.setdefault(key, version.manifest) == version.manifest
@@ -173,7 +181,7 @@ class QueueMachine(RuleBasedStateMachine):
         for _ in range(10):
             self.clock.advance(60)
             worker.work()
-        for job in self.coordinator.list_jobs(PageRequest(1000, None)).items:
+        for job in list_jobs(self.coordinator):
             assert job.state.is_terminal, f"{job.id} is {job.state}"
         self.ledger_is_right()
         self.coordinator.close()

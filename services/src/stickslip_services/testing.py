@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import (
@@ -45,7 +46,12 @@ from stickslip_schemas.worker_api import (
     WorkerSession,
 )
 
-from stickslip_services.sockets import listen
+from stickslip_services.catalog import datasets
+from stickslip_services.database.paging import PageRequest
+from stickslip_services.local.sockets import listen
+from stickslip_services.queue import jobs
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.jobs import find_job
 
 A = TypeVar("A", bound=BaseModel)
 
@@ -87,6 +93,24 @@ def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed")
 def rejection(message: str = "it diverged") -> TaskResult:
     """Return a rejected sample."""
     return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
+
+
+def show_job(coordinator: Coordinator, job_id: str) -> JobDetail:
+    """Return a job."""
+    with coordinator.database.read() as connection:
+        return coordinator.show(connection, find_job(connection, job_id).seq)
+
+
+def list_jobs(coordinator: Coordinator) -> tuple[Job, ...]:
+    """Return all jobs, newest first."""
+    with coordinator.database.read() as connection:
+        return jobs.list_jobs(connection, PageRequest(1000, None), ()).items
+
+
+def list_datasets(coordinator: Coordinator) -> tuple[Dataset, ...]:
+    """Return all datasets, newest first."""
+    with coordinator.database.read() as connection:
+        return datasets.list_datasets(connection, PageRequest(1000, None)).items
 
 
 @dataclass
