@@ -584,3 +584,103 @@ def test_the_time_left_is_measured(coordinator: Coordinator, worker: PretendWork
     earlier = show_job(coordinator, submit(coordinator, gamma=(8.0,))).progress.eta
     assert earlier is not None  # from the job before
     assert earlier.seconds == pytest.approx(4.0)  # 6 tasks on 2 slots, but each stage waits for the one before
+
+
+class TestPausing:
+    """Pausing: nothing more is leased, what runs finishes, and resuming goes on."""
+
+    def test_running_tasks_finish_and_nothing_more_is_leased(
+        self, coordinator: Coordinator, worker: PretendWorker
+    ) -> None:
+        job = submit(coordinator)
+        running, waiting = worker.lease(simulate=2)
+        worker.start(running)
+        assert coordinator.pause(job).state is JobState.pausing
+        assert coordinator.pause(job).state is JobState.pausing  # asked twice, it is one pause
+        assert worker.lease() == ()
+        assert worker.start(running) == ()
+        assert worker.beat(waiting) == (waiting.task_id,)  # it had not been started: given back
+        assert counts(coordinator, job, Stage.simulate) == {TaskState.pending: 3, TaskState.running: 1}
+        assert worker.finish(running) == ["accepted"]
+        shown = show_job(coordinator, job)
+        assert (shown.state, shown.progress.eta) == (JobState.paused, None)
+        assert worker.lease() == ()
+        check(coordinator)
+        assert coordinator.resume(job).state is JobState.running
+        assert coordinator.resume(job).state is JobState.running
+        worker.work()
+        assert show_job(coordinator, job).state is JobState.succeeded
+        assert len(worker.ran) == len(set(worker.ran)) == 11
+        check(coordinator)
+
+    def test_it_survives_a_restart(self, settings: Settings, clock: ManualClock) -> None:
+        before = Coordinator(settings, clock)
+        before.start()
+        worker = PretendWorker(before, before.store).register()
+        job = submit(before)
+        assert before.pause(job).state is JobState.paused
+        before.close()
+        after = Coordinator(settings, clock)
+        after.start()
+        worker = PretendWorker(after, after.store).register()
+        after.sweep()
+        assert worker.lease() == ()
+        assert show_job(after, job).state is JobState.paused
+        assert after.resume(job).state is JobState.queued
+        worker.work()
+        assert show_job(after, job).state is JobState.succeeded
+        after.close()
+
+    def test_others_run_what_a_paused_job_shares(self, coordinator: Coordinator, worker: PretendWorker) -> None:
+        first = submit(coordinator)
+        coordinator.pause(first)
+        second = submit(coordinator, gamma=(1.0, 2.0), name="second")  # the same tasks
+        third = submit(coordinator, gamma=(1.0,))
+        coordinator.pause(second)
+        check(coordinator)
+        assert [len(worker.lease(simulate=10))] == [2]  # those of the third
+        coordinator.resume(second)
+        check(coordinator)
+        for lease in worker.lease(simulate=10):
+            worker.finish(lease)
+        coordinator.cancel(third)
+        worker.register()
+        worker.work()
+        assert show_job(coordinator, second).state is JobState.succeeded
+        assert show_job(coordinator, first).state is JobState.succeeded  # its dataset was made for another
+        check(coordinator)
+
+    def test_a_job_that_waits_for_the_first_worker(self, coordinator: Coordinator) -> None:
+        job = submit(coordinator)
+        assert coordinator.pause(job).state is JobState.paused
+        worker = PretendWorker(coordinator, coordinator.store).register()
+        assert show_job(coordinator, job).progress.total == 0
+        assert coordinator.resume(job).state is JobState.queued
+        worker.work()
+        assert show_job(coordinator, job).state is JobState.succeeded
+
+    def test_ended_jobs_refuse(self, coordinator: Coordinator, worker: PretendWorker) -> None:
+        done, dropped = submit(coordinator), submit(coordinator, gamma=(5.0,))
+        coordinator.pause(dropped)
+        assert coordinator.cancel(dropped).state is JobState.cancelled
+        worker.work()
+        for job in (done, dropped):
+            with pytest.raises(ConflictError, match="can be paused"):
+                coordinator.pause(job)
+            with pytest.raises(ConflictError, match="can be resumed"):
+                coordinator.resume(job)
+
+    def test_a_lost_worker_does_not_undo_it(
+        self, coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    ) -> None:
+        job = submit(coordinator)
+        worker.start(*worker.lease(simulate=1))
+        coordinator.pause(job)
+        clock.advance(31)
+        coordinator.sweep()
+        clock.advance(5)
+        coordinator.sweep()
+        assert show_job(coordinator, job).state is JobState.paused
+        assert counts(coordinator, job, Stage.simulate) == {TaskState.pending: 4}
+        assert worker.lease() == ()
+        check(coordinator)

@@ -15,7 +15,7 @@ from stickslip_services.database.tables import (
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.ledger import LIVE, OPEN
+from stickslip_services.queue.ledger import LIVE, OPEN, RUNNABLE
 
 
 def audit(connection: Connection) -> list[str]:
@@ -37,6 +37,8 @@ def _task_faults(connection: Connection) -> list[str]:
         )
     )
     live_jobs = set(connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(LIVE))))
+    runnable_jobs = set(connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))))
+    runnable_tasks = set(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job.in_(runnable_jobs))))
     for row in connection.execute(select(tasks)):
         held = row.state in (TaskState.leased, TaskState.running)
         if held != (row.owner is not None) or held != (row.expires_at is not None):
@@ -45,6 +47,8 @@ def _task_faults(connection: Connection) -> list[str]:
             faults.append(f"task {row.seq} is {row.state} and no live job needs it")
         if row.state in (TaskState.pending, TaskState.soft_failed) and row.job not in live_jobs:
             faults.append(f"task {row.seq} is {row.state} and charged to a job that is not live")
+        if row.state == TaskState.pending and row.seq in runnable_tasks and row.job not in runnable_jobs:
+            faults.append(f"task {row.seq} is pending for a job that may run and charged to one that may not")
         if (row.state == TaskState.succeeded) != (row.output is not None):
             faults.append(f"task {row.seq} is {row.state} and its output says otherwise")
         if (row.state == TaskState.soft_failed) != (row.retry_at is not None):
