@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from rich.console import Console
-from stickslip_services.client import Client
+from stickslip_services.client.http import Client
 from stickslip_training.kinds.cloth_drag import ClipDataset
 from stickslip_training.kinds.rod_hang import RodDataset
 

@@ -58,9 +58,7 @@ def write_dataset(
     root: Path, spec: RodHangSpec | ClothDragSpec, content: dict[str, np.ndarray], rejected: tuple[int, ...] = ()
 ) -> MadeDataset:
     """Write a dataset version with zarr-python; `content` has the arrays that are not in every dataset."""
-    builds = Builds(
-        sim_core=sha256(b"s"), simulate=sha256(b"sim_core"), render=sha256(b"blender"), pack=sha256(b"packer")
-    )
+    builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     planned = list(samples(spec, builds))
     valid = np.ones(len(planned), dtype=bool)
     valid[list(rejected)] = False
@@ -213,7 +211,7 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
 
 def write_rods(root: Path, spec: RodHangSpec, rejected: tuple[int, ...] = ()) -> MadeDataset:
     """Write a dataset of made-up rods, with noise for pictures where the spec asks for views."""
-    builds = Builds(sim_core=sha256(b"s"), simulate=sha256(b"a"), render=sha256(b"b"), pack=sha256(b"c"))
+    builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     labels = [sample.labels for sample in samples(spec, builds)]
     parameters = {name: np.array([label[name] for label in labels]) for name in ("gamma", "phi0", "phi1")}
     content = {**parameters, **curves(**parameters), "energy": np.linspace(-1.0, 1.0, len(labels))}
@@ -229,7 +227,7 @@ def write_rods(root: Path, spec: RodHangSpec, rejected: tuple[int, ...] = ()) ->
 
 def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ()) -> MadeDataset:
     """Write a dataset of clips that are noise over a few bits, so that they compress a little."""
-    builds = Builds(sim_core=sha256(b"s"), simulate=sha256(b"a"), render=sha256(b"b"), pack=sha256(b"c"))
+    builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     names = {array.name: array.categories for array in layout(spec)}
     labels = [sample.labels for sample in samples(spec, builds)]
     generator = np.random.default_rng(2)

@@ -10,7 +10,7 @@ from stickslip_training.data.samples import SampleDataset
 
 
 class ClipSamples(SampleDataset):
-    """Clips of cloth: `video` (frames, 224, 224, 3) uint8, the labels of the kind, and the positions of the vertices where wanted."""
+    """Clips of cloth: `video` (frames, 224, 224, 3) uint8, the labels of the kind, and on request the vertices."""
 
     labels: ClassVar[tuple[str, ...]]
     """The labels of an item: int64 where they are codes or counts, float32 where they are quantities."""
@@ -42,7 +42,5 @@ class ClipSamples(SampleDataset):
     def _of_any_sample(self, name: str) -> torch.Tensor:
         valid = self.reader.slots()
         if name not in self.reader.arrays or not len(valid):
-            raise ValueError(
-                f"the dataset has no {name}: it was made with store_positions: false, or has no valid sample"
-            )
+            raise ValueError(f"the dataset has no {name}: its spec says store_positions: false, or no sample is valid")
         return torch.from_numpy(self.reader.read(name, valid[:1])[0].copy())
