@@ -3,6 +3,7 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
 #include <ctime>
 #include <limits>
 #include <set>
@@ -81,6 +82,11 @@ Body between(const Body& a, const Body& b, double share) {
 }  // namespace
 
 ClothKernel best_cloth_kernel() {
+  if (const char* asked = std::getenv("STICKSLIP_CLOTH_KERNEL")) {
+    const std::string name = asked;
+    if (name == "baseline") return cloth_kernel_baseline();
+    if (name == "x86-64-v3") return cloth_kernel_x86_64_v3();
+  }
 #ifdef SIM_CORE_X86_64_KERNELS
   __builtin_cpu_init();
   if (__builtin_cpu_supports("x86-64-v4")) return cloth_kernel_x86_64_v4();
