@@ -1,5 +1,6 @@
 """Sheets that move in contact with bodies: the thin face of the C++ solver."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -12,6 +13,9 @@ from stickslip_sim_core.meshes import Mesh
 from stickslip_sim_core.presets import Preset
 
 Floats = NDArray[np.float64]
+
+KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
+"""Environment variable that names the level of the kernels."""
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -93,6 +97,7 @@ class Cloth:
         held: ArrayLike = (),
         clamped: ArrayLike | None = None,
         force_scale: float | None = None,
+        kernel: str | None = None,
     ) -> None:
         self.mesh, self.fabric, self.preset = mesh, fabric, preset
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
@@ -116,6 +121,7 @@ class Cloth:
             krylov_tolerance=preset.krylov_tolerance,
             refactor_after=preset.refactor_after,
             halvings_max=preset.halvings_max,
+            kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
         )
         self.time = 0.0
         self.steps = self.unconverged_steps = 0
