@@ -1,11 +1,10 @@
 """Numbers that say what a hanging rod looks like: how near it comes to itself, how far it reaches sideways."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from stickslip_sim_core.rods import finite_array
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.solve import finite_array
 
 
 def reach(centerline: ArrayLike) -> Floats:

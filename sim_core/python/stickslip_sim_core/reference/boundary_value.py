@@ -15,7 +15,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+
 Numbers = NDArray[np.inexact]
 Rate = Callable[[Floats, Numbers, Numbers], Numbers]
 Conditions = Callable[[Numbers, Numbers, Numbers], Numbers]

@@ -1,4 +1,4 @@
-"""Sheets that move in contact with bodies: the thin face of the C++ solver."""
+"""Pieces of cloth that move in contact with bodies: the thin face of the C++ solver."""
 
 import os
 from collections.abc import Sequence
@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh
-from stickslip_sim_core.fabrics import Fabric
-from stickslip_sim_core.meshes import Mesh
-from stickslip_sim_core.presets import Preset
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.fabrics import Fabric
+from stickslip_sim_core.cloth.meshes import Mesh
+from stickslip_sim_core.cloth.presets import SolverSettings
 
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that names the level of the kernels."""
@@ -74,15 +73,18 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
 
 
 class Cloth:
-    """A sheet, its state, and the settings by which it is stepped.
+    """A piece of cloth, its state, and the settings by which it is stepped.
 
     Args:
-        mesh: The sheet at rest.
+        mesh: The cloth at rest.
         fabric: What it is made of.
         preset: Solver settings.
         held: (K,) vertices whose positions are prescribed.
         clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
             outward normal of the rest plane.
+        force_scale: Force that residuals are measured in [N]; None is the weight of a node.
+        kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
+            that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -92,7 +94,7 @@ class Cloth:
         self,
         mesh: Mesh,
         fabric: Fabric,
-        preset: Preset,
+        preset: SolverSettings,
         *,
         held: ArrayLike = (),
         clamped: ArrayLike | None = None,
@@ -131,6 +133,11 @@ class Cloth:
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     @property
+    def kernel(self) -> str:
+        """Level of the kernels that step it."""
+        return str(self._solver.kernel())
+
+    @property
     def masses(self) -> Floats:
         """(V,) [kg]."""
         return np.asarray(self._solver.masses())
@@ -163,7 +170,7 @@ class Cloth:
     def set_state(
         self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
     ) -> None:
-        """Put the sheet somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3)."""
+        """Put the cloth somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3)."""
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
         if slopes is not None:
@@ -183,12 +190,15 @@ class Cloth:
 
         In the first step after `set_state` bodies are taken to have been where they are.
 
-        `damping` is proportional to mass [1/s]. A step that does not converge is counted and its best iterate kept.
+        `damping` is proportional to mass [1/s]; that of the fabric is added.
+        A step that does not converge is counted and its best iterate kept.
         """
         if slopes is not None:
             self.slopes = np.asarray(slopes, float)
         ends = np.asarray(held, float).reshape(-1, 3)
-        report = self._solver.step(dt, self.gravity, ends, self.slopes, [body.as_tuple() for body in bodies], damping)
+        report = self._solver.step(
+            dt, self.gravity, ends, self.slopes, [body.as_tuple() for body in bodies], damping + self.fabric.damping
+        )
         self.time += dt
         self.steps += 1
         self.unconverged_steps += not report.converged

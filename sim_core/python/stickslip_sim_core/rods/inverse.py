@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from stickslip_sim_core.general_rods import CLAMP_FRAME, STIFFNESS, clamp_quaternions, rod_stiffness
-from stickslip_sim_core.rods import finite_array
-from stickslip_sim_core.splines import interpolation_matrix
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.general import CLAMP_FRAME, STIFFNESS, clamp_quaternions, rod_stiffness
+from stickslip_sim_core.rods.solve import finite_array
+from stickslip_sim_core.rods.splines import interpolation_matrix
 
 GRAVITY = np.array([0.0, 0.0, -1.0])
 

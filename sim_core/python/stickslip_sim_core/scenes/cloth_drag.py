@@ -1,15 +1,16 @@
-"""What is simulated: cloth, what holds it, what it touches, and how these move."""
+"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3]."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stickslip_sim_core import cloth, fabrics, meshes
 from stickslip_sim_core._sim_core import self_intersections
-from stickslip_sim_core.presets import Preset, preset_named
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, plane
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -31,7 +32,7 @@ FRAME_RATE = 2.4
 
 
 def travel(time: float, distance: float) -> float:
-    """Return how far a stage has come that starts and ends at rest with `ACCELERATION` and cruises at `SPEED` [m]."""
+    """Return how far holders have come that start and end at rest with `ACCELERATION` and cruise at `SPEED` [m]."""
     ramp = SPEED / ACCELERATION
     duration = duration_of(distance)
     t = min(max(time, 0.0), duration)
@@ -47,7 +48,7 @@ def duration_of(distance: float) -> float:
     return distance / SPEED + SPEED / ACCELERATION
 
 
-def stage(time: float) -> Floats:
+def holder_path(time: float) -> Floats:
     """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]."""
     start, leg = duration_of(DROP), duration_of(DRAG)
     x, direction = 0.0, 1.0
@@ -75,7 +76,7 @@ class DropAndDrag:
     """(frames, V, 3) [m]"""
 
     rest: Floats
-    """(V, 2) [m]: the first axis, the warp, runs along the held edge (world y), the second up the sheet."""
+    """(V, 2) [m]: the first axis, the warp, runs along the held edge (world y), the second up the cloth."""
 
     triangles: NDArray[np.int32]
     """(T, 3)"""
@@ -124,9 +125,9 @@ def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
     return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
 
 
-def hang(sheet: cloth.Cloth, floor: list[cloth.Body], *, seed: int) -> tuple[Floats, Tilt]:
-    """Let the sheet come to rest under its holders; return their vertices' positions (K, 3) and the tilt of gravity."""
-    rest = sheet.mesh.rest
+def hang(cloth: Cloth, floor: list[Body], *, seed: int) -> tuple[Floats, Tilt]:
+    """Let the cloth come to rest under its holders; return their vertices' positions (K, 3) and the tilt of gravity."""
+    rest = cloth.mesh.rest
     hung = np.zeros((len(rest), 3))
     hung[:, 1] = rest[:, 0]
     hung[:, 2] = rest[:, 1] + SIDE / 2 + CLEARANCE
@@ -135,27 +136,27 @@ def hang(sheet: cloth.Cloth, floor: list[cloth.Body], *, seed: int) -> tuple[Flo
     bias = float(rng.uniform(1e-3, 3e-3))
     twist = float(rng.uniform(-0.3, 0.3))
     tilt = Tilt(side, bias, side * bias * (1.0 + twist * rest[:, 0] / (SIDE / 2)))
-    sheet.set_state(hung)
-    sheet.gravity[:, 0] = tilt.of_vertices * cloth.GRAVITY
+    cloth.set_state(hung)
+    cloth.gravity[:, 0] = tilt.of_vertices * GRAVITY
     for _ in range(SETTLING_STEPS):
-        sheet.step(0.05, held=hung[sheet.held], bodies=floor, damping=5.0)
-    sheet.set_state(sheet.positions)
-    return hung[sheet.held], tilt
+        cloth.step(0.05, held=hung[cloth.held], bodies=floor, damping=5.0)
+    cloth.set_state(cloth.positions)
+    return hung[cloth.held], tilt
 
 
-def drag(sheet: cloth.Cloth, floor: list[cloth.Body], hung: Floats, tilt: Tilt, time: float, dt: float) -> None:
-    """Step the sheet to `time` after the start of the stage; gravity is upright one second after the drop."""
+def drag(cloth: Cloth, floor: list[Body], hung: Floats, tilt: Tilt, time: float, dt: float) -> None:
+    """Step the cloth to `time` after the holders have started; gravity is upright one second after the drop."""
     upright = min(max(time - duration_of(DROP), 0.0), 1.0)
-    sheet.gravity[:, 0] = tilt.of_vertices * cloth.GRAVITY * (1.0 - upright)
-    x, z = stage(time)
-    sheet.step(dt, held=hung + np.array([x, 0.0, z]), bodies=floor)
+    cloth.gravity[:, 0] = tilt.of_vertices * GRAVITY * (1.0 - upright)
+    x, z = holder_path(time)
+    cloth.step(dt, held=hung + np.array([x, 0.0, z]), bodies=floor)
 
 
 def drop_and_drag(
-    material: str,
+    fabric: str | Fabric,
     mu: float,
     *,
-    preset: str | Preset = "certified",
+    preset: str | SolverSettings = "certified",
     vertices: int = 41,
     frames: int = FRAMES,
     seed: int = 0,
@@ -163,12 +164,12 @@ def drop_and_drag(
 ) -> DropAndDrag:
     """Hold a square of cloth by two corners, lower it onto a plane and drag it to and fro [thesis, 4.2.3].
 
-    The cloth hangs at rest, 1 cm over the floor, when the stage starts. A drop without imperfection would buckle to
-    neither side: gravity is tilted along x by `bias`, a little more on one side of the sheet than on the other, both
-    drawn from `seed`, until the drop ends, and set upright within the second after.
+    The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A drop without imperfection would
+    buckle to neither side: gravity is tilted along x by `bias`, a little more on one side of the cloth than on the other,
+    both drawn from `seed`, until the drop ends, and set upright within the second after.
 
     Args:
-        material: One of `fabric_names()`.
+        fabric: One of `fabric_names()`, or one of your own.
         mu: Coefficient of friction between cloth and floor, >= 0.
         preset: Solver settings, or their name.
         vertices: Vertices a side of the mesh, at least 5.
@@ -184,44 +185,44 @@ def drop_and_drag(
         raise ValueError(f"frames: must be 1 ... {FRAMES}, got {frames}")
     if vertices < 5:
         raise ValueError(f"vertices: must be at least 5, got {vertices}")
-    sheet = meshes.grid(SIDE, SIDE, vertices - 1, vertices - 1) if mesh is None else mesh
-    held = held_by_holders(sheet)
-    floor = [cloth.plane(mu)]
-    simulated = cloth.Cloth(sheet, fabrics.fabric(material), settings, held=held)
-    hung, tilt = hang(simulated, floor, seed=seed)
+    mesh = meshes.grid(SIDE, SIDE, vertices - 1, vertices - 1) if mesh is None else mesh
+    held = held_by_holders(mesh)
+    floor = [plane(mu)]
+    cloth = Cloth(mesh, fabric_of(fabric), settings, held=held)
+    hung, tilt = hang(cloth, floor, seed=seed)
     per_frame = int(np.ceil(1.0 / (FRAME_RATE * settings.time_step)))
     dt = 1.0 / (FRAME_RATE * per_frame)
-    masses = simulated.masses[:, None]
-    weight = simulated.masses.sum() * np.array([0.0, 0.0, -cloth.GRAVITY])
-    positions, contact, holders = [simulated.positions], [np.zeros(3)], [-weight]
+    masses = cloth.masses[:, None]
+    weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
+    positions, contact, holders = [cloth.positions], [np.zeros(3)], [-weight]
     for frame in range(1, frames):
         for step in range(1, per_frame + 1):
-            before = (masses * simulated.velocities).sum(axis=0) if step == per_frame else None
-            drag(simulated, floor, hung, tilt, (frame - 1) / FRAME_RATE + step * dt, dt)
+            before = (masses * cloth.velocities).sum(axis=0) if step == per_frame else None
+            drag(cloth, floor, hung, tilt, (frame - 1) / FRAME_RATE + step * dt, dt)
             if before is not None:
-                pushed = ((masses * simulated.velocities).sum(axis=0) - before) / dt
-                pulled = simulated.reactions[held].sum(axis=0)
-                contact.append(pushed - (masses * simulated.gravity).sum(axis=0) - pulled)
+                pushed = ((masses * cloth.velocities).sum(axis=0) - before) / dt
+                pulled = cloth.reactions[held].sum(axis=0)
+                contact.append(pushed - (masses * cloth.gravity).sum(axis=0) - pulled)
                 holders.append(pulled)
-        positions.append(simulated.positions)
+        positions.append(cloth.positions)
         if not np.isfinite(positions[-1]).all():
             break
     path = np.stack(positions)
     finite = bool(np.isfinite(path).all())
-    reason = simulated.why_invalid(path)
+    reason = cloth.why_invalid(path)
     return DropAndDrag(
         positions=path,
-        rest=sheet.rest,
-        triangles=sheet.triangles,
+        rest=mesh.rest,
+        triangles=mesh.triangles,
         times=np.arange(len(path)) / FRAME_RATE,
         contact_force=np.stack(contact),
         holder_force=np.stack(holders),
-        self_intersections=np.array([self_intersections(p, sheet.triangles) if finite else 0 for p in path], np.int32),
+        self_intersections=np.array([self_intersections(p, mesh.triangles) if finite else 0 for p in path], np.int32),
         side=tilt.side,
         bias=tilt.bias,
-        steps=simulated.steps,
-        unconverged_steps=simulated.unconverged_steps,
-        worst_residual=simulated.worst_residual,
+        steps=cloth.steps,
+        unconverged_steps=cloth.unconverged_steps,
+        worst_residual=cloth.worst_residual,
         valid=not reason,
         reason=reason,
     )

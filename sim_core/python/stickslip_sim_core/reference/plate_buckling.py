@@ -24,9 +24,8 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
 
 # Degree of the highest derivatives, W_xx and u_x; elements between the clamp and x = w, and between an edge and y = 0.
 DEGREE = 4

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core import _sim_core
-from stickslip_sim_core.general_rods import (
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.general import (
     CLAMP_FRAME,
     ELEMENT_TURN_MAX,
     STIFFNESS,
@@ -20,10 +21,8 @@ from stickslip_sim_core.general_rods import (
     rod_stiffness,
     solve_general_rods,
 )
-from stickslip_sim_core.rods import RodSolution, check_count, finite_array
-from stickslip_sim_core.splines import bspline_matrix, interpolation_matrix
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.rods.solve import RodSolution, check_count, finite_array
+from stickslip_sim_core.rods.splines import bspline_matrix, interpolation_matrix
 
 ELEMENTS_MIN = 96
 """Elements of the coarser chain are at least this many."""

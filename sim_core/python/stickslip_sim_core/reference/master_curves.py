@@ -12,12 +12,11 @@ from functools import cached_property, lru_cache
 from math import gamma as gamma_function
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from stickslip_sim_core import boundary_value, plate_buckling
-from stickslip_sim_core.boundary_value import NotSolvedError, Numbers, Solution
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.reference import boundary_value, plate_buckling
+from stickslip_sim_core.reference.boundary_value import NotSolvedError, Numbers, Solution
 
 
 def cantilever(gamma: ArrayLike) -> Floats:

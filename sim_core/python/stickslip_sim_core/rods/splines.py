@@ -3,9 +3,8 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
 
 
 def bspline_matrix(intervals: int, s: Floats, derivative: int = 0) -> Floats:

@@ -1,13 +1,12 @@
 """Equilibria of suspended rods beyond three numbers: natural curvature along s, three stiffnesses, any clamp."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stickslip_sim_core import _sim_core
-from stickslip_sim_core.rods import RodSolution, check_count, finite_array
-from stickslip_sim_core.splines import interpolation_matrix
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.solve import RodSolution, check_count, finite_array
+from stickslip_sim_core.rods.splines import interpolation_matrix
 
 STIFFNESS = (2.0 / 3.0, 1.0, 1.0)
 """K = diag(C, 1, 1) of a round, incompressible rod: C = GJ/EI = 1/(1 + 1/2)."""

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core.general_rods import ELEMENT_TURN_MAX, solve_general_rods
-from stickslip_sim_core.rods import RodSolution, finite_array, solve_rods
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.general import ELEMENT_TURN_MAX, solve_general_rods
+from stickslip_sim_core.rods.solve import RodSolution, finite_array, solve_rods
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 DISTINCT = 1e-3
