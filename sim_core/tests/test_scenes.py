@@ -142,7 +142,9 @@ class TestRotatingSphere:
         assert np.hypot(*scene.bias) > 0.0
         weight = fabric("gray-interlock").density * 0.04 * GRAVITY
         assert scene.contact_force[-1] == pytest.approx([0.0, 0.0, weight], abs=0.05 * weight)
-        assert (scene.floor_force + scene.sphere_force)[30:] == pytest.approx(scene.contact_force[30:], abs=1e-3 * weight)
+        assert (scene.floor_force + scene.sphere_force)[30:] == pytest.approx(
+            scene.contact_force[30:], abs=1e-3 * weight
+        )
         assert scene.self_intersections.shape == (76,)
 
     def test_smooth_sphere_does_not(self) -> None:

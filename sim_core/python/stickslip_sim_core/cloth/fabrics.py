@@ -17,7 +17,7 @@ DENSITY_BOUNDS = (1e-3, 100.0)
 STRETCHING_MAX = 1e7
 """Of each number of the table [N/m]."""
 
-RIGIDITY_BOUNDS = (1e-10, 10.0)
+RIGIDITY_BOUNDS = (1e-12, 10.0)
 """Of the stiffness against bending in each direction [N m]."""
 
 DAMPING_MAX = 1e3
@@ -89,28 +89,28 @@ class Fabric:
 
 
 def own_fabric(
+    name: str,
     density: float,
     *,
     stretching: ArrayLike | None = None,
     young: float | None = None,
-    poisson: float = 0.0,
+    poisson: float | None = None,
     thickness: float | None = None,
     bending: ArrayLike | None = None,
     damping: float = 0.0,
-    name: str = "own",
 ) -> Fabric:
     """Return a fabric from measured numbers: a stretching table with bending, or Young's modulus with thickness.
 
     Args:
+        name: For messages.
         density: Mass per area [kg/m^2].
         stretching: (6, 4) [N/m], as `Fabric.stretching`; or `young`.
         young: Young's modulus [Pa], of an isotropic fabric with `poisson` and `thickness`.
-        poisson: Poisson's ratio, in [0, 0.5].
+        poisson: Poisson's ratio, in [0, 0.5]; None is 0.
         thickness: [m]
         bending: D [N m]: (3,) of warp, weft and twist (D11, D22, D66), or (3, 3). Without it, the plate's of `young`,
             E h^3 / (12 (1 - poisson^2)).
         damping: Proportional to mass [1/s].
-        name: For messages.
 
     Raises:
         ValueError: A number breaks its rule, or there are too many or too few.
@@ -120,6 +120,7 @@ def own_fabric(
     if young is not None:
         if thickness is None:
             raise ValueError("thickness: must be given with young")
+        poisson = 0.0 if poisson is None else poisson
         _within("young", young, 1.0, 1e13)
         _within("thickness", thickness, 1e-6, 0.1)
         _within("poisson", poisson, 0.0, 0.5)

@@ -165,8 +165,8 @@ def drop_and_drag(
     """Hold a square of cloth by two corners, lower it onto a plane and drag it to and fro [thesis, 4.2.3].
 
     The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A drop without imperfection would
-    buckle to neither side: gravity is tilted along x by `bias`, a little more on one side of the cloth than on the other,
-    both drawn from `seed`, until the drop ends, and set upright within the second after.
+    buckle to neither side: gravity is tilted along x by `bias`, a little more on one side of the cloth than on the
+    other, both drawn from `seed`, until the drop ends, and set upright within the second after.
 
     Args:
         fabric: One of `fabric_names()`, or one of your own.
