@@ -14,18 +14,18 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Reason, Stage
+from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
 from stickslip_workers.backoff import Backoff
 from stickslip_workers.coordinator import Coordinator, CoordinatorError, UnknownWorkerError, UnreachableError
-from stickslip_workers.failures import failed, failure, process_failure
+from stickslip_workers.failures import AnyTask, damaged_inputs, failed, failure, process_failure
 from stickslip_workers.heartbeat import HeartbeatThread
 from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import Settings
 from stickslip_workers.stages.kinds import KINDS, KindName
-from stickslip_workers.stages.run import AnyTask
 
 log = logging.getLogger(__name__)
 
@@ -96,6 +96,7 @@ class Dispatcher:
                 **common,
             )
         )
+        self._store = Store(settings.store)
         self._coordinator = Coordinator(settings.url)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
@@ -199,7 +200,10 @@ class Dispatcher:
                 log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
                 pool.bury(assignment.process)
             result = process_failure(error, renders=assignment.stage is Stage.render)
-            results = [result] * len(assignment.leases)
+            results = [
+                result.model_copy(update={"damaged_inputs": damaged_inputs(lease.task, self._store)})
+                for lease in assignment.leases
+            ]
         else:
             pool.give_back(assignment.process, resident)
             results = _read_results(answer, len(assignment.leases))

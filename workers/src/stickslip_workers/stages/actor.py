@@ -7,7 +7,8 @@ from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import Task, TaskResult
 
 from stickslip_workers import builds
-from stickslip_workers.stages.run import AnyTask, run_tasks
+from stickslip_workers.failures import AnyTask
+from stickslip_workers.stages.run import run_tasks
 
 _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
 _results = TypeAdapter(list[TaskResult])

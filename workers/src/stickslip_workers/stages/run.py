@@ -4,14 +4,12 @@ import time
 from collections.abc import Sequence
 
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult
+from stickslip_schemas.tasks import PackTask, PublishTask, SimulateTask, TaskResult
 
-from stickslip_workers.failures import failure
+from stickslip_workers.failures import AnyTask, damaged_inputs, failure
 from stickslip_workers.stages.kinds import KINDS
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
-
-AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
@@ -23,12 +21,18 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     try:
         results = _run(tasks, store)
     except Exception as error:
-        results = [failure(error)] * len(tasks)
+        results = [_failure(error, task, store) for task in tasks]
     share = {
         "cpu_seconds": (time.process_time() - cpu) / len(tasks),
         "wall_seconds": (time.perf_counter() - wall) / len(tasks),
     }
     return [result.model_copy(update=share) for result in results]
+
+
+def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
+    """Return the result of a task that raised; it names all damaged inputs, so that they are made again at once."""
+    damaged = damaged_inputs(task, store)
+    return failure(error).model_copy(update={"damaged_inputs": damaged})
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
