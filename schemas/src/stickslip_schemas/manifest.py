@@ -6,15 +6,15 @@ the form that `sha256sum --check` reads. So a bit that flips in any of the three
 """
 
 import json
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import Camera
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.tasks import FileEntry, Rejection
 
 MANIFEST_NAME = "manifest.json"
@@ -36,7 +36,7 @@ class Manifest(Document):
     format: Literal["stickslip-dataset/1"] = "stickslip-dataset/1"
     dataset: str
     version: int = Field(ge=1)
-    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec: AnyJobSpec
     spec_digest: Sha256
     builds: Builds
     certificate: Sha256 | None = Field(

@@ -15,10 +15,10 @@ import httpx
 import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.chunks import encode_chunk
-from stickslip_schemas.jobs import job_spec_adapter
-from stickslip_schemas.layout import SAMPLE_KEY_BYTES
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
@@ -58,7 +58,7 @@ from stickslip_services.queue.jobs import find_job
 
 A = TypeVar("A", bound=BaseModel)
 
-BUILDS = Builds(sim_core="a" * 64, blender="b" * 64, packer="c" * 64)
+BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 ALL_STAGES = dict.fromkeys(Stage, 1000)
 
 
@@ -133,7 +133,7 @@ class PretendWorker:
     def register(self) -> "PretendWorker":
         """Present itself."""
         registration = WorkerRegistration(
-            name=self.name, builds=self.builds, kinds=self.kinds, slots=self.slots, versions={}
+            name=self.name, builds=dict.fromkeys(self.kinds, self.builds), slots=self.slots, versions={}
         )
         self.id = self.api.register(registration).worker_id
         return self

@@ -2,10 +2,7 @@
 
 from stickslip_schemas.chunks import CorruptChunkError
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
-
-AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
+from stickslip_schemas.tasks import TaskResult
 
 MESSAGE_LENGTH = 2000
 """The most that a result says of an error [characters]; the rest is in the log."""
@@ -14,11 +11,6 @@ MESSAGE_LENGTH = 2000
 def failed(reason: Reason, message: str) -> TaskResult:
     """Return the result of a task that the infrastructure failed."""
     return TaskResult(outcome="failed", reason=reason, message=message[:MESSAGE_LENGTH])
-
-
-def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
-    """Return the artifacts that `task` reads and that are damaged or not in the store. Reads all of them."""
-    return tuple(digest for digest in input_digests(task) if not store.holds(digest))
 
 
 def failure(error: Exception) -> TaskResult:

@@ -8,9 +8,9 @@ from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import RenderTask, TaskResult
 
-from stickslip_workers.failures import AnyTask, failed
+from stickslip_workers.failures import failed
 from stickslip_workers.settings import RENDER_ACTOR
-from stickslip_workers.stages.run import run_tasks
+from stickslip_workers.stages.run import AnyTask, run_tasks
 
 # Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what it likes.
 _RENDER = """

@@ -6,7 +6,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, TypeAdapter
 from stickslip_schemas.certificate import CertificateUpload
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.problems import Problem
 from stickslip_schemas.tasks import task_adapter

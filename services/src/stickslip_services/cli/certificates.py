@@ -60,7 +60,7 @@ def certificates(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> N
         found = list(client.certificates())
         if as_json:
             return print_json(found)
-        builds = {worker.builds.sim_core for worker in client.workers()}
+        builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
     shown = table("certificate", "preset", "extent", "verdict", "build", "made", no_wrap=("certificate",))
     for entry in found:
         shown.add_row(

@@ -16,16 +16,15 @@ def workers(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
         found = client.workers()
     if as_json:
         return print_json(found)
-    shown = table("worker", "kinds", "slots", "tasks", "sim_core build", "last seen", no_wrap=("worker",))
+    shown = table("worker", "kinds", "slots", "tasks", "last seen", no_wrap=("worker",))
     now = datetime.now(UTC)
     for worker in found:
         ago = wording.duration(max(0.0, (now - worker.last_seen_at).total_seconds()))
         shown.add_row(
             worker.name,
-            ", ".join(worker.kinds),
+            ", ".join(worker.builds),
             str(worker.slots),
             str(worker.leased),
-            worker.builds.sim_core[:12],
             f"{ago} ago" if worker.alive else f"[red]{ago} ago: not connected[/]",
         )
     return console().print(shown)

@@ -29,7 +29,7 @@ from stickslip_schemas.responses import (
     Preview,
     SampleState,
     Validation,
-    Worker,
+    WorkerEntry,
 )
 from stickslip_schemas.states import TaskState
 from tenacity import Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
@@ -197,9 +197,9 @@ class Client:
         response = self.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
         return _parsed(response, Manifest), response.content
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[WorkerEntry]:
         """Return the workers."""
-        return self._get("GET", "/v1/workers", TypeAdapter(list[Worker]))
+        return self._get("GET", "/v1/workers", TypeAdapter(list[WorkerEntry]))
 
     # --- certificates ---------------------------------------------------------------------------------------------
 

@@ -17,9 +17,10 @@ from typing import Literal
 
 import httpx
 from pydantic import ValidationError
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from stickslip_schemas.chunks import CorruptChunkError, decode_chunk
 from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.layout import SAMPLE_KEY_BYTES, layout
+from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,

@@ -34,8 +34,7 @@ workers = Table(
     Column("seq", Integer, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String, nullable=False, index=True),
-    Column("builds", Text, nullable=False),  # JSON
-    Column("kinds", Text, nullable=False),  # JSON
+    Column("builds", Text, nullable=False),  # JSON: by kind
     Column("slots", Integer, nullable=False),
     Column("versions", Text, nullable=False),  # JSON
     Column("registered_at", Float, nullable=False),

@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, func, insert, select
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.states import Stage, TaskState
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter

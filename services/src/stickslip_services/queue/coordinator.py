@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from sqlalchemy import Connection
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.certificate import CertificateUpload
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.layout import layout
 from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
 from stickslip_schemas.states import JobState, Reason
@@ -51,12 +52,12 @@ from stickslip_services.queue.jobs import (
 )
 from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
 from stickslip_services.queue.ledger import Ledger
-from stickslip_services.queue.planning import Plan, Spec, collector_at_rest, expand
-from stickslip_services.queue.reopening import make_again
+from stickslip_services.queue.planning import Plan, collector_at_rest, expand
+from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.stranded import find_stranded, note_stranded
-from stickslip_services.queue.submitting import count_settled, end_made, insert_job, made_jobs, plan_job
+from stickslip_services.queue.submitting import count_settled, insert_job, plan_job
 from stickslip_services.queue.terms import Terms, terms_for
 from stickslip_services.queue.workers import (
     RegisteredWorker,
@@ -68,7 +69,7 @@ from stickslip_services.queue.workers import (
 )
 from stickslip_services.settings import Settings
 
-_NO_BUILDS = Builds(sim_core="0" * 64, blender="0" * 64, packer="0" * 64)
+_NO_BUILDS = Builds(**dict.fromkeys(Builds.model_fields, "0" * 64))
 """Stands in where simulations are only counted."""
 
 CHECKED_AT_ONCE = 64 * 2**20
@@ -111,7 +112,7 @@ class Coordinator:
 
     # --- users ----------------------------------------------------------------------------------------------------
 
-    def validate(self, spec: Spec) -> Validation:
+    def validate(self, spec: JobSpec) -> Validation:
         """Tell what a job would be."""
         with self.database.read() as connection:
             terms = terms_for(connection, spec)
@@ -129,12 +130,12 @@ class Coordinator:
             certificate=plan.certificate,
         )
 
-    def submit(self, spec: Spec, idempotency_key: str | None) -> JobDetail | Replay:
+    def submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
         with collector_at_rest():
             return self._submit(spec, idempotency_key)
 
-    def _submit(self, spec: Spec, idempotency_key: str | None) -> JobDetail | Replay:
+    def _submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
         while True:
@@ -343,7 +344,7 @@ class Coordinator:
         """Since when a worker must have been heard of to be taken for alive."""
         return self.clock() - self.settings.lease_seconds
 
-    def _expand(self, spec: Spec, terms: Terms) -> Plan:
+    def _expand(self, spec: JobSpec, terms: Terms) -> Plan:
         return expand(spec, terms.builds, certificate=terms.certificate, previews=self.settings.previews_per_job)
 
     def _note_stranded(self) -> None:

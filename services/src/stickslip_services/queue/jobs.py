@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 from stickslip_schemas.states import JobState, Reason, TaskState
 
@@ -17,7 +18,6 @@ from stickslip_services.database.tables import idempotency_keys, jobs, previews,
 from stickslip_services.errors import ConflictError, IdempotencyKeyReusedError, NotFoundError
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
-from stickslip_services.queue.planning import Spec
 from stickslip_services.queue.progress import read_progress, rejected_samples
 from stickslip_services.queue.workers import NO_WORKER, RegisteredWorker, count_slots
 
@@ -51,7 +51,7 @@ def keep_replay(connection: Connection, key: str, fingerprint: str, job: int, re
     )
 
 
-def fingerprint(spec: Spec) -> str:
+def fingerprint(spec: JobSpec) -> str:
     """Return what tells one submitted document from another."""
     return sha256(spec.model_dump_json().encode())
 

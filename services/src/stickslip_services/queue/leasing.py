@@ -54,12 +54,13 @@ def has_ready_task(connection: Connection, worker: RegisteredWorker, stages: Ite
                 _READY,
                 tasks.c.stage == stage,
                 tasks.c.build == build,
-                tasks.c.kind.in_(worker.kinds),
+                tasks.c.kind == kind,
                 tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))),
             )
             .limit(1)
         )
-        for stage, build in worker.stage_builds.items()
+        for kind in worker.kinds
+        for stage, build in worker.stage_builds(kind).items()
         if stage in stages
     )
 
@@ -144,7 +145,7 @@ def _ready_tasks(connection: Connection, worker: RegisteredWorker, stage: Stage,
             .where(
                 _READY,
                 tasks.c.stage == stage,
-                tasks.c.build == worker.stage_builds[stage],
+                tasks.c.build == worker.stage_builds(kind)[stage],
                 tasks.c.kind == kind,
                 tasks.c.job == job,
             )

@@ -11,14 +11,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
+from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.samples import keyed_points, pack_key, publish_key
 from stickslip_schemas.states import Stage
 
 from stickslip_services.database.database import batches
-
-Spec = RodHangSpec | ClothDragSpec
 
 _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
 
@@ -48,7 +46,7 @@ class PlannedSample(NamedTuple):
 class Plan:
     """The tasks of a job by content key, in the order in which they should run, and its samples."""
 
-    spec: Spec
+    spec: JobSpec
     builds: Builds
     certificate: Sha256 | None = None
     tasks: dict[bytes, PlannedTask] = field(default_factory=dict)
@@ -86,7 +84,7 @@ def preview_slots(sample_count: int, previews: int) -> set[int]:
     return {position * sample_count // count for position in range(count)}
 
 
-def expand(spec: Spec, builds: Builds, *, certificate: Sha256 | None = None, previews: int = 0) -> Plan:
+def expand(spec: JobSpec, builds: Builds, *, certificate: Sha256 | None = None, previews: int = 0) -> Plan:
     """Return all tasks and samples that `spec` means; the manifest will carry the certificate's digest."""
     plan = Plan(spec, builds, certificate)
     tasks_by_key = plan.tasks
@@ -99,18 +97,18 @@ def expand(spec: Spec, builds: Builds, *, certificate: Sha256 | None = None, pre
             key = simulate = bytes.fromhex(point.simulation_key)
             render: bytes | None = None
             if simulate not in tasks_by_key:
-                tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.sim_core, point.simulation_text)
+                tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.simulate, point.simulation_text)
             if point.render_key is not None and point.render_text is not None:
                 key = render = bytes.fromhex(point.render_key)
                 if render not in tasks_by_key:
                     preview = point.slot in previewed
-                    tasks_by_key[render] = PlannedTask(_RENDER, builds.blender, point.render_text, (simulate,), preview)
+                    tasks_by_key[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview)
             last[key] = None
             plan.samples.append(PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text))
         name = pack_key(spec, shard, members, builds)
         pack_keys.append(name)
         payload = json.dumps({"shard": shard})
-        packs[bytes.fromhex(name)] = PlannedTask(_PACK, builds.packer, payload, tuple(last))
+        packs[bytes.fromhex(name)] = PlannedTask(_PACK, builds.pack, payload, tuple(last))
     tasks_by_key.update(packs)
     publish = bytes.fromhex(publish_key(spec, pack_keys, builds, certificate))
     payload = json.dumps({} if certificate is None else {"certificate": certificate})

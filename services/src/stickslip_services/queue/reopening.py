@@ -2,22 +2,37 @@
 
 Whoever needs such an artifact reports it. The task that made it, found among those that the reporter builds on, goes
 back to `pending`, and all that depend on it wait for one task more. What that task needs itself it reports in turn.
+
+A job whose dataset was made before it came ends when the dataset has been checked, and what is damaged is made again.
 """
 
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from sqlalchemy import bindparam, select, update
+from sqlalchemy import Connection, bindparam, select, update
 from stickslip_schemas.keys import Sha256
-from stickslip_schemas.states import Stage, TaskState
+from stickslip_schemas.states import JobState, Stage, TaskState
 
+from stickslip_services.catalog.versions import find_committed
 from stickslip_services.database.database import batches, insert_rows
-from stickslip_services.database.tables import task_dependencies, tasks
-from stickslip_services.queue.ledger import Ledger, live_jobs
+from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
+from stickslip_services.queue.events import set_job_state
+from stickslip_services.queue.ledger import LIVE, Ending, Ledger, live_jobs
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True, slots=True)
+class MadeJob:
+    """A live job whose dataset was made before it came."""
+
+    job: int
+    publish_task: int
+    manifest: Sha256
+    group: Sha256 | None
+    bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +55,45 @@ def make_again(book: Ledger, consumer: int, digests: Collection[Sha256]) -> int:
     _wait_for(book, Counter({consumer: sum(not maker.state.is_settled for maker in new)}))
     reopen(book, makers)
     return len(makers)
+
+
+def made_jobs(connection: Connection) -> list[MadeJob]:
+    """Return the live jobs whose dataset was made before they came; its files have to be checked."""
+    rows = connection.execute(
+        select(
+            jobs.c.seq,
+            jobs.c.publish_task,
+            dataset_versions.c.manifest,
+            dataset_versions.c.group_digest,
+            dataset_versions.c.bytes,
+        )
+        .join(tasks, tasks.c.seq == jobs.c.publish_task)
+        .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)
+        .where(jobs.c.state.in_(LIVE), tasks.c.state == TaskState.succeeded)
+        .order_by(jobs.c.seq)
+    )
+    return [MadeJob(*row) for row in rows]
+
+
+def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:
+    """End a job whose dataset is there and whole, or else let the tasks that made it run again.
+
+    `damaged` are the artifacts that are not whole; None where the manifest itself cannot be trusted.
+    """
+    if made not in made_jobs(book.connection):
+        return  # cancelled, or ended by another check
+    if damaged is not None and not damaged:
+        version = find_committed(book.connection, made.publish_task)
+        ending = Ending.published(
+            version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
+        )
+        book.end_job(made.job, replace(ending, message=ending.message or "all of it was there already"))
+        return
+    what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
+    message = f"the dataset was made before, but {what} damaged or lost in the store; what is missing is made again"
+    set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
+    reopen_task(book, made.publish_task)
+    make_again(book, made.publish_task, damaged or frozenset())
 
 
 def reopen_task(book: Ledger, task: int) -> None:

@@ -43,7 +43,7 @@ def _stranded_message(kind: str, builds: Builds, alive: list[RegisteredWorker]) 
         return f"no connected worker makes {kind!r}; the job goes on when one does"
     needed = stage_builds(builds)
     missing = [
-        stage for stage, build in needed.items() if all(worker.stage_builds[stage] != build for worker in makers)
+        stage for stage, build in needed.items() if all(worker.stage_builds(kind)[stage] != build for worker in makers)
     ]
     if missing:
         return (

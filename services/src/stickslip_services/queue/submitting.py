@@ -7,17 +7,14 @@ wait for it, where it failed or was cancelled the new job starts it again.
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, func, insert, select, update
-from stickslip_schemas.keys import Sha256
+from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
-from stickslip_services.catalog.versions import find_committed
 from stickslip_services.database.database import batches, insert_rows
 from stickslip_services.database.tables import (
-    dataset_versions,
     job_counts,
     job_stages,
     job_tasks,
@@ -28,27 +25,14 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import LIVE, Ending, Ledger, charge_waiting_tasks
-from stickslip_services.queue.planning import Plan, Spec
-from stickslip_services.queue.reopening import make_again, reopen_task
+from stickslip_services.queue.ledger import Ledger, charge_waiting_tasks
+from stickslip_services.queue.planning import Plan
 from stickslip_services.queue.workers import NO_WORKER
-
-
-@dataclass(frozen=True, slots=True)
-class MadeJob:
-    """A live job whose dataset was made before it came."""
-
-    job: int
-    publish_task: int
-    manifest: Sha256
-    group: Sha256 | None
-    bytes: int
-
 
 _LOST = (TaskState.failed, TaskState.cancelled)
 
 
-def insert_job(book: Ledger, spec: Spec, plan: Plan | None) -> int:
+def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None) -> int:
     """Write a job down, and its tasks if it can be planned already; return its `seq`."""
     reason, message = (None, "") if plan else (Reason.waiting_for_worker, NO_WORKER)
     result = book.connection.execute(
@@ -72,7 +56,7 @@ def insert_job(book: Ledger, spec: Spec, plan: Plan | None) -> int:
 
 
 def plan_job(book: Ledger, job: int, plan: Plan) -> None:
-    """Write the tasks of a job. If all of it is there already, the job ends once `end_made` has been told so."""
+    """Write the tasks of a job. If its dataset was made before, it ends once that has been checked (`reopening`)."""
     last = _insert_plan(book, job, plan)
     publish_task = book.connection.scalar(select(tasks.c.seq).where(tasks.c.key == plan.publish_key))
     book.connection.execute(
@@ -86,45 +70,6 @@ def plan_job(book: Ledger, job: int, plan: Plan) -> None:
     charge_waiting_tasks(book.connection, job)  # tasks that it shares with paused jobs run for this one
     if _has_started_tasks(book.connection, job):
         set_job_state(book.connection, job, JobState.running, book.now)
-
-
-def made_jobs(connection: Connection) -> list[MadeJob]:
-    """Return the live jobs whose dataset was made before they came; its files have to be checked."""
-    rows = connection.execute(
-        select(
-            jobs.c.seq,
-            jobs.c.publish_task,
-            dataset_versions.c.manifest,
-            dataset_versions.c.group_digest,
-            dataset_versions.c.bytes,
-        )
-        .join(tasks, tasks.c.seq == jobs.c.publish_task)
-        .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)
-        .where(jobs.c.state.in_(LIVE), tasks.c.state == TaskState.succeeded)
-        .order_by(jobs.c.seq)
-    )
-    return [MadeJob(*row) for row in rows]
-
-
-def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:
-    """End a job whose dataset is there and whole, or else let the tasks that made it run again.
-
-    `damaged` are the artifacts that are not whole; None where the manifest itself cannot be trusted.
-    """
-    if made not in made_jobs(book.connection):
-        return  # cancelled, or ended by another check
-    if damaged is not None and not damaged:
-        version = find_committed(book.connection, made.publish_task)
-        ending = Ending.published(
-            version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
-        )
-        book.end_job(made.job, replace(ending, message=ending.message or "all of it was there already"))
-        return
-    what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
-    message = f"the dataset was made before, but {what} damaged or lost in the store; what is missing is made again"
-    set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
-    reopen_task(book, made.publish_task)
-    make_again(book, made.publish_task, damaged or frozenset())
 
 
 def _has_started_tasks(connection: Connection, job: int) -> bool:

@@ -21,9 +21,9 @@ NO_WORKER = "no worker has registered yet; the job is planned when one does"
 def stage_builds(builds: Builds) -> dict[Stage, str]:
     """Return what a worker must have, to the bit, to run a task of each stage."""
     return {
-        Stage.simulate: builds.sim_core,
-        Stage.render: builds.blender,
-        Stage.pack: builds.packer,
+        Stage.simulate: builds.simulate,
+        Stage.render: builds.render,
+        Stage.pack: builds.pack,
         Stage.publish: builds.digest,
     }
 
@@ -34,8 +34,8 @@ class RegisteredWorker:
 
     id: str
     name: str
-    builds: Builds
-    kinds: tuple[str, ...]
+    builds: dict[str, Builds]
+    """Of each kind that it makes."""
     slots: int
     versions: dict[str, str]
     registered_at: float
@@ -43,9 +43,13 @@ class RegisteredWorker:
     superseded: bool
 
     @property
-    def stage_builds(self) -> dict[Stage, str]:
-        """Which build of each stage it runs."""
-        return stage_builds(self.builds)
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds that it makes."""
+        return tuple(self.builds)
+
+    def stage_builds(self, kind: str) -> dict[Stage, str]:
+        """Return which build of each stage it runs for a kind; nothing where it does not make the kind."""
+        return stage_builds(self.builds[kind]) if kind in self.builds else {}
 
 
 def insert_worker(connection: Connection, registration: WorkerRegistration, now: float) -> RegisteredWorker:
@@ -56,8 +60,7 @@ def insert_worker(connection: Connection, registration: WorkerRegistration, now:
         insert(workers).values(
             id=worker_id,
             name=registration.name,
-            builds=registration.builds.model_dump_json(),
-            kinds=json.dumps(registration.kinds),
+            builds=json.dumps({kind: builds.model_dump() for kind, builds in registration.builds.items()}),
             slots=registration.slots,
             versions=json.dumps(registration.versions),
             registered_at=now,
@@ -93,8 +96,8 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
     if not workers:
         return None
     for worker in workers:
-        if kind in worker.kinds:
-            return worker.builds
+        if kind in worker.builds:
+            return worker.builds[kind]
     kinds = ", ".join(sorted({kind for worker in workers for kind in worker.kinds}))
     raise KindNotAvailableError(f"no worker makes {kind!r}; those that have registered make {kinds}")
 
@@ -114,7 +117,7 @@ def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | 
     if builds is None:
         return 0
     needed = stage_builds(Builds.model_validate_json(builds))
-    return sum(worker.slots for worker in workers if kind in worker.kinds and worker.stage_builds == needed)
+    return sum(worker.slots for worker in workers if worker.stage_builds(kind) == needed)
 
 
 def leased_counts(connection: Connection) -> dict[str, int]:
@@ -123,14 +126,13 @@ def leased_counts(connection: Connection) -> dict[str, int]:
     return dict(connection.execute(query).all())
 
 
-def show_workers(connection: Connection, *, alive_since: float) -> list[responses.Worker]:
+def show_workers(connection: Connection, *, alive_since: float) -> list[responses.WorkerEntry]:
     """Return the newest session of every worker as the API shows it."""
     held = leased_counts(connection)
     return [
-        responses.Worker(
+        responses.WorkerEntry(
             id=worker.id,
             name=worker.name,
-            kinds=worker.kinds,
             slots=worker.slots,
             builds=worker.builds,
             versions=worker.versions,
@@ -147,8 +149,7 @@ def _worker(row: Row[tuple[object, ...]]) -> RegisteredWorker:
     return RegisteredWorker(
         id=row.id,
         name=row.name,
-        builds=Builds.model_validate_json(row.builds),
-        kinds=tuple(json.loads(row.kinds)),
+        builds={kind: Builds.model_validate(builds) for kind, builds in json.loads(row.builds).items()},
         slots=row.slots,
         versions=json.loads(row.versions),
         registered_at=row.registered_at,

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Sequence
+from importlib import import_module
 
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import PackTask, PublishTask, SimulateTask, TaskResult
+from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
 
-from stickslip_workers.failures import AnyTask, damaged_inputs, failure
-from stickslip_workers.stages.kinds import KINDS
-from stickslip_workers.stages.pack import pack
-from stickslip_workers.stages.publish import publish
+from stickslip_workers.failures import failure
+
+AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
@@ -29,6 +29,11 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     return [result.model_copy(update=share) for result in results]
 
 
+def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
+    """Return the artifacts that `task` reads and that are damaged or not in the store. Reads all of them."""
+    return tuple(digest for digest in input_digests(task) if not store.holds(digest))
+
+
 def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
     """Return the result of a task that raised; it names all damaged inputs, so that they are made again at once."""
     damaged = damaged_inputs(task, store)
@@ -36,15 +41,7 @@ def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    simulations = [task.simulation for task in tasks if isinstance(task, SimulateTask)]
-    kinds = {simulation.kind for simulation in simulations}
-    if len(simulations) == len(tasks) and len(kinds) == 1:
-        return KINDS[kinds.pop()].simulate(simulations, store)
-    if len(tasks) == 1:
-        (task,) = tasks
-        if isinstance(task, PackTask):
-            return [TaskResult(outcome="succeeded", output=pack(task, store))]
-        if isinstance(task, PublishTask):
-            return [TaskResult(outcome="succeeded", output=publish(task, store))]
-    stages = sorted({str(task.stage) for task in tasks})
-    raise ValueError(f"tasks must be simulations of one kind, or one pack or publish; got {len(tasks)} of {stages}")
+    """Hand the tasks to the module of their stage, which is imported only now: a packer needs no simulator."""
+    (stage,) = {task.stage for task in tasks}
+    results: list[TaskResult] = import_module(f"stickslip_workers.stages.{stage}").run(tasks, store)
+    return results

@@ -3,8 +3,9 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.problems import ProblemCode
 from stickslip_schemas.responses import Job, JobDetail, Page, Preview, SampleState, Validation
 from stickslip_schemas.states import TaskState
@@ -15,13 +16,12 @@ from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.jobs import Replay, find_job, list_jobs, list_previews, list_samples
-from stickslip_services.queue.planning import Spec
 
 router = APIRouter(tags=["jobs"])
 
 CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
-SpecBody = Annotated[Spec, Depends(JsonBody(job_spec_adapter))]
+SpecBody = Annotated[JobSpec, Depends(JsonBody(job_spec_adapter))]
 
 _LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
 _ETAG = {"ETag": {"description": "Changes with the job", "schema": {"type": "string"}}}

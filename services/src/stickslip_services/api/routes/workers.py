@@ -3,7 +3,7 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Response
-from stickslip_schemas.responses import Worker
+from stickslip_schemas.responses import WorkerEntry
 from stickslip_schemas.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -26,7 +26,7 @@ CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
 
 @router.get("/v1/workers", responses=problem_responses())
-def get_workers(coordinator: CoordinatorDep) -> list[Worker]:
+def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
     """List the workers that have registered, the newest session of each name, newest first."""
     with coordinator.database.read() as connection:
         return show_workers(connection, alive_since=coordinator.alive_since)
