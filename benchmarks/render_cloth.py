@@ -20,7 +20,7 @@ from stickslip_blender.blender import import_bpy
 from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, Sampling
 from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Texture
+from stickslip_schemas.textures import Texture
 
 SIDE = 41
 

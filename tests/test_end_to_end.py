@@ -16,7 +16,7 @@ from stickslip_schemas.keys import sha256
 from stickslip_schemas.manifest import Manifest
 from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.kinds import RodDataset
+from stickslip_training.kinds.rod_hang import RodDataset
 
 TRAIN = STICKSLIP.with_name("stickslip-train")
 

@@ -12,7 +12,7 @@ import pytest
 from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.sources import HttpSource
-from stickslip_training.kinds import RodDataset
+from stickslip_training.kinds.rod_hang import RodDataset
 
 
 class _Server(http.server.ThreadingHTTPServer):

@@ -11,7 +11,7 @@ from stickslip_training.cli.errors import errors_told
 
 def reconstruct(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="one picture for each camera, named as the camera")],
-    calibration: Annotated[Path, typer.Option(help="cameras as in cameras.toml of stickslip-schemas")],
+    calibration: Annotated[Path, typer.Option(help="cameras as in the rigs of stickslip-schemas")],
     out: Annotated[Path, typer.Option(help="directory for the centreline, the overlay and the report")],
     length: Annotated[float, typer.Option(help="of the rod, in the unit of the calibration")] = 1.0,
     clamp: Annotated[tuple[float, float, float], typer.Option(help="where the rod leaves its clamp")] = (0, 0, 0),

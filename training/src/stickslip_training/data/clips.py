@@ -10,7 +10,7 @@ from stickslip_training.data.samples import SampleDataset
 
 
 class ClipSamples(SampleDataset):
-    """Clips of cloth: `video` (frames, 224, 224, 3) uint8, the labels of the kind, and the meshes where wanted."""
+    """Clips of cloth: `video` (frames, 224, 224, 3) uint8, the labels of the kind, and on request the vertices."""
 
     labels: ClassVar[tuple[str, ...]]
     """The labels of an item: int64 where they are codes or counts, float32 where they are quantities."""
@@ -20,15 +20,15 @@ class ClipSamples(SampleDataset):
         source: str | os.PathLike[str] | DatasetReader,
         split: Split | None = None,
         *,
-        mesh: bool = False,
+        positions: bool = False,
         ring: int = 0,
     ) -> None:
         """Open `split` of a dataset of clips, or all of it; `source` is a directory, a URL or an open reader."""
-        super().__init__(source, split, arrays=["video"] + ["mesh"] * mesh, labels=self.labels, ring=ring)
+        super().__init__(source, split, arrays=["video"] + ["positions"] * positions, labels=self.labels, ring=ring)
 
     @property
     def instants(self) -> tuple[int, ...]:
-        """Index into the first dimension of `mesh` of each frame of `video`."""
+        """Index into the first dimension of `positions` of each frame of `video`."""
         return tuple(self.reader.arrays["video"].attributes["instants"])
 
     def rest(self) -> torch.Tensor:
@@ -42,5 +42,5 @@ class ClipSamples(SampleDataset):
     def _of_any_sample(self, name: str) -> torch.Tensor:
         valid = self.reader.slots()
         if name not in self.reader.arrays or not len(valid):
-            raise ValueError(f"the dataset has no {name}: it was made with store_mesh: false, or has no valid sample")
+            raise ValueError(f"the dataset has no {name}: its spec says store_positions: false, or no sample is valid")
         return torch.from_numpy(self.reader.read(name, valid[:1])[0].copy())

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.layout import ArrayLayout
+from stickslip_schemas.arrays import ArrayLayout
 
 from stickslip_training.data.errors import InvalidDatasetError
 

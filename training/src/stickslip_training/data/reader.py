@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
+from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.chunks import (
     MISSING,
     CorruptChunkError,
@@ -23,7 +24,7 @@ from stickslip_schemas.chunks import (
 )
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.layout import ArrayLayout, layout
+from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import SPLITS
 from stickslip_schemas.tasks import FileEntry

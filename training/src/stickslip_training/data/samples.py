@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from stickslip_schemas.layout import SAMPLE_KEY_BYTES
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from stickslip_training.arrays import Array

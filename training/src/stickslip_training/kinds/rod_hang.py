@@ -29,3 +29,6 @@ class RodDataset(SampleDataset):
         arrays = ["centerline", "curvature"] + ["frame"] * frame + ["views"] * views
         labels = ["gamma", "phi0", "phi1"] + ["color"] * views
         super().__init__(source, split, arrays=arrays, labels=labels, ring=ring)
+
+
+DATASET = RodDataset
