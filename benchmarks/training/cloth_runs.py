@@ -54,7 +54,7 @@ def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int) -> d
         "reason": scene.reason,
         "cpu_s": round(time.process_time() - started, 2),
     }
-    shown = scene.positions[list(shown_frames(FRAMES))] if scene.valid else np.zeros((FRAMES, len(scene.rest), 3))
+    shown = scene.positions[list(shown_frames(FRAMES, 300))] if scene.valid else np.zeros((FRAMES, len(scene.rest), 3))
     return {
         "positions": np.round(shown / 1e-5).astype(np.int16),
         "rest": scene.rest.astype(np.float32),
@@ -81,7 +81,7 @@ def pack(folder: Path, file: Path) -> None:
         differences=np.moveaxis(bytes_apart, -1, 0),  # low bytes, high bytes, (2, runs, frames, vertices, 3)
         rest=first["rest"],
         triangles=first["triangles"],
-        instants=np.array(shown_frames(FRAMES), np.int16),
+        instants=np.array(shown_frames(FRAMES, 300), np.int16),
         about=np.array([str(run["about"]) for run in runs]),
     )
     print(f"{file}: {len(runs)} runs, {file.stat().st_size / 1e6:.2f} MB")

@@ -68,13 +68,13 @@ def test_reads_into_the_given_buffer_and_no_other(clips):
 
 def test_names_and_slots_are_checked(clips):
     reader = DatasetReader(clips.root)
-    with pytest.raises(ValueError, match="array must be one of video, material"):
+    with pytest.raises(ValueError, match="array must be one of video, texture"):
         reader.read("vdieo", [0])
     with pytest.raises(IndexError, match="slot must be from 0 to 11, and is 12"):
         reader.read("video", [12])
     with pytest.raises(IndexError):
         reader.read("video", [-1])
-    with pytest.raises(ValueError, match="video is no label; the labels are material"):
+    with pytest.raises(ValueError, match="video is no label; the labels are texture"):
         reader.label("video")
 
 
@@ -368,9 +368,9 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
     ("old", "new", "message"),
     [
         ('"zstd"', '"gzip"', "array video: codecs must be"),
-        ('"order": [', '"order": [3, ', "array mesh: codecs must be"),
-        ('"data_type": "int16"', '"data_type": "int32"', "array material: data_type must be"),
-        ('"fill_value": -1', '"fill_value": 0', "array material: fill_value must be -1, and is 0"),
+        ('"order": [', '"order": [3, ', "array positions: codecs must be"),
+        ('"data_type": "int16"', '"data_type": "int32"', "array texture: data_type must be"),
+        ('"fill_value": -1', '"fill_value": 0', "array texture: fill_value must be -1, and is 0"),
         ('"separator": "/"', '"separator": "."', "array video: chunk_key_encoding must be"),
         ('"viewpoint": {', '"view": {', "array viewpoint: there must be metadata, and there are none"),
         ('"node_type": "group"', '"node_type": "array"', "zarr.json must be of a Zarr v3 group"),

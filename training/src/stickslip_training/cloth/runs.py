@@ -77,12 +77,12 @@ def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequen
 
     Samples of one simulation are told by material, mu and the mesh at the last instant that is read.
     """
-    for name in ("mesh", "rest", "material", "mu"):
+    for name in ("positions", "rest", "material", "mu"):
         if name not in reader.arrays:
-            raise ValueError(f"the dataset must have the array {name} to train from meshes: it has none (store_mesh)")
+            raise ValueError(f"the dataset must have the array {name} to train from meshes: its spec says store_positions: false")
     slots, meshes, seen = [], [], set()
     for slot in reader.slots(split).tolist():
-        mesh = reader.read("mesh", [slot])[0][list(instants)]
+        mesh = reader.read("positions", [slot])[0][list(instants)]
         if (key := mesh[-1].tobytes()) not in seen:
             seen.add(key)
             slots.append(slot)
