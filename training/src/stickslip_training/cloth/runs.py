@@ -79,7 +79,9 @@ def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequen
     """
     for name in ("positions", "rest", "material", "mu"):
         if name not in reader.arrays:
-            raise ValueError(f"the dataset must have the array {name} to train from meshes: its spec says store_positions: false")
+            raise ValueError(
+                f"the dataset must have the array {name} to train from meshes: its spec says store_positions: false"
+            )
     slots, meshes, seen = [], [], set()
     for slot in reader.slots(split).tolist():
         mesh = reader.read("positions", [slot])[0][list(instants)]
@@ -122,8 +124,17 @@ def _runs(
     mu: Floats,
 ) -> Runs:
     grid = positions[:, :, grid_order(rest)].astype(np.float32)
-    landed = np.sign((grid[:, _first(instants), 0] - grid[:, _first(instants), -1])[..., 0].mean(axis=1))
-    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed.astype(np.int64))
+    landed = _landed(grid[:, _first(instants)])
+    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
+
+
+def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
+    """Return the side along x, +1 or -1, to which cloth fell: of positions at all instants, (runs, 300, V, 3) [m]."""
+    return _landed(positions[:, DROPPED][:, grid_order(rest)])
+
+
+def _landed(grid: SingleFloats) -> Integers:
+    return np.where((grid[:, 0] - grid[:, -1])[..., 0].mean(axis=1) > 0, 1, -1)
 
 
 def _first(instants: tuple[int, ...]) -> int:

@@ -13,6 +13,7 @@ from torch import nn
 
 from stickslip_training.arrays import Floats, Integers, SingleFloats
 from stickslip_training.cloth.crop import Cameras
+from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
 from stickslip_training.cloth.render import Style, draw_style, render_crops, turned
@@ -85,6 +86,10 @@ class Clips:
 
     def __len__(self) -> int:
         return len(self.mu)
+
+    def truth(self) -> Truth:
+        """Return what is true of the clips, as scores ask for it."""
+        return Truth(self.material, self.mu, self.landed, self.run)
 
 
 @dataclass(frozen=True, eq=False)
