@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import stickslip_sim_core
 import tensorstore
 import xarray
 import zarr
@@ -22,6 +21,7 @@ from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import ChunkRef, FileEntry, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
+from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
@@ -84,7 +84,7 @@ class Core:
 def core(monkeypatch: pytest.MonkeyPatch) -> Core:
     """A core that answers at once, in place of the one that takes minutes."""
     core = Core()
-    monkeypatch.setattr(stickslip_sim_core, "drop_and_drag", core, raising=False)
+    monkeypatch.setattr(cloth_drag, "drop_and_drag", core)
     return core
 
 

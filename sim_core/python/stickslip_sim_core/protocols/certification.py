@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_sim_core.presets import PRESETS
+from stickslip_sim_core.cloth.presets import PRESETS
 
 
 @dataclass(frozen=True)

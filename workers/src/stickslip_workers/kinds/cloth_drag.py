@@ -20,7 +20,7 @@ def _simulate(simulations: Sequence["ClothDragSimulation"], store: Store) -> lis
 
 
 def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult:
-    from stickslip_sim_core.scenes import drop_and_drag  # here, so that packing needs no compiled core
+    from stickslip_sim_core.scenes.cloth_drag import drop_and_drag  # here, so that packing needs no compiled core
 
     fabric = fabric_of(simulation)
     run = drop_and_drag(
@@ -39,4 +39,4 @@ def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult
     return result_of(simulation, fabric, run, store, record=forces, labels=labels)
 
 
-KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth")
+KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.scenes.cloth_drag")
