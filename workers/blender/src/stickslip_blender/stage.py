@@ -1,0 +1,297 @@
+"""The drop-and-drag scene in Blender: a square of cloth between two holders over a floor, under one lamp, before black.
+
+The cloth is the solver's, refined so that no facet shows. The lamp follows it along the stage [thesis, 4.2.3].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.cameras import Camera
+
+from stickslip_blender.blender import import_bpy
+from stickslip_blender.engine import Sampling, new_scene, set_sampling
+from stickslip_blender.geometry import FLOOR, DragGeometry, holder_mesh, mirrored
+from stickslip_blender.lights import Light
+from stickslip_blender.looks import Look
+from stickslip_blender.multiplexed import ALBEDOS, Composer
+from stickslip_blender.pixels import FrameReader, Window
+from stickslip_blender.raster import projected, window_about
+from stickslip_blender.substrates import GRAIN_EXTENT, GRAIN_SIZE, Substrate, grain_picture
+from stickslip_blender.view import new_view, set_view
+
+_AIM = 0.05  # [m], the height that the lamp points to, under the holders
+_LAMP_DISTANCE = 1.2  # [m]
+_LAMP_SIZE = 0.5  # [m], diameter
+_LAMP_POWER = 24.0  # [W]
+_AMBIENT = 0.012  # radiance of the black curtains around the stage; cameras see none of it
+_FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
+_WINDOW_MARGIN = 4  # [px] about the cloth
+_MIRRORING = 0.3  # roughness below which a floor's mirror image is in the window too
+
+Clip = npt.NDArray[np.uint8]
+
+
+class ClothStage:
+    """A stage with one cloth, built once; only vertices, textures, camera, floor and lamp change between frames.
+
+    Blender is one scene per process: a second stage in the same process would empty the first.
+    """
+
+    def __init__(self, geometry: DragGeometry, look: Look, *, scratch: str | Path | None = None) -> None:
+        self._geometry = geometry
+        self.composer = Composer(geometry)
+        self._scene = new_scene()
+        self._scene.cycles.max_bounces = 3
+        self._scene.cycles.diffuse_bounces = 2
+        self._scene.cycles.glossy_bounces = 1
+        self._scene.cycles.use_light_tree = False  # one lamp: there is nothing to choose
+        _set_curtains(self._scene)
+        self._lamp = _add_lamp(self._scene)
+        self._floor = _Floor(self._scene)
+        self._mesh = _add_cloth(self._scene, geometry)
+        self._fabric = _Fabric(self._mesh, look)
+        self._holders = [_add_holder(self._scene, name) for name in ("holder-1", "holder-2")]
+        new_view(self._scene)
+        self._reader = FrameReader(self._scene, scratch)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of what it holds outside Blender."""
+        self._reader.close()
+
+    def set_up(self, camera: Camera, light: Light, substrate: Substrate) -> None:
+        """Set the camera, the lamp and the floor of the clips to come."""
+        set_view(self._scene, camera)
+        self._camera, self._light, self._substrate = camera, light, substrate
+        self._lamp.data.energy = _LAMP_POWER * light.power
+        self._floor.set(substrate)
+
+    def trace(
+        self, positions: npt.NDArray[np.float64], frame: Sampling, window: Sampling
+    ) -> npt.NDArray[np.float16]:
+        """Trace one instant (V', 3) [m] for all textures: linear light at ALBEDOS, shape (height, width, 3).
+
+        The whole frame has the samples of one setting; the window that the cloth is in, those of the other.
+        """
+        self._fabric.set_color(ALBEDOS)
+        points = self._place(positions)
+        set_sampling(self._scene, frame)
+        light = self._reader.read_light()
+        part = self.window(points)
+        set_sampling(self._scene, window)
+        light[part.slices] = self._reader.read_light(part)
+        return light
+
+    def window(self, points: npt.NDArray[np.float64]) -> Window:
+        """Return the part of the frame that the cloth is in, and its image in a floor that mirrors it."""
+        cloth = points[: len(self._geometry.surface.uv)]
+        if self._substrate.roughness < _MIRRORING:
+            cloth = np.concatenate([cloth, mirrored(cloth)])
+        return window_about(projected(self._camera, cloth), self._camera, _WINDOW_MARGIN)
+
+    def direct(
+        self, positions: npt.NDArray[np.float64], picture: npt.NDArray[np.uint8], sampling: Sampling
+    ) -> npt.NDArray[np.float16]:
+        """Render one instant (V', 3) [m] with a texture, the slow way: linear light, shape (height, width, 3)."""
+        self._fabric.set_picture(picture)
+        self._place(positions)
+        set_sampling(self._scene, sampling)
+        return self._reader.read_light()
+
+    def direct_window(
+        self, positions: npt.NDArray[np.float64], picture: npt.NDArray[np.uint8], sampling: Sampling
+    ) -> tuple[Window, npt.NDArray[np.float16]]:
+        """Render, as `direct` does, the window that the cloth is in."""
+        self._fabric.set_picture(picture)
+        part = self.window(self._place(positions))
+        set_sampling(self._scene, sampling)
+        return part, self._reader.read_light(part)
+
+    def _place(self, positions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Move everything to where it is at an instant; return all vertices."""
+        from mathutils import Vector
+
+        points = self._geometry.points(positions)
+        middles = self._geometry.holders(positions)
+        for holder, middle in zip(self._holders, middles, strict=True):
+            holder.location = middle
+        cloth = points[: len(self._geometry.surface.uv)]
+        self._mesh.attributes["position"].data.foreach_set("vector", cloth.astype(np.float32).ravel())
+        self._mesh.update()
+        a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
+        outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        self._lamp.location = np.array([middles[:, 0].mean(), 0.0, _AIM]) + _LAMP_DISTANCE * outward
+        self._lamp.rotation_euler = Vector(outward.tolist()).to_track_quat("Z", "Y").to_euler()
+        return points
+
+
+def _set_curtains(scene: Any) -> None:
+    """Light the stage a little from all around, and let cameras see black there."""
+    scene.world.color = (0.0, 0.0, 0.0)
+    tree = scene.world.node_tree
+    tree.nodes.clear()
+    seen = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
+    dark = tree.nodes.new("ShaderNodeBackground")
+    dark.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    faint = tree.nodes.new("ShaderNodeBackground")
+    faint.inputs["Color"].default_value = (_AMBIENT, _AMBIENT, _AMBIENT, 1.0)
+    mix = tree.nodes.new("ShaderNodeMixShader")
+    output = tree.nodes.new("ShaderNodeOutputWorld")
+    tree.links.new(seen, mix.inputs["Fac"])
+    tree.links.new(faint.outputs["Background"], mix.inputs[1])
+    tree.links.new(dark.outputs["Background"], mix.inputs[2])
+    tree.links.new(mix.outputs["Shader"], output.inputs["Surface"])
+    scene.world.cycles.sampling_method = "NONE"  # found by the paths that leave: the lamp gets all shadow rays
+
+
+def _add_lamp(scene: Any) -> Any:
+    data = import_bpy().data.lights.new("lamp", "AREA")
+    data.shape = "DISK"
+    data.size = _LAMP_SIZE
+    lamp = import_bpy().data.objects.new("lamp", data)
+    lamp.visible_camera = False
+    scene.collection.objects.link(lamp)
+    return lamp
+
+
+def _add_mesh(scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]]) -> Any:
+    bpy = import_bpy()
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(np.asarray(vertices).tolist(), [], [list(face) for face in faces])
+    made = bpy.data.objects.new(name, mesh)
+    scene.collection.objects.link(made)
+    return made
+
+
+def _new_material(name: str, **inputs: Any) -> Any:
+    material = import_bpy().data.materials.new(name)
+    shader = material.node_tree.nodes["Principled BSDF"]
+    for words, value in inputs.items():
+        shader.inputs[words.replace("_", " ")].default_value = value
+    return material
+
+
+def _new_image(name: str, size: int, *, linear: bool) -> Any:
+    return import_bpy().data.images.new(name, width=size, height=size, is_data=linear, float_buffer=linear)
+
+
+def _set_image(image: Any, colors: npt.NDArray[np.float32]) -> None:
+    rgba = np.ones((*colors.shape[:2], 4), dtype=np.float32)
+    rgba[..., :3] = colors
+    image.pixels.foreach_set(rgba.ravel())
+    image.update()
+
+
+class _Floor:
+    """A round plate with a low rim, whose finish can be set."""
+
+    def __init__(self, scene: Any) -> None:
+        around = 64
+        angle = 2.0 * np.pi * np.arange(around) / around
+        circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=1) * _FLOOR_RADIUS
+        circle[:, 2] = FLOOR
+        rim = circle + [0.0, 0.0, _FLOOR_RIM]
+        sides = [(k, (k + 1) % around, (k + 1) % around + around, k + around) for k in range(around)]
+        vertices = np.concatenate([circle, rim])
+        plate = _add_mesh(scene, "floor", vertices, [tuple(range(around)), *sides])
+        material = _new_material("floor")
+        tree = material.node_tree
+        self._shader = tree.nodes["Principled BSDF"]
+        marks = tree.nodes.new("ShaderNodeTexImage")
+        self._image = marks.image = _new_image("marks", GRAIN_SIZE, linear=True)
+        place = tree.nodes.new("ShaderNodeMapping")
+        place.inputs["Scale"].default_value = (1.0 / GRAIN_EXTENT,) * 3
+        where = tree.nodes.new("ShaderNodeTexCoord")
+        tree.links.new(where.outputs["Object"], place.inputs["Vector"])
+        tree.links.new(place.outputs["Vector"], marks.inputs["Vector"])
+        tree.links.new(marks.outputs["Color"], self._shader.inputs["Base Color"])
+        plate.data.materials.append(material)
+        self._substrate: Substrate | None = None
+
+    def set(self, substrate: Substrate) -> None:
+        """Give the floor a finish."""
+        if substrate == self._substrate:
+            return
+        self._substrate = substrate
+        self._shader.inputs["Roughness"].default_value = substrate.roughness
+        self._shader.inputs["Metallic"].default_value = substrate.metallic
+        self._shader.inputs["Specular IOR Level"].default_value = substrate.specular
+        _set_image(self._image, grain_picture(substrate)[..., None])
+
+
+def _add_cloth(scene: Any, geometry: DragGeometry) -> Any:
+    faces, uv = geometry.surface.triangles, geometry.surface.uv
+    mesh = _add_mesh(scene, "cloth", np.column_stack([uv, np.zeros(len(uv))]), faces.tolist()).data
+    mesh.shade_smooth()
+    mesh.uv_layers.new(name="rest").uv.foreach_set("vector", uv[faces.ravel()].astype(np.float32).ravel())
+    return mesh
+
+
+class _Fabric:
+    """The cloth's shader, of one even colour or with a picture."""
+
+    def __init__(self, mesh: Any, look: Look) -> None:
+        material = _new_material(
+            "fabric",
+            Roughness=look.roughness,
+            Specular_IOR_Level=look.specular,
+            Sheen_Weight=look.sheen,
+            Sheen_Roughness=0.5,
+        )
+        self._tree = tree = material.node_tree
+        shader = tree.nodes["Principled BSDF"]
+        self._picture = tree.nodes.new("ShaderNodeTexImage")
+        self._picture.extension = "EXTEND"
+        self._even = tree.nodes.new("ShaderNodeRGB")
+        self._color = tree.nodes.new("NodeReroute")
+        tree.links.new(self._color.outputs[0], shader.inputs["Base Color"])
+        if look.translucency > 0.0:
+            through = tree.nodes.new("ShaderNodeBsdfTranslucent")
+            tree.links.new(self._color.outputs[0], through.inputs["Color"])
+            both = tree.nodes.new("ShaderNodeMixShader")
+            both.inputs["Fac"].default_value = look.translucency
+            tree.links.new(shader.outputs["BSDF"], both.inputs[1])
+            tree.links.new(through.outputs["BSDF"], both.inputs[2])
+            tree.links.new(both.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"])
+        mesh.materials.append(material)
+        self._from: Any = None
+
+    def set_color(self, color: tuple[float, float, float]) -> None:
+        """Give the cloth one linear colour."""
+        self._even.outputs["Color"].default_value = (*color, 1.0)
+        self._connect(self._even)
+
+    def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
+        """Print a picture on the cloth, (size, size, 3), 8-bit sRGB, row 0 at its lower edge."""
+        if self._picture.image is None:
+            self._picture.image = _new_image("print", len(picture), linear=False)
+        _set_image(self._picture.image, picture / np.float32(255))
+        self._connect(self._picture)
+
+    def _connect(self, node: Any) -> None:
+        if self._from is not node:
+            self._tree.links.new(node.outputs["Color"], self._color.inputs[0])
+            self._from = node
+
+
+def _add_holder(scene: Any, name: str) -> Any:
+    """Add a clip of one centimetre and the rod it hangs on; it holds a square at a corner of the cloth."""
+    metal = import_bpy().data.materials.get("metal") or _new_material(
+        "metal", Base_Color=(0.05, 0.05, 0.052, 1.0), Roughness=0.45, Metallic=0.0
+    )
+    holder = _add_mesh(scene, name, *holder_mesh())
+    holder.data.materials.append(metal)
+    return holder
