@@ -186,12 +186,14 @@ Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> ver
   std::vector<Place> places(static_cast<std::size_t>(grid) * grid);
   for (int row = 0; row < window.height; ++row) {
     for (int column = 0; column < window.width; ++column) {
-      int count = 0;
+      int count = 0, covered = 0;
       for (int j = row * grid; j < (row + 1) * grid; ++j) {
         for (int i = column * grid; i < (column + 1) * grid; ++i) {
           const std::int32_t number = seen[static_cast<std::size_t>(j) * columns + i];
           if (number < 0 || number >= end) continue;
           ++result.hits[number];
+          ++covered;
+          if (count > 0 && (i + j) % 2 != 0) continue;
           const Lookup& lookup = lookups[number];
           const double x = i + samples.shift(j), y = j + samples.shift(i), depth = 1.0 / lookup.near(x, y);
           places[count++] = {lookup.u(x, y) * depth, lookup.v(x, y) * depth};
@@ -200,7 +202,7 @@ Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> ver
       if (count == 0) continue;
       sum_lookups(textures, places.data(), count, sums.data());
       const std::size_t pixel = static_cast<std::size_t>(row) * window.width + column;
-      result.coverage[pixel] = static_cast<float>(count) / static_cast<float>(grid * grid);
+      result.coverage[pixel] = static_cast<float>(covered) / static_cast<float>(grid * grid);
       for (int color = 0; color < colors; ++color) result.mean[pixel * colors + color] = sums[color] / count;
     }
   }

@@ -54,7 +54,8 @@ struct Albedo {
 };
 
 // Mean the textures over what is visible. A texture is looked up as Cycles does it: bilinear between texel centres in
-// sRGB, clamped at the border, then decoded to linear light; texture coordinates are interpolated in perspective.
+// sRGB, clamped at the border, then decoded to linear light; texture coordinates are interpolated in perspective. Of a
+// pixel's samples that see a triangle the first, and then those of a checkerboard, are looked up.
 Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> vertices,
               std::span<const Triangle> triangles, std::span<const TextureCoordinate> coordinates, std::int32_t end,
               const Textures& textures, Window window, int grid);

@@ -73,11 +73,12 @@ class Composer:
         points: npt.NDArray[np.float64],
         camera: Camera,
         substrate: Substrate,
+        floor: Floats,
         textures: Textures,
     ) -> npt.NDArray[np.uint8]:
         """Compose one frame's trace (height, width, 3) with all textures: 8-bit sRGB (textures, height, width, 3).
 
-        Points: all vertices of the stage at that instant (V, 3) [m].
+        Points: all vertices of the stage at that instant (V, 3) [m]; floor: as `floor_factor` returns it.
         """
         S, D, I = separate(trace)  # noqa: E741  (the formula's name)
         seen = see(projected(camera, points), self._geometry.triangles, self._window(points, camera))
@@ -89,14 +90,24 @@ class Composer:
         if substrate.mirrors:
             self._mirror(albedo, points, camera, substrate, textures)
         _lay_over(albedo, sight, seen.window, _reflectance(substrate))
-        once = (D[..., None, None] + I[..., None, None] * mean) * albedo
-        light = S[..., None, None] + once
-        if substrate.tint != (1.0, 1.0, 1.0):
-            cover = np.zeros(S.shape, dtype=np.float32)
-            cover[seen.window.slices] = sight.coverage
-            floor = 1.0 - cover[..., None, None]
-            light *= 1.0 + floor * (np.asarray(substrate.tint, dtype=np.float32) - 1.0)
+        cover = np.zeros(S.shape, dtype=np.float32)
+        cover[seen.window.slices] = sight.coverage
+        factor = 1.0 + (1.0 - cover[..., None]) * (floor - 1.0)
+        light = (D[..., None, None] + I[..., None, None] * mean) * albedo
+        light += S[..., None, None]
+        light *= factor[:, :, None]
         return np.moveaxis(encode(light), 2, 0)
+
+    def on_floor(
+        self, light: npt.NDArray[np.float16], points: npt.NDArray[np.float64], camera: Camera, floor: Floats
+    ) -> Floats:
+        """Give the floor of a frame that was rendered directly (height, width, 3) its marks and colour."""
+        window = self._window(points, camera)
+        seen = see(projected(camera, points), self._geometry.triangles, window)
+        cover = np.zeros(light.shape[:2], dtype=np.float32)
+        cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
+        marked: Floats = light.astype(np.float32) * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0))
+        return marked
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
         return window_about(projected(camera, points[: len(self._geometry.surface.uv)]), camera)

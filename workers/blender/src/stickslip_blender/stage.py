@@ -15,14 +15,14 @@ import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
 from stickslip_blender.blender import import_bpy
-from stickslip_blender.engine import Sampling, new_scene, set_sampling
+from stickslip_blender.engine import ClothSampling, Sampling, new_scene, set_sampling
 from stickslip_blender.geometry import FLOOR, DragGeometry, holder_mesh, mirrored
 from stickslip_blender.lights import Light
 from stickslip_blender.looks import Look
 from stickslip_blender.multiplexed import ALBEDOS, Composer
 from stickslip_blender.pixels import FrameReader, Window
 from stickslip_blender.raster import projected, window_about
-from stickslip_blender.substrates import GRAIN_EXTENT, GRAIN_SIZE, Substrate, grain_picture
+from stickslip_blender.substrates import Substrate
 from stickslip_blender.view import new_view, set_view
 
 _AIM = 0.05  # [m], the height that the lamp points to, under the holders
@@ -80,18 +80,18 @@ class ClothStage:
         self._floor.set(substrate)
 
     def trace(
-        self, positions: npt.NDArray[np.float64], frame: Sampling, window: Sampling
+        self, positions: npt.NDArray[np.float64], sampling: ClothSampling, seed: int
     ) -> npt.NDArray[np.float16]:
         """Trace one instant (V', 3) [m] for all textures: linear light at ALBEDOS, shape (height, width, 3).
 
-        The whole frame has the samples of one setting; the window that the cloth is in, those of the other.
+        Seed: of the noise; the same in all frames of a clip, so that what is left of it does not flicker.
         """
         self._fabric.set_color(ALBEDOS)
         points = self._place(positions)
-        set_sampling(self._scene, frame)
+        set_sampling(self._scene, Sampling(sampling.frame, "fast", seed))
         light = self._reader.read_light()
         part = self.window(points)
-        set_sampling(self._scene, window)
+        set_sampling(self._scene, Sampling(sampling.window, "fast", seed))
         light[part.slices] = self._reader.read_light(part)
         return light
 
@@ -184,17 +184,6 @@ def _new_material(name: str, **inputs: Any) -> Any:
     return material
 
 
-def _new_image(name: str, size: int, *, linear: bool) -> Any:
-    return import_bpy().data.images.new(name, width=size, height=size, is_data=linear, float_buffer=linear)
-
-
-def _set_image(image: Any, colors: npt.NDArray[np.float32]) -> None:
-    rgba = np.ones((*colors.shape[:2], 4), dtype=np.float32)
-    rgba[..., :3] = colors
-    image.pixels.foreach_set(rgba.ravel())
-    image.update()
-
-
 class _Floor:
     """A round plate with a low rim, whose finish can be set."""
 
@@ -208,28 +197,15 @@ class _Floor:
         vertices = np.concatenate([circle, rim])
         plate = _add_mesh(scene, "floor", vertices, [tuple(range(around)), *sides])
         material = _new_material("floor")
-        tree = material.node_tree
-        self._shader = tree.nodes["Principled BSDF"]
-        marks = tree.nodes.new("ShaderNodeTexImage")
-        self._image = marks.image = _new_image("marks", GRAIN_SIZE, linear=True)
-        place = tree.nodes.new("ShaderNodeMapping")
-        place.inputs["Scale"].default_value = (1.0 / GRAIN_EXTENT,) * 3
-        where = tree.nodes.new("ShaderNodeTexCoord")
-        tree.links.new(where.outputs["Object"], place.inputs["Vector"])
-        tree.links.new(place.outputs["Vector"], marks.inputs["Vector"])
-        tree.links.new(marks.outputs["Color"], self._shader.inputs["Base Color"])
+        self._shader = material.node_tree.nodes["Principled BSDF"]
         plate.data.materials.append(material)
-        self._substrate: Substrate | None = None
 
     def set(self, substrate: Substrate) -> None:
-        """Give the floor a finish."""
-        if substrate == self._substrate:
-            return
-        self._substrate = substrate
+        """Give the floor a finish, without its marks and colour."""
+        self._shader.inputs["Base Color"].default_value = (*(substrate.albedo,) * 3, 1.0)
         self._shader.inputs["Roughness"].default_value = substrate.roughness
         self._shader.inputs["Metallic"].default_value = substrate.metallic
         self._shader.inputs["Specular IOR Level"].default_value = substrate.specular
-        _set_image(self._image, grain_picture(substrate)[..., None])
 
 
 def _add_cloth(scene: Any, geometry: DragGeometry) -> Any:
@@ -276,9 +252,15 @@ class _Fabric:
 
     def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
         """Print a picture on the cloth, (size, size, 3), 8-bit sRGB, row 0 at its lower edge."""
-        if self._picture.image is None:
-            self._picture.image = _new_image("print", len(picture), linear=False)
-        _set_image(self._picture.image, picture / np.float32(255))
+        images, old = import_bpy().data.images, self._picture.image
+        image = images.new("print", *picture.shape[:2])  # a new one: Cycles does not look at an old one again
+        rgba = np.ones((*picture.shape[:2], 4), dtype=np.float32)
+        rgba[..., :3] = picture / np.float32(255)
+        image.pixels.foreach_set(rgba.ravel())
+        image.update()
+        self._picture.image = image
+        if old is not None:
+            images.remove(old)
         self._connect(self._picture)
 
     def _connect(self, node: Any) -> None:

@@ -33,6 +33,15 @@ class Seen:
     triangle: Indices
     """By sample, -1 where there is none; shape (grid height, grid width)."""
 
+    def share_below(self, end: int) -> npt.NDArray[np.float32]:
+        """Return the share of each pixel's samples that see one of the first `end` triangles, (height, width)."""
+        hit = (self.triangle >= 0) & (self.triangle < end)
+        rows, columns = self.triangle.shape[0] // self.grid, self.triangle.shape[1] // self.grid
+        share: npt.NDArray[np.float32] = hit.reshape(rows, self.grid, columns, self.grid).mean(
+            axis=(1, 3), dtype=np.float32
+        )
+        return share
+
     def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
         """Interpolate values of vertices (V, k) in perspective at the pixel centres, `fill` where nothing is seen.
 
