@@ -9,12 +9,12 @@ SOURCES = $(addsuffix /src,schemas services training workers workers/blender) si
 # One by one: test modules of different components have the same names. The other tests are not typed.
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
-CORE_SOURCES = $(wildcard sim_core/src/*) sim_core/CMakeLists.txt sim_core/pyproject.toml
+CORE_SOURCES = $(shell find sim_core/src sim_core/cmake -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
 # reconstruction.py calls render_rod_set.py with Blender's interpreter.
 # rod_families.py is imported, cloth_grid.py takes half an hour, and the last two need what others write, or train.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py cloth_grid.py curvature_methods.py \
   natural_from_pictures.py),$(wildcard benchmarks/*.py))
-CPP_FILES = $(wildcard sim_core/src/*.hpp sim_core/src/*.cpp)
+CPP_FILES = $(shell find sim_core/src -name "*.[ch]pp")
 
 .PHONY: setup demo test check bench constraints clean
 

@@ -10,7 +10,9 @@ import argparse
 import time
 
 import numpy as np
-from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, meshes, plane, scenes
+from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, plane
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.scenes import cloth_drag as scenes
 
 
 def run(material: str, mu: float, preset: str, vertices: int) -> None:

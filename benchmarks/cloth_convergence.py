@@ -18,13 +18,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core import DropAndDrag, Preset, build_info, drop_and_drag, preset_named
-from stickslip_sim_core.scenes import FRAME_RATE, FRAMES
+from stickslip_sim_core import DropAndDrag, SolverSettings, build_info, drop_and_drag, preset_named
+from stickslip_sim_core.scenes.cloth_drag import FRAME_RATE, FRAMES
 
 STEADY = (22.0, 37.0)  # s
 
 
-def divided(preset: Preset, divisor: int) -> Preset:
+def divided(preset: SolverSettings, divisor: int) -> SolverSettings:
     """Return a preset whose steps divide those that the scene makes of `preset`'s."""
     per_frame = int(np.ceil(1.0 / (FRAME_RATE * preset.time_step)))
     step = (1.0 + 1e-9) / (FRAME_RATE * per_frame * divisor)

@@ -30,21 +30,22 @@ import numpy.typing as npt  # noqa: E402
 import torch  # noqa: E402
 from rod_families import POINTS, RANGES, WAVES, Rods, bumpy_rods, cosines, family_rods, varying_rods  # noqa: E402
 from stickslip_sim_core import fit_natural_curvature, fit_parameters, solve_general_rods, solve_rods  # noqa: E402
-from stickslip_training import train_curvature  # noqa: E402
-from stickslip_training.curvature_baselines import (  # noqa: E402
+from stickslip_training.engine.fit import EpochReport  # noqa: E402
+from stickslip_training.rods import curvature as table_5_1  # noqa: E402
+from stickslip_training.rods import dataset  # noqa: E402
+from stickslip_training.rods.baselines import (  # noqa: E402
     cubic_spline_curvature,
     finite_difference_curvature,
     quintic_spline_curvature,
 )
-from stickslip_training.curvature_errors import bending, relative_rms_error  # noqa: E402
-from stickslip_training.local_global_training import (  # noqa: E402
+from stickslip_training.rods.errors import bending, relative_rms_error  # noqa: E402
+from stickslip_training.rods.local_global import (  # noqa: E402
     LocalGlobalTraining,
-    StepReport,
     load_local_global,
     save_local_global,
     train_local_global,
 )
-from stickslip_training.noise import ReconstructionNoise, with_white_noise  # noqa: E402
+from stickslip_training.rods.noise import ReconstructionNoise, with_white_noise  # noqa: E402
 
 Floats = npt.NDArray[np.float64]
 
@@ -67,13 +68,13 @@ def train_ours(path: Path, reconstruction: ReconstructionNoise | None) -> None:
     )
     del pools
 
-    def tell(report: StepReport) -> None:
-        print(f"  step {report.step}: loss {report.loss:.4f}, {report.seconds:.0f} CPU s", flush=True)
+    def tell(report: EpochReport) -> None:
+        print(f"  step {report.step}: loss {report.train_loss:.4f}, {report.seconds:.0f} s", flush=True)
 
     mixed = np.random.default_rng(0).permutation(len(lines))  # the components come from every so many of them
     settings = LocalGlobalTraining(steps=STEPS)
     net = train_local_global(
-        lines[mixed], strains[mixed], settings, reconstruction=reconstruction, on_step=tell, every=1000
+        lines[mixed], strains[mixed], settings, reconstruction=reconstruction, on_epoch=tell, every=1000
     )
     save_local_global(path, net, settings)
 
@@ -84,11 +85,11 @@ def train_thesis(path: Path) -> None:
     grid = np.stack([values.ravel() for values in np.meshgrid(*axes, indexing="ij")])
     chosen = np.random.default_rng(102).permutation(grid.shape[1])[:THESIS_RODS]
     solution = solve_rods(*grid[:, chosen])
-    rods = train_curvature.Rods(chosen, solution.centerline.astype(np.float32), solution.curvature.astype(np.float32))
-    config = train_curvature.CurvatureTraining(
+    rods = dataset.Rods(chosen, solution.centerline.astype(np.float32), solution.curvature.astype(np.float32))
+    config = table_5_1.CurvatureTraining(
         dataset="the thesis's grid", out=path.parent / "table-5.1", epochs=EPOCHS, threads=1
     )
-    net = train_curvature.train_on_rods(config, rods[:THESIS_TRAINING], rods[THESIS_TRAINING:])
+    net = table_5_1.train_on_rods(config, rods[:THESIS_TRAINING], rods[THESIS_TRAINING:])
     torch.save({"net": net.state_dict()}, path)
 
 
@@ -153,7 +154,7 @@ def all_methods(models: Path) -> dict[str, Method]:
         "quintic smoothing spline, cross-validated": quintic_spline_curvature,
         "three-parameter fit": rod_by_rod(three_parameter_fit),
         "distributed fit, cross-validated": rod_by_rod(distributed_fit),
-        "network of Table 5.1": network(train_curvature.load_model(models / THESIS_NAME)),
+        "network of Table 5.1": network(table_5_1.load_model(models / THESIS_NAME)),
         OURS: network(load_local_global(models / OUR_NAME)),
     }
 

@@ -14,7 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core import boundary_value, master_curves, plate_buckling
+from stickslip_sim_core.reference import boundary_value, master_curves, plate_buckling
 
 Floats = NDArray[np.float64]
 

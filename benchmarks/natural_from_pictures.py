@@ -31,7 +31,7 @@ from stickslip_sim_core import (  # noqa: E402
     natural_curvature,
     solve_general_rods,
 )
-from stickslip_training.curvature_errors import bending, relative_rms_error  # noqa: E402
+from stickslip_training.rods.errors import bending, relative_rms_error  # noqa: E402
 
 Floats = npt.NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def by_distributed_fit(line: Floats, gamma: float, noise: float) -> Floats:
 def by_network(model: Path) -> Way:
     """Read the strains with a network and invert Eq. 5.1."""
     import torch
-    from stickslip_training.local_global_training import load_local_global
+    from stickslip_training.rods.local_global import load_local_global
 
     torch.set_num_threads(1)
     net = load_local_global(model)

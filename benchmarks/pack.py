@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 from stickslip_schemas.chunks import encode_chunk
-from stickslip_schemas.jobs import RodHangSpec
+from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import ChunkRef, PackSlot, PackTask, RecordRef

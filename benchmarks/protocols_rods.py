@@ -16,8 +16,9 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from stickslip_sim_core import build_info, master_curves, protocols
+from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
+from stickslip_sim_core.reference import master_curves
 
 
 def report(result: ProtocolResult, seconds: float) -> None:

@@ -31,15 +31,17 @@ import tensorstore
 import torch
 import zarr
 from numpy.typing import NDArray
+from stickslip_schemas.arrays import ArrayLayout, describe
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.chunks import encode_chunk, encode_shard
-from stickslip_schemas.jobs import ClothDragSpec, job_spec_adapter
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.layout import ArrayLayout, describe, layout
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.tasks import FileEntry
-from stickslip_training.datasets import ClipDataset
+from stickslip_training.kinds.cloth_drag import ClipDataset
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
 Bytes = NDArray[np.uint8]

@@ -24,7 +24,7 @@ import httpx
 import numpy as np
 import yaml
 from stickslip_schemas.manifest import Manifest
-from stickslip_training.reader import DatasetReader
+from stickslip_training.data.reader import DatasetReader
 
 SPEC = Path(__file__).parents[1] / "examples" / "thesis-rods.yaml"
 STICKSLIP = Path(sys.executable).with_name("stickslip")

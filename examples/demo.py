@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from rich.console import Console
-from stickslip_services.client import Client
-from stickslip_training.datasets import ClipDataset, RodDataset
+from stickslip_services.client.http import Client
+from stickslip_training.kinds.cloth_drag import ClipDataset
+from stickslip_training.kinds.rod_hang import RodDataset
 
 BIN = Path(sys.executable).parent
 RODS = Path(__file__).with_name("demo-rods.yaml")

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.manifest import Manifest
-from stickslip_services.certifying import read_certificate
 from stickslip_services.cli import app
-from stickslip_services.client import Client
+from stickslip_services.client.http import Client
+from stickslip_services.local.certifying import read_certificate
 from stickslip_services.testing import BUILDS, RunningServer, start_server
 from typer.testing import CliRunner, Result
 

@@ -11,13 +11,13 @@ import pytest
 import yaml
 from harness import Service, descendants, read_arrays, wait_for
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import job_spec_adapter
 from stickslip_schemas.keys import sha256
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import samples
 from stickslip_schemas.store import Store
-from stickslip_services.audit import audit
-from stickslip_services.db import Database
+from stickslip_services.database.database import Database
+from stickslip_services.queue.audit import audit
 from stickslip_sim_core import solve_rods
 
 SPEC: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text())

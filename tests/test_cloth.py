@@ -9,7 +9,7 @@ import pytest
 from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.manifest import Manifest
 from stickslip_sim_core import drop_and_drag
-from stickslip_training.datasets import ClipDataset
+from stickslip_training.kinds.cloth_drag import ClipDataset
 
 SPEC: dict[str, Any] = {
     "kind": "cloth_drag",

@@ -15,8 +15,8 @@ from stickslip_schemas.chunks import CorruptChunkError
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.manifest import Manifest
 from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
-from stickslip_training.datasets import RodDataset
-from stickslip_training.reader import DatasetReader
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.kinds.rod_hang import RodDataset
 
 TRAIN = STICKSLIP.with_name("stickslip-train")
 

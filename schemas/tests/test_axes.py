@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 from stickslip_schemas.axes import axis_values
-from stickslip_schemas.jobs import GammaAxis
+from stickslip_schemas.kinds.rod_hang import GammaAxis
 
 _AXIS: TypeAdapter[Any] = TypeAdapter(GammaAxis)
 

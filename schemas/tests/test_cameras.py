@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from stickslip_schemas.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
-from stickslip_schemas.jobs import Viewpoint
+from stickslip_schemas.kinds.cloth_drag import Viewpoint
 
 LEVEL = Camera(  # three units in front of the origin on the x axis, looking back at it
     name="level",
@@ -99,7 +99,7 @@ def test_a_camera_survives_json_unchanged() -> None:
 
 def test_rod_4_is_four_upright_views_that_never_face_each_other() -> None:
     rig = load_rig("rod-4")
-    assert rig_names() == ("rod-4", "drag-3")
+    assert rig_names() == ("drag-3", "rod-4")
     assert [camera.name for camera in rig] == ["front", "side", "high", "low"]
     for camera in rig:
         assert (camera.width, camera.height) == (224, 224)
@@ -140,12 +140,12 @@ def test_drag_3_is_the_viewpoints_and_holds_the_stage() -> None:
 
 
 def test_an_unknown_rig_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="rig must be one of rod-4, drag-3; got 'rod-5'"):
+    with pytest.raises(ValueError, match="rig must be one of drag-3, rod-4; got 'rod-5'"):
         load_rig("rod-5")
 
 
 def test_a_calibration_file_reads_like_the_shipped_one(tmp_path: Path) -> None:
-    text = files("stickslip_schemas").joinpath("cameras.toml").read_text(encoding="utf-8")
+    text = files("stickslip_schemas").joinpath("rigs", "rod-4.toml").read_text(encoding="utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(text.replace("[rod-4", "[mine"), encoding="utf-8")
     assert read_rigs(file)["mine"] == load_rig("rod-4")

@@ -5,11 +5,11 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.certificate import Certificate, preset_of
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.certificate import Certificate
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.samples import publish_key, samples
 
-BUILDS = Builds(sim_core="a" * 64, blender="b" * 64, packer="c" * 64)
+BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
 
 def protocol(**changes: Any) -> dict[str, Any]:
@@ -32,6 +32,7 @@ def document(**changes: Any) -> dict[str, Any]:
         "preset": "certified",
         "numbers": {"dt": 0.01},
         "sim_core": "a" * 64,
+        "protocol_sources": "b" * 64,
         "extent": "full",
         "protocols": [protocol()],
         "passed": True,
@@ -104,10 +105,10 @@ def test_allow_uncertified_changes_no_sample() -> None:
     )
     assert [s.key for s in samples(strict, BUILDS)] == [s.key for s in samples(lenient, BUILDS)]
     assert strict.content_digest != lenient.content_digest
-    assert preset_of(strict) == "certified"
+    assert strict.certified_preset == "certified"
 
 
 def test_a_certificate_makes_another_version_of_the_dataset() -> None:
     spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1, "phi1": 6}})
     assert publish_key(spec, ["a" * 64], BUILDS, "e" * 64) != publish_key(spec, ["a" * 64], BUILDS)
-    assert preset_of(spec) == "rods"
+    assert spec.certified_preset == "rods"

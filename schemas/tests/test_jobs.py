@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import ValidationError
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec, job_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.problems import FieldError, field_errors
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -126,4 +128,4 @@ def test_long_values_are_cut_and_errors_are_json() -> None:
 
 def test_schema_names_the_quantities() -> None:
     definitions = job_spec_adapter.json_schema()["$defs"]
-    assert {"RodHangSpec", "ClothDragSpec", "RodAxes", "ClothAxes"} <= set(definitions)
+    assert {"RodHangSpec", "ClothDragSpec", "RodHangAxes", "ClothDragAxes"} <= set(definitions)

@@ -2,12 +2,12 @@
 
 import pytest
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import job_spec_adapter
 from stickslip_schemas.keys import canonical_json, content_key, derived_seed
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.samples import Sample, dataset_id, pack_key, publish_key, samples
-from stickslip_schemas.tasks import RodRender
 
-BUILDS = Builds(sim_core="a" * 64, blender="b" * 64, packer="c" * 64)
+BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
 
 def one(
@@ -40,7 +40,7 @@ def test_pinned_keys() -> None:
     sample = one()
     assert sample.simulation_key == PINNED["simulation"]
     assert sample.split == PINNED["split"]
-    assert isinstance(sample.render, RodRender)
+    assert isinstance(sample.render, RodHangRender)
     assert sample.render.color_seed == PINNED["color_seed"]
     spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": 100.0, "phi0": 1.0, "phi1": 6.0}})
     assert spec.content_digest == PINNED["spec"]
@@ -60,8 +60,8 @@ def test_pinned_keys() -> None:
 def test_simulation_depends_on_physics_and_sim_core_only() -> None:
     key = one().simulation_key
     assert one(poisson=0.3).simulation_key != key
-    assert one(builds=BUILDS.model_copy(update={"sim_core": "d" * 64})).simulation_key != key
-    assert one(builds=BUILDS.model_copy(update={"blender": "d" * 64})).simulation_key == key
+    assert one(builds=BUILDS.model_copy(update={"simulate": "d" * 64})).simulation_key != key
+    assert one(builds=BUILDS.model_copy(update={"render": "d" * 64})).simulation_key == key
     assert one(seed=1, name="x", views=None, samples_per_shard=2).simulation_key == key
 
 
@@ -70,7 +70,7 @@ def test_render_depends_on_simulation_look_and_renderer() -> None:
     assert one(poisson=0.3).render_key != key
     assert one(seed=1).render_key != key
     assert one(quality="draft").render_key != key
-    assert one(builds=BUILDS.model_copy(update={"blender": "d" * 64})).render_key != key
+    assert one(builds=BUILDS.model_copy(update={"render": "d" * 64})).render_key != key
     assert one(name="x", samples_per_shard=2).render_key == key
 
 
@@ -100,7 +100,7 @@ def test_pack_and_publish_keys_hold_what_they_are_made_of() -> None:
     key = pack_key(spec, 0, [first, second], BUILDS)
     assert key != pack_key(spec, 0, [second, first], BUILDS)
     assert key != pack_key(spec, 1, [first, second], BUILDS)
-    assert key != pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"packer": "d" * 64}))
+    assert key != pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"pack": "d" * 64}))
     assert publish_key(spec, [key], BUILDS) != publish_key(spec, [key, key], BUILDS)
 
 
@@ -150,6 +150,6 @@ PINNED: dict[str, object] = {
     "split": 0,
     "color_seed": 1423131992,
     "spec": "f9b8c3cfcafcc5fac6634f45c6f4652371cc8cd0843a906cd6364e98eabc7b32",
-    "cloth_simulation": "9fbc21cd005d23922f0a1d06e37add03dad9db04cce9e09bac72b323da410f45",
-    "cloth_render": "2fc27dec49b4b9325cf86a4268d9d27c0b30951500b4687875468f4b4a400565",
+    "cloth_simulation": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
+    "cloth_render": "e08606046a31a0577257ccf870123298caa290a113452d0ecbd7c272ccb30101",
 }

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from stickslip_services.operations import Coordinator
+from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, start_server
 

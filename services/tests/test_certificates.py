@@ -8,11 +8,11 @@ from fastapi import FastAPI
 from stickslip_schemas.certificate import Certificate, CertificateUpload
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.states import JobState, Reason
-from stickslip_services.app import make_app
+from stickslip_services.coordinator import make_app
 from stickslip_services.errors import PresetNotCertifiedError
-from stickslip_services.operations import Coordinator
+from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import BUILDS, ManualClock, PretendWorker, parsed, rods, serving
+from stickslip_services.testing import BUILDS, ManualClock, PretendWorker, parsed, rods, serving, show_job
 
 KINDS = ("rod_hang", "cloth_drag")
 PAGE = "<!doctype html><title>c</title>"
@@ -35,6 +35,7 @@ def upload(**changes: Any) -> CertificateUpload:
         "preset": "certified",
         "numbers": {},
         "sim_core": BUILDS.sim_core,
+        "protocol_sources": "f" * 64,
         "extent": "full",
         "protocols": [protocol],
         "passed": error <= 0.01,
@@ -49,7 +50,7 @@ def cloth(**rest: Any) -> Any:
 
 
 def manifest_of(coordinator: Coordinator, job: Any) -> Manifest:
-    shown = coordinator.show_job(job.id)
+    shown = show_job(coordinator, job.id)
     assert shown.state is JobState.succeeded, shown.message
     assert shown.dataset is not None
     return Manifest.model_validate_json(coordinator.store.read(shown.dataset.manifest))
@@ -137,10 +138,10 @@ class TestTheRule:
         early = coordinator.submit(cloth(), None)
         lenient = coordinator.submit(cloth(allow_uncertified=True), None)
         PretendWorker(coordinator, coordinator.store, kinds=KINDS).register()
-        shown = coordinator.show_job(early.id)  # type: ignore[union-attr]  # no replay
+        shown = show_job(coordinator, early.id)  # type: ignore[union-attr]  # no replay
         assert (shown.state, shown.reason) == (JobState.failed, Reason.preset_not_certified)
         assert "stickslip certify" in shown.message
-        assert coordinator.show_job(lenient.id).state is JobState.queued  # type: ignore[union-attr]
+        assert show_job(coordinator, lenient.id).state is JobState.queued  # type: ignore[union-attr]
 
 
 class TestHttp:

@@ -8,8 +8,8 @@ from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.tasks import Rejection
-from stickslip_services.app import make_app
-from stickslip_services.dataset_page import LISTED, dataset_page
+from stickslip_services.coordinator import make_app
+from stickslip_services.pages.dataset_page import LISTED, dataset_page
 from stickslip_services.settings import Settings
 from stickslip_services.testing import BUILDS, PretendWorker, parsed, rejection, rods, serving
 

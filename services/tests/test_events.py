@@ -9,8 +9,8 @@ import httpx
 import pytest
 from fastapi import FastAPI
 from httpx_sse import ServerSentEvent, connect_sse
-from stickslip_services import sse
-from stickslip_services.app import make_app
+from stickslip_services.api import sse
+from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, failure, rods, serving
 

@@ -13,7 +13,7 @@ import xarray
 import zarr
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.store import Store
-from stickslip_services.app import make_app
+from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, rods, serving
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from alembic.util import CommandError
 from sqlalchemy import text
-from stickslip_services import migrate
-from stickslip_services.db import Database
-from stickslip_services.tables import metadata
+from stickslip_services.database import migrate
+from stickslip_services.database.database import Database
+from stickslip_services.database.tables import metadata
 
 
 def test_tables_are_those_of_the_migrations(tmp_path: Path) -> None:

@@ -3,17 +3,17 @@
 import json
 from pathlib import Path
 
-from stickslip_services.openapi import document_text
+from stickslip_services.coordinator import openapi_text
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "openapi.json"
 
 
 def test_the_committed_document_is_up_to_date() -> None:
-    assert COMMITTED.read_text() == document_text(), "run: python -m stickslip_services.openapi > docs/openapi.json"
+    assert COMMITTED.read_text() == openapi_text(), "run: python -m stickslip_services.api.openapi > docs/openapi.json"
 
 
 def test_every_reference_leads_somewhere() -> None:
-    document = json.loads(document_text())
+    document = json.loads(openapi_text())
     names = set(document["components"]["schemas"])
     text = json.dumps(document)
     references = {part.split('"')[0] for part in text.split("#/components/schemas/")[1:]}
@@ -23,7 +23,7 @@ def test_every_reference_leads_somewhere() -> None:
 
 
 def test_every_route_names_its_problems() -> None:
-    document = json.loads(document_text())
+    document = json.loads(openapi_text())
     for path, methods in document["paths"].items():
         for method, operation in methods.items():
             for status, response in operation["responses"].items():

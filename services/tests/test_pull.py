@@ -7,9 +7,9 @@ import httpx
 import pytest
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.manifest import Manifest
-from stickslip_services.app import make_app
-from stickslip_services.client import Client, ProblemError, UnexpectedError, UnreachableError
-from stickslip_services.pull import DamagedError, UnsafePathError, pull, safe_path, verify
+from stickslip_services.client.http import Client, ProblemError, UnexpectedError, UnreachableError
+from stickslip_services.client.pull import DamagedError, UnsafePathError, pull, safe_path, verify
+from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, rods, serving
 

@@ -5,23 +5,29 @@ from typing import Any
 
 import pytest
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.responses import Dataset
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask
 from stickslip_schemas.worker_api import LeaseRequest
-from stickslip_services.audit import audit
+from stickslip_services.catalog.datasets import find_dataset
+from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
-from stickslip_services.events import read_events
-from stickslip_services.operations import Coordinator
-from stickslip_services.paging import PageRequest
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.compose import AnyTask, find_task
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.events import read_events
+from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.settings import Settings
 from stickslip_services.testing import (
     BUILDS,
     ManualClock,
     PretendWorker,
     failure,
+    list_jobs,
     parsed,
     rejection,
     rods,
+    show_job,
 )
 
 
@@ -31,27 +37,37 @@ def submit(coordinator: Coordinator, **spec: Any) -> str:
     return job.id  # type: ignore[union-attr]
 
 
+def show_dataset(coordinator: Coordinator, dataset: str) -> Dataset:
+    with coordinator.database.read() as connection:
+        return find_dataset(connection, dataset)
+
+
+def show_task(coordinator: Coordinator, name: str) -> AnyTask:
+    with coordinator.database.read() as connection:
+        return find_task(connection, name)
+
+
 def check(coordinator: Coordinator) -> None:
     with coordinator.database.read() as connection:
         assert audit(connection) == []
 
 
 def counts(coordinator: Coordinator, job: str, stage: Stage) -> dict[TaskState, int]:
-    return coordinator.show_job(job).progress.stages[stage].counts
+    return show_job(coordinator, job).progress.stages[stage].counts
 
 
 def test_a_job_runs_from_grid_to_dataset(coordinator: Coordinator, worker: PretendWorker) -> None:
     job_id = submit(coordinator, name="first")
-    assert coordinator.show_job(job_id).state is JobState.queued
+    assert show_job(coordinator, job_id).state is JobState.queued
     first = worker.lease(simulate=1)
-    assert coordinator.show_job(job_id).state is JobState.running
+    assert show_job(coordinator, job_id).state is JobState.running
     worker.finish(*first)
     assert worker.work() == 4 + 4 + 2 + 1 - 1
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.rejected_count, job.progress.done, job.progress.total) == (JobState.succeeded, 0, 11, 11)
     assert job.progress.stages[Stage.render].cpu_seconds == 8.0
     assert job.dataset is not None
-    dataset = coordinator.show_dataset(job.dataset.dataset)
+    dataset = show_dataset(coordinator, job.dataset.dataset)
     assert (dataset.name, [version.version for version in dataset.versions]) == ("first", [1])
     assert dataset.versions[0].manifest == job.dataset.manifest
     check(coordinator)
@@ -87,7 +103,7 @@ def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, work
 def test_nothing_is_rendered_where_no_views_are_wanted(coordinator: Coordinator, worker: PretendWorker) -> None:
     job_id = submit(coordinator, views=None)
     assert worker.work() == 4 + 2 + 1
-    assert coordinator.show_job(job_id).state is JobState.succeeded
+    assert show_job(coordinator, job_id).state is JobState.succeeded
     check(coordinator)
 
 
@@ -95,10 +111,11 @@ def test_a_rejected_simulation_rejects_its_renders(coordinator: Coordinator, wor
     worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
     job_id = submit(coordinator)
     worker.work()
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 2)
     assert "2 of 4 samples were rejected" in job.message
-    page = coordinator.list_samples(job_id, PageRequest(10, None), TaskState.rejected)
+    with coordinator.database.read() as connection:
+        page = list_samples(connection, find_job(connection, job_id).seq, PageRequest(10, None), TaskState.rejected)
     assert [(item.slot, item.reason, item.message) for item in page.items] == [
         (0, Reason.solver_diverged, "it diverged"),
         (1, Reason.solver_diverged, "it diverged"),
@@ -111,16 +128,16 @@ def test_all_samples_rejected_is_a_dataset_too(coordinator: Coordinator, worker:
     worker.judge = lambda task: rejection() if task.stage == "simulate" else None
     job_id = submit(coordinator)
     worker.work()
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 4)
     assert job.dataset is not None
-    assert coordinator.show_version(job.dataset.dataset, 1).valid_count == 0
+    assert show_dataset(coordinator, job.dataset.dataset).versions[0].valid_count == 0
 
 
 def test_the_same_grid_again_runs_nothing(coordinator: Coordinator, worker: PretendWorker) -> None:
     submit(coordinator)
     worker.work()
-    again = coordinator.show_job(submit(coordinator, name="again"))
+    again = show_job(coordinator, submit(coordinator, name="again"))
     assert again.state is JobState.succeeded
     assert again.dataset is not None
     assert again.dataset.version == 1
@@ -135,7 +152,7 @@ def test_a_bigger_grid_runs_what_is_new(coordinator: Coordinator, worker: Preten
     ran = len(worker.ran)
     bigger = submit(coordinator, gamma=(1.0, 2.0, 5.0))
     worker.work()
-    job = coordinator.show_job(bigger)
+    job = show_job(coordinator, bigger)
     assert job.state is JobState.succeeded
     assert len(worker.ran) - ran == 2 + 2 + 1 + 1  # two shards are those of the smaller grid
     assert job.progress.stages[Stage.simulate].cached == 4
@@ -147,15 +164,15 @@ def test_other_builds_make_another_version(coordinator: Coordinator, worker: Pre
     submit(coordinator)
     worker.work()
     other = PretendWorker(
-        coordinator, coordinator.store, name="new", builds=BUILDS.model_copy(update={"blender": "e" * 64})
+        coordinator, coordinator.store, name="new", builds=BUILDS.model_copy(update={"render": "e" * 64})
     ).register()
     job_id = submit(coordinator)
     other.work()
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert job.dataset is not None
     assert job.dataset.version == 2
     assert job.progress.stages[Stage.simulate].cached == 4  # the simulator is the same
-    assert len(coordinator.show_dataset(job.dataset.dataset).versions) == 2
+    assert len(show_dataset(coordinator, job.dataset.dataset).versions) == 2
     check(coordinator)
 
 
@@ -224,7 +241,7 @@ def test_three_failed_tries_fail_the_job(coordinator: Coordinator, worker: Prete
         leases = worker.lease(simulate=1)
         assert len(leases) == (1 if tries < 2 else 0)
         poison = leases[0] if leases else poison
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.failed_tasks)
     assert "failed 3 times" in job.message
     assert "crash 2" in job.message
@@ -245,15 +262,15 @@ def test_submitting_a_failed_job_again_tries_again(
     for _ in range(4):
         worker.work()
         clock.advance(10)
-    assert coordinator.show_job(first).state is JobState.failed
+    assert show_job(coordinator, first).state is JobState.failed
     worker.judge = lambda _task: None
     second = submit(coordinator)
     check(coordinator)
     worker.work()
-    job = coordinator.show_job(second)
+    job = show_job(coordinator, second)
     assert job.state is JobState.succeeded
     assert job.progress.stages[Stage.simulate].cached == 4
-    assert coordinator.show_job(first).state is JobState.failed
+    assert show_job(coordinator, first).state is JobState.failed
     check(coordinator)
 
 
@@ -301,17 +318,17 @@ def test_jobs_share_tasks_and_one_can_be_cancelled(coordinator: Coordinator, wor
     small = submit(coordinator, gamma=(1.0,))
     big = submit(coordinator)
     first = worker.lease(simulate=1)
-    assert coordinator.show_job(small).state is coordinator.show_job(big).state is JobState.running
+    assert show_job(coordinator, small).state is show_job(coordinator, big).state is JobState.running
     check(coordinator)
     assert coordinator.cancel(small).state is JobState.cancelled  # what is leased, the other job needs
     check(coordinator)
     assert worker.beat(*first, started=True) == ()
     worker.finish(*first)
     worker.work()
-    assert coordinator.show_job(big).state is JobState.succeeded
-    assert coordinator.show_job(small).state is JobState.cancelled
+    assert show_job(coordinator, big).state is JobState.succeeded
+    assert show_job(coordinator, small).state is JobState.cancelled
     check(coordinator)
-    assert coordinator.show_job(submit(coordinator, gamma=(1.0,))).state is JobState.queued  # its own last task only
+    assert show_job(coordinator, submit(coordinator, gamma=(1.0,))).state is JobState.queued  # its own last task only
 
 
 def test_cancelling_drops_what_runs(coordinator: Coordinator, worker: PretendWorker) -> None:
@@ -323,7 +340,7 @@ def test_cancelling_drops_what_runs(coordinator: Coordinator, worker: PretendWor
     check(coordinator)
     assert worker.lease() == ()
     assert set(worker.beat(started, idle)) == {started.task_id, idle.task_id}
-    assert coordinator.show_job(job_id).state is JobState.cancelled
+    assert show_job(coordinator, job_id).state is JobState.cancelled
     assert worker.finish(started) == ["stale"]
     assert coordinator.cancel(job_id).state is JobState.cancelled
     check(coordinator)
@@ -334,8 +351,8 @@ def test_a_result_that_comes_before_the_drop_is_kept(coordinator: Coordinator, w
     (task,) = worker.lease(simulate=1)
     coordinator.cancel(job_id)
     assert worker.finish(task) == ["accepted"]
-    assert coordinator.show_job(job_id).state is JobState.cancelled
-    again = coordinator.show_job(submit(coordinator))
+    assert show_job(coordinator, job_id).state is JobState.cancelled
+    again = show_job(coordinator, submit(coordinator))
     assert again.progress.stages[Stage.simulate].cached == 1
     check(coordinator)
 
@@ -348,7 +365,7 @@ def test_cancelling_ends_although_the_worker_is_gone(
     coordinator.cancel(job_id)
     clock.advance(31)
     coordinator.sweep()
-    assert coordinator.show_job(job_id).state is JobState.cancelled
+    assert show_job(coordinator, job_id).state is JobState.cancelled
     check(coordinator)
 
 
@@ -363,13 +380,13 @@ def test_a_job_that_has_ended_cannot_be_cancelled(coordinator: Coordinator, work
 
 def test_a_job_waits_for_the_first_worker(coordinator: Coordinator) -> None:
     job_id = submit(coordinator)
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.reason, job.progress.total) == (JobState.queued, Reason.waiting_for_worker, 0)
     worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.reason, job.message, job.progress.total) == (JobState.queued, None, "", 11)
     worker.work()
-    assert coordinator.show_job(job_id).state is JobState.succeeded
+    assert show_job(coordinator, job_id).state is JobState.succeeded
     check(coordinator)
 
 
@@ -377,7 +394,7 @@ def test_a_waiting_job_can_be_cancelled(coordinator: Coordinator) -> None:
     job_id = submit(coordinator)
     assert coordinator.cancel(job_id).state is JobState.cancelled
     PretendWorker(coordinator, coordinator.store).register()
-    assert coordinator.show_job(job_id).progress.total == 0
+    assert show_job(coordinator, job_id).progress.total == 0
     check(coordinator)
 
 
@@ -391,14 +408,14 @@ CLOTH: dict[str, Any] = {
 def test_a_kind_that_no_worker_makes_is_refused(coordinator: Coordinator, worker: PretendWorker) -> None:
     with pytest.raises(KindNotAvailableError, match="rod_hang"):
         coordinator.submit(parsed(CLOTH), None)
-    assert coordinator.list_jobs(PageRequest(10, None)).items == ()
+    assert list_jobs(coordinator) == ()
     assert worker.lease() == ()
 
 
 def test_a_waiting_job_of_such_a_kind_fails(coordinator: Coordinator) -> None:
     job = coordinator.submit(parsed(CLOTH), None)
     PretendWorker(coordinator, coordinator.store).register()
-    shown = coordinator.show_job(job.id)  # type: ignore[union-attr]
+    shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
     assert shown.state is JobState.failed
     assert "no worker makes 'cloth_drag'" in shown.message
 
@@ -409,7 +426,7 @@ def test_one_simulation_serves_all_looks_and_those_that_come_later(coordinator: 
     def work(**axes: Any) -> dict[str, dict[str, int]]:
         job = coordinator.submit(parsed(CLOTH | {"axes": CLOTH["axes"] | axes}), None)
         worker.work()
-        stages = coordinator.show_job(job.id).progress.stages  # type: ignore[union-attr]
+        stages = show_job(coordinator, job.id).progress.stages  # type: ignore[union-attr]
         return {
             stage: {"all": sum(stages[stage].counts.values()), "cached": stages[stage].cached}
             for stage in (Stage.simulate, Stage.render)
@@ -430,7 +447,7 @@ def test_many_renders_share_one_simulation(coordinator: Coordinator) -> None:
     worker.report((simulation, rejection()))
     assert worker.lease(render=10) == ()
     worker.work()
-    shown = coordinator.show_job(job.id)  # type: ignore[union-attr]
+    shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
     assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 2)
     check(coordinator)
 
@@ -439,21 +456,21 @@ def test_a_stranded_job_says_so(coordinator: Coordinator, worker: PretendWorker,
     job_id = submit(coordinator)
     clock.advance(31)
     coordinator.sweep()
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.state, job.reason) == (JobState.queued, Reason.waiting_for_worker)
     assert "no worker is connected" in job.message
     other = BUILDS.model_copy(update={"sim_core": "f" * 64})
     PretendWorker(coordinator, coordinator.store, builds=other).register()
-    assert "no connected worker has the builds" in coordinator.show_job(job_id).message
+    assert "no connected worker has the builds" in show_job(coordinator, job_id).message
     PretendWorker(coordinator, coordinator.store, name="old").register()
-    job = coordinator.show_job(job_id)
+    job = show_job(coordinator, job_id)
     assert (job.reason, job.message) == (None, "")
     check(coordinator)
 
 
 def test_tasks_go_only_to_their_builds(coordinator: Coordinator, worker: PretendWorker) -> None:
     submit(coordinator)
-    other = BUILDS.model_copy(update={"blender": "f" * 64})
+    other = BUILDS.model_copy(update={"render": "f" * 64})
     foreign = PretendWorker(coordinator, coordinator.store, name="foreign", builds=other).register()
     leases = foreign.lease()
     assert {lease.task.stage for lease in leases} == {"simulate"}  # the simulator is the same
@@ -468,7 +485,7 @@ def test_a_small_job_does_not_wait_behind_a_big_one(coordinator: Coordinator, wo
     held = worker.lease(simulate=4)
     gammas = sorted(lease.task.simulation.gamma for lease in held)  # type: ignore[union-attr]
     assert gammas[-2:] == [77.0, 77.0]
-    assert coordinator.show_job(small).state is JobState.running
+    assert show_job(coordinator, small).state is JobState.running
     check(coordinator)
 
 
@@ -488,7 +505,7 @@ def test_work_survives_a_restart(settings: Settings, clock: ManualClock) -> None
     assert worker.start(*held) == ()
     assert worker.finish(*held) == ["accepted", "accepted"]
     worker.work()
-    assert after.show_job(job_id).state is JobState.succeeded
+    assert show_job(after, job_id).state is JobState.succeeded
     check(after)
     after.close()
 
@@ -508,7 +525,7 @@ def test_a_worker_that_publishes_what_is_not_there_is_not_believed(
     (again,) = worker.lease(publish=1)
     assert again.task == publish[0].task  # the same version number
     assert worker.finish(again) == ["accepted"]
-    assert coordinator.show_job(job_id).state is JobState.succeeded
+    assert show_job(coordinator, job_id).state is JobState.succeeded
     check(coordinator)
 
 
@@ -525,19 +542,19 @@ def test_an_output_of_another_stage_is_no_answer(coordinator: Coordinator, worke
 def test_a_task_can_be_read_for_a_replay(coordinator: Coordinator, worker: PretendWorker) -> None:
     submit(coordinator)
     leases = worker.lease(simulate=4)
-    assert coordinator.show_task(leases[0].task_id) == leases[0].task
+    assert show_task(coordinator, leases[0].task_id) == leases[0].task
     worker.finish(*leases)
     (render,) = worker.lease(render=1)
-    assert coordinator.show_task(render.task_id) == render.task
+    assert show_task(coordinator, render.task_id) == render.task
     with pytest.raises(NotFoundError):
-        coordinator.show_task("render-" + "0" * 64)
+        show_task(coordinator, "render-" + "0" * 64)
     with pytest.raises(NotFoundError):
-        coordinator.show_task(render.task_id.replace("render", "simulate"))
+        show_task(coordinator, render.task_id.replace("render", "simulate"))
 
 
 def test_versions_of_two_builds_at_once_do_not_share_a_number(coordinator: Coordinator, worker: PretendWorker) -> None:
     submit(coordinator)
-    builds = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+    builds = Builds(**{stage: str(n) * 64 for n, stage in enumerate(Builds.model_fields)})
     other = PretendWorker(coordinator, coordinator.store, name="other", builds=builds).register()
     submit(coordinator)
     publishes = []
@@ -553,17 +570,117 @@ def test_versions_of_two_builds_at_once_do_not_share_a_number(coordinator: Coord
 
 def test_the_time_left_is_measured(coordinator: Coordinator, worker: PretendWorker) -> None:
     job_id = submit(coordinator, gamma=(1.0, 2.0, 3.0))
-    assert coordinator.show_job(job_id).progress.eta is None
+    assert show_job(coordinator, job_id).progress.eta is None
     worker.finish(*worker.lease(simulate=6))
-    assert coordinator.show_job(job_id).progress.eta is None  # no render has been measured
+    assert show_job(coordinator, job_id).progress.eta is None  # no render has been measured
     worker.finish(*worker.lease(render=2))
-    eta = coordinator.show_job(job_id).progress.eta
+    eta = show_job(coordinator, job_id).progress.eta
     assert eta is not None
     # 4 renders of 1 s, 3 packs and 1 publish taken as 1 s each, two at a time
     assert eta.seconds == pytest.approx((4 + 3 + 1) / 2)
     assert 0 <= eta.low < eta.seconds < eta.high
     worker.work()
-    assert coordinator.show_job(job_id).progress.eta is None
-    earlier = coordinator.show_job(submit(coordinator, gamma=(8.0,))).progress.eta
+    assert show_job(coordinator, job_id).progress.eta is None
+    earlier = show_job(coordinator, submit(coordinator, gamma=(8.0,))).progress.eta
     assert earlier is not None  # from the job before
     assert earlier.seconds == pytest.approx(4.0)  # 6 tasks on 2 slots, but each stage waits for the one before
+
+
+class TestPausing:
+    """Pausing: nothing more is leased, what runs finishes, and resuming goes on."""
+
+    def test_running_tasks_finish_and_nothing_more_is_leased(
+        self, coordinator: Coordinator, worker: PretendWorker
+    ) -> None:
+        job = submit(coordinator)
+        running, waiting = worker.lease(simulate=2)
+        worker.start(running)
+        assert coordinator.pause(job).state is JobState.pausing
+        assert coordinator.pause(job).state is JobState.pausing  # asked twice, it is one pause
+        assert worker.lease() == ()
+        assert worker.start(running) == ()
+        assert worker.beat(waiting) == (waiting.task_id,)  # it had not been started: given back
+        assert counts(coordinator, job, Stage.simulate) == {TaskState.pending: 3, TaskState.running: 1}
+        assert worker.finish(running) == ["accepted"]
+        shown = show_job(coordinator, job)
+        assert (shown.state, shown.progress.eta) == (JobState.paused, None)
+        assert worker.lease() == ()
+        check(coordinator)
+        assert coordinator.resume(job).state is JobState.running
+        assert coordinator.resume(job).state is JobState.running
+        worker.work()
+        assert show_job(coordinator, job).state is JobState.succeeded
+        assert len(worker.ran) == len(set(worker.ran)) == 11
+        check(coordinator)
+
+    def test_it_survives_a_restart(self, settings: Settings, clock: ManualClock) -> None:
+        before = Coordinator(settings, clock)
+        before.start()
+        worker = PretendWorker(before, before.store).register()
+        job = submit(before)
+        assert before.pause(job).state is JobState.paused
+        before.close()
+        after = Coordinator(settings, clock)
+        after.start()
+        worker = PretendWorker(after, after.store).register()
+        after.sweep()
+        assert worker.lease() == ()
+        assert show_job(after, job).state is JobState.paused
+        assert after.resume(job).state is JobState.queued
+        worker.work()
+        assert show_job(after, job).state is JobState.succeeded
+        after.close()
+
+    def test_others_run_what_a_paused_job_shares(self, coordinator: Coordinator, worker: PretendWorker) -> None:
+        first = submit(coordinator)
+        coordinator.pause(first)
+        second = submit(coordinator, gamma=(1.0, 2.0), name="second")  # the same tasks
+        third = submit(coordinator, gamma=(1.0,))
+        coordinator.pause(second)
+        check(coordinator)
+        assert [len(worker.lease(simulate=10))] == [2]  # those of the third
+        coordinator.resume(second)
+        check(coordinator)
+        for lease in worker.lease(simulate=10):
+            worker.finish(lease)
+        coordinator.cancel(third)
+        worker.register()
+        worker.work()
+        assert show_job(coordinator, second).state is JobState.succeeded
+        assert show_job(coordinator, first).state is JobState.succeeded  # its dataset was made for another
+        check(coordinator)
+
+    def test_a_job_that_waits_for_the_first_worker(self, coordinator: Coordinator) -> None:
+        job = submit(coordinator)
+        assert coordinator.pause(job).state is JobState.paused
+        worker = PretendWorker(coordinator, coordinator.store).register()
+        assert show_job(coordinator, job).progress.total == 0
+        assert coordinator.resume(job).state is JobState.queued
+        worker.work()
+        assert show_job(coordinator, job).state is JobState.succeeded
+
+    def test_ended_jobs_refuse(self, coordinator: Coordinator, worker: PretendWorker) -> None:
+        done, dropped = submit(coordinator), submit(coordinator, gamma=(5.0,))
+        coordinator.pause(dropped)
+        assert coordinator.cancel(dropped).state is JobState.cancelled
+        worker.work()
+        for job in (done, dropped):
+            with pytest.raises(ConflictError, match="can be paused"):
+                coordinator.pause(job)
+            with pytest.raises(ConflictError, match="can be resumed"):
+                coordinator.resume(job)
+
+    def test_a_lost_worker_does_not_undo_it(
+        self, coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    ) -> None:
+        job = submit(coordinator)
+        worker.start(*worker.lease(simulate=1))
+        coordinator.pause(job)
+        clock.advance(31)
+        coordinator.sweep()
+        clock.advance(5)
+        coordinator.sweep()
+        assert show_job(coordinator, job).state is JobState.paused
+        assert counts(coordinator, job, Stage.simulate) == {TaskState.pending: 4}
+        assert worker.lease() == ()
+        check(coordinator)

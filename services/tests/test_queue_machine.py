@@ -10,14 +10,26 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from sqlalchemy import select
 from stickslip_schemas.states import JobState
 from stickslip_schemas.worker_api import Lease
-from stickslip_services.audit import audit
+from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
-from stickslip_services.operations import Coordinator
-from stickslip_services.paging import PageRequest
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.ledger import runnable_tasks
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rejection, rods
+from stickslip_services.testing import (
+    ManualClock,
+    PretendWorker,
+    failure,
+    list_datasets,
+    list_jobs,
+    parsed,
+    rejection,
+    rods,
+    show_job,
+)
 
 SPECS = (
     rods(gamma=(1.0,)),
@@ -81,6 +93,7 @@ class QueueMachine(RuleBasedStateMachine):
         for lease in granted:
             assert lease.task_id not in self.holders, "leased twice"
             assert lease.task_id not in self.settled, "leased although it has a result"
+            assert self._is_asked_for(lease.task_id), "leased for a paused job"
             assert lease.token == self.tokens.get(lease.task_id, 0) + 1
             self.tokens[lease.task_id] = lease.token
             self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
@@ -127,6 +140,24 @@ class QueueMachine(RuleBasedStateMachine):
         else:
             assert shown.state in (JobState.cancelling, JobState.cancelled)
 
+    @rule(job=jobs)
+    def pause(self, job: str) -> None:
+        try:
+            shown = self.coordinator.pause(job)
+        except ConflictError:
+            assert job in self.ended or show_job(self.coordinator, job).state is JobState.cancelling
+        else:
+            assert shown.state in (JobState.pausing, JobState.paused)
+
+    @rule(job=jobs)
+    def resume(self, job: str) -> None:
+        try:
+            shown = self.coordinator.resume(job)
+        except ConflictError:
+            assert job in self.ended or show_job(self.coordinator, job).state is JobState.cancelling
+        else:
+            assert shown.state in (JobState.queued, JobState.running)
+
     @rule(seconds=st.sampled_from((1.0, 5.0, 29.0, 31.0)))
     def wait(self, seconds: float) -> None:
         self.clock.advance(seconds)
@@ -155,12 +186,12 @@ class QueueMachine(RuleBasedStateMachine):
 
     @invariant()
     def what_has_ended_stays_so(self) -> None:
-        for job in self.coordinator.list_jobs(PageRequest(1000, None)).items:
+        for job in list_jobs(self.coordinator):
             if job.state.is_terminal:
                 assert self.ended.setdefault(job.id, job.state) is job.state
             else:
                 assert job.id not in self.ended
-        for dataset in self.coordinator.list_datasets(PageRequest(1000, None)).items:
+        for dataset in list_datasets(self.coordinator):
             for version in dataset.versions:
                 key = (dataset.id, version.version)
                 assert self.manifests.setdefault(key, version.manifest) == version.manifest
@@ -168,12 +199,15 @@ class QueueMachine(RuleBasedStateMachine):
     def teardown(self) -> None:
         if not hasattr(self, "coordinator"):
             return
-        # However it went: a worker that does its work brings every job to its end.
+        # However it went: once no job is paused, a worker that does its work brings every job to its end.
+        for job in list_jobs(self.coordinator):
+            if job.state in (JobState.pausing, JobState.paused):
+                self.coordinator.resume(job.id)
         worker = PretendWorker(self.coordinator, self.coordinator.store, name="last", judge=_judge).register()
         for _ in range(10):
             self.clock.advance(60)
             worker.work()
-        for job in self.coordinator.list_jobs(PageRequest(1000, None)).items:
+        for job in list_jobs(self.coordinator):
             assert job.state.is_terminal, f"{job.id} is {job.state}"
         self.ledger_is_right()
         self.coordinator.close()
@@ -182,6 +216,12 @@ class QueueMachine(RuleBasedStateMachine):
     def _is_held(self, worker: PretendWorker, lease: Lease) -> bool:
         held = self.holders.get(lease.task_id)
         return held is not None and held[:2] == (worker.id, lease.token) and held[2] > self.clock()
+
+    def _is_asked_for(self, task: str) -> bool:
+        """Tell whether a job that may run needs the task."""
+        with self.coordinator.database.read() as connection:
+            seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
+            return bool(runnable_tasks(connection, [seq]))
 
     def _expired_unnoticed(self, worker: PretendWorker, lease: Lease) -> bool:
         """Tell whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""

@@ -1,7 +1,7 @@
 # sim_core_build_hash: SHA-256 over everything that can change a result: the text of the sources and of this build's
 # recipe, the compiler, the flags and the instruction set. Paths, folders and time stay out. File names are relative and
 # in a fixed order. Datasets' content keys use it.
-file(GLOB hashed_files RELATIVE ${CMAKE_CURRENT_SOURCE_DIR}
+file(GLOB_RECURSE hashed_files CONFIGURE_DEPENDS RELATIVE ${CMAKE_CURRENT_SOURCE_DIR}
      ${CMAKE_CURRENT_SOURCE_DIR}/src/*.cpp ${CMAKE_CURRENT_SOURCE_DIR}/src/*.hpp ${CMAKE_CURRENT_SOURCE_DIR}/src/*.in)
 list(APPEND hashed_files CMakeLists.txt cmake/build_hash.cmake)
 list(SORT hashed_files)

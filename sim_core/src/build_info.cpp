@@ -1,7 +1,7 @@
 #include "build_info.hpp"
 
 #include "build_constants.hpp"
-#include "rods.hpp"
+#include "rods/rods.hpp"
 
 namespace sim_core {
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import boundary_value
-from stickslip_sim_core.boundary_value import NotSolvedError, Numbers, solve
+from stickslip_sim_core.reference import boundary_value
+from stickslip_sim_core.reference.boundary_value import NotSolvedError, Numbers, solve
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Energies of a sheet: derivatives by finite differences, what costs nothing, and plates."""
+"""Energies of a cloth: derivatives by finite differences, what costs nothing, and plates."""
 
 from collections.abc import Callable
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import Cloth, Fabric, fabric, isotropic, meshes, preset_named
-from stickslip_sim_core.meshes import Mesh
+from stickslip_sim_core import Cloth, Fabric, fabric, isotropic, preset_named
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
 
 Floats = NDArray[np.float64]
@@ -31,13 +32,13 @@ def sheet_of(mesh: Mesh, material: Fabric = SHEET, clamp: bool = False) -> Cloth
     return Cloth(mesh, material, preset_named("certified"), held=held, clamped=mesh.boundary(root))
 
 
-def energy(sheet: Cloth, at: Floats, slopes: Floats | None = None) -> tuple[float, float, Floats]:
-    membrane, bending, gradient = sheet._solver.energies(at, sheet.slopes if slopes is None else slopes)
+def energy(cloth: Cloth, at: Floats, slopes: Floats | None = None) -> tuple[float, float, Floats]:
+    membrane, bending, gradient = cloth._solver.energies(at, cloth.slopes if slopes is None else slopes)
     return membrane, bending, np.asarray(gradient)
 
 
-def total(sheet: Cloth, at: Floats) -> float:
-    return sum(energy(sheet, at)[:2])
+def total(cloth: Cloth, at: Floats) -> float:
+    return sum(energy(cloth, at)[:2])
 
 
 def flat(mesh: Mesh) -> Floats:
@@ -72,15 +73,15 @@ STATES: dict[str, Callable[[Mesh], Floats]] = {"flat": flat, "waved": waved, "fo
 def test_gradient(name: str, state: str, clamp: bool, material: str) -> None:
     """The table's stiffness is that at the start of a step, here at no strain: the gradient is exact for it."""
     mesh = MESHES[name]
-    sheet = sheet_of(mesh, SHEET if material == "isotropic" else fabric(material), clamp)
-    sheet.slopes = np.tile([0.1, -0.9, 0.3], (len(sheet.slopes), 1))
+    cloth = sheet_of(mesh, SHEET if material == "isotropic" else fabric(material), clamp)
+    cloth.slopes = np.tile([0.1, -0.9, 0.3], (len(cloth.slopes), 1))
     at = STATES[state](mesh)
-    gradient = energy(sheet, at)[2]
+    gradient = energy(cloth, at)[2]
     rng = np.random.default_rng(2)
     for _ in range(4):
         direction = rng.normal(size=at.shape)
         h = 1e-7
-        ends = [total(sheet, at + sign * h * direction) for sign in (2.0, 1.0, -1.0, -2.0)]
+        ends = [total(cloth, at + sign * h * direction) for sign in (2.0, 1.0, -1.0, -2.0)]
         difference = (-ends[0] + 8.0 * ends[1] - 8.0 * ends[2] + ends[3]) / (12.0 * h)
         scale = float(np.linalg.norm(gradient)) + 1e-6
         assert float((gradient * direction).sum()) == pytest.approx(difference, abs=2e-6 * scale, rel=2e-6)
@@ -91,12 +92,12 @@ def test_gradient(name: str, state: str, clamp: bool, material: str) -> None:
 def test_matrix(name: str, state: str) -> None:
     """The matrix, in single precision, is the gradient's derivative, where no fold is sharp."""
     mesh = MESHES[name]
-    sheet = sheet_of(mesh)
+    cloth = sheet_of(mesh)
     at = STATES[state](mesh)
     direction = np.random.default_rng(3).normal(size=at.shape)
     h = 1e-8
-    difference = (energy(sheet, at + h * direction)[2] - energy(sheet, at - h * direction)[2]) / (2.0 * h)
-    product = np.asarray(sheet._solver.stiffness_times(at, sheet.slopes, direction))
+    difference = (energy(cloth, at + h * direction)[2] - energy(cloth, at - h * direction)[2]) / (2.0 * h)
+    product = np.asarray(cloth._solver.stiffness_times(at, cloth.slopes, direction))
     error = np.linalg.norm(product - difference) / np.linalg.norm(difference)
     assert error < (2e-6 if state == "flat" else 2e-3)
 
@@ -104,14 +105,14 @@ def test_matrix(name: str, state: str) -> None:
 def test_matrix_of_a_fold_is_that_of_bending_stiffened() -> None:
     """At a fold the matrix leaves out a rank-one part: it is close, symmetric, and no softer by half."""
     mesh = MESHES["grid"]
-    sheet = sheet_of(mesh)
+    cloth = sheet_of(mesh)
     at = folded(mesh)
     rng = np.random.default_rng(4)
     v, w = rng.normal(size=at.shape), rng.normal(size=at.shape)
-    Kv, Kw = (np.asarray(sheet._solver.stiffness_times(at, sheet.slopes, u)) for u in (v, w))
+    Kv, Kw = (np.asarray(cloth._solver.stiffness_times(at, cloth.slopes, u)) for u in (v, w))
     assert float((Kv * w).sum()) == pytest.approx(float((Kw * v).sum()), rel=1e-4)
     h = 1e-8
-    difference = (energy(sheet, at + h * v)[2] - energy(sheet, at - h * v)[2]) / (2.0 * h)
+    difference = (energy(cloth, at + h * v)[2] - energy(cloth, at - h * v)[2]) / (2.0 * h)
     assert np.linalg.norm(Kv - difference) < 0.2 * np.linalg.norm(difference)
 
 
@@ -119,9 +120,9 @@ def test_matrix_of_a_fold_is_that_of_bending_stiffened() -> None:
 def test_factor_solves(name: str) -> None:
     """In single precision, where the matrix is definite by itself: flat, and pulled."""
     mesh = MESHES[name]
-    sheet = sheet_of(mesh)
+    cloth = sheet_of(mesh)
     for stretch in (1.0, 1.05):
-        assert sheet._solver.factor_error(stretch * flat(mesh), sheet.slopes, 0.01) < 1e-4
+        assert cloth._solver.factor_error(stretch * flat(mesh), cloth.slopes, 0.01) < 1e-4
 
 
 def rotation(seed: int) -> Floats:
@@ -133,15 +134,15 @@ def rotation(seed: int) -> Floats:
 @pytest.mark.parametrize("name", MESHES)
 def test_rigid_motions_cost_nothing(name: str) -> None:
     mesh = MESHES[name]
-    sheet = sheet_of(mesh)
+    cloth = sheet_of(mesh)
     turn = rotation(5)
     moved = flat(mesh) @ turn.T + [0.3, -0.2, 0.5]
-    membrane, bending, gradient = energy(sheet, moved)
+    membrane, bending, gradient = energy(cloth, moved)
     assert membrane < 1e-20
     assert bending < 1e-20
     assert np.abs(gradient).max() < 1e-10
     bent = waved(mesh)
-    first, second = energy(sheet, bent), energy(sheet, bent @ turn.T + [0.3, -0.2, 0.5])
+    first, second = energy(cloth, bent), energy(cloth, bent @ turn.T + [0.3, -0.2, 0.5])
     assert second[:2] == pytest.approx(first[:2], rel=1e-10)
     assert second[2] == pytest.approx(first[2] @ turn.T, abs=1e-9)
 
@@ -177,25 +178,25 @@ def test_table_of_stiffness(along: int, row: int) -> None:
     material = fabric("gray-interlock")
     inner = int(np.argmin(np.linalg.norm(mesh.rest, axis=1)))
     held = np.delete(np.arange(len(mesh.rest)), inner)
-    sheet = Cloth(mesh, material, preset_named("certified"), held=held)
-    sheet.gravity[:] = 0.0
+    cloth = Cloth(mesh, material, preset_named("certified"), held=held)
+    cloth.gravity[:] = 0.0
     at = flat(mesh)
     at[:, along] *= 1.0 + 1.0 / 12.0
-    sheet.set_state(at)
-    sheet.step(1e-3, held=at[held])
+    cloth.set_state(at)
+    cloth.step(1e-3, held=at[held])
     k = 0.5 * (material.stretching[0] + material.stretching[row])
     green = 0.5 * ((1.0 + 1.0 / 12.0) ** 2 - 1.0)
-    assert energy(sheet, at)[0] == pytest.approx(0.5 * k[2 * along] * green**2 * 0.04 * 0.05, rel=1e-9)
+    assert energy(cloth, at)[0] == pytest.approx(0.5 * k[2 * along] * green**2 * 0.04 * 0.05, rel=1e-9)
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3])
 def test_pure_bending(poisson: float) -> None:
     """A narrow strip under end curvature: W per area between D (1 - nu^2) and D, times kappa^2/2."""
     mesh = meshes.unstructured(0.02, 0.1, 0.004, 0)
-    sheet = Cloth(mesh, isotropic(0.2, 50.0, 1e-5, poisson), preset_named("certified"))
+    cloth = Cloth(mesh, isotropic(0.2, 50.0, 1e-5, poisson), preset_named("certified"))
     at = flat(mesh)
     at[:, 2] = 0.5 * mesh.rest[:, 1] ** 2
-    bending = energy(sheet, at)[1] / (0.02 * 0.1 * 0.5 * 1e-5)
+    bending = energy(cloth, at)[1] / (0.02 * 0.1 * 0.5 * 1e-5)
     assert (1.0 - poisson**2) * 0.9 < bending < 1.0 + 1e-9  # triangles at the ends are free to lie flat
 
 
@@ -203,7 +204,7 @@ def test_pure_bending(poisson: float) -> None:
 def test_linear_plate(strip: Strip) -> None:
     """The tip of a horizontal cantilever, nu = 0, sags by rho g L^4 / 8D: to 0.05 %."""
     density, rigidity, g = 0.2, 1e-5, 9.81
-    sheet = Cloth(
+    cloth = Cloth(
         strip.mesh,
         isotropic(density, 500.0, rigidity),
         preset_named("certified"),
@@ -217,7 +218,7 @@ def test_linear_plate(strip: Strip) -> None:
     for column, vertex in enumerate(free):
         moved = at.copy()
         moved[vertex, 2] = 1e-7
-        K[:, column] = energy(sheet, moved, slopes)[2][free, 2] / 1e-7
+        K[:, column] = energy(cloth, moved, slopes)[2][free, 2] / 1e-7
     sag = np.zeros(len(at))
-    sag[free] = np.linalg.solve(K, sheet.masses[free] * g)
+    sag[free] = np.linalg.solve(K, cloth.masses[free] * g)
     assert sag[strip.tip].mean() == pytest.approx(density * g * LENGTH**4 / (8.0 * rigidity), rel=5e-4)

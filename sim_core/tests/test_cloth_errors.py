@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from stickslip_sim_core import PRESETS, Cloth, fabric, meshes, plane
+from stickslip_sim_core import PRESETS, Cloth, fabric, plane
+from stickslip_sim_core.cloth import meshes
 
 CERTIFIED = PRESETS["certified"]
 

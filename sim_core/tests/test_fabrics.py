@@ -1,11 +1,21 @@
-"""Fabrics: the table, isotropic sheets, and what is refused; presets by name."""
+"""Fabrics: the table, isotropic ones, your own, and what is refused; presets by name."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from stickslip_sim_core import PRESETS, fabric, fabric_names, isotropic, preset_named
+from stickslip_sim_core import (
+    PRESETS,
+    Cloth,
+    drop_and_drag,
+    fabric,
+    fabric_names,
+    isotropic,
+    own_fabric,
+    preset_named,
+)
+from stickslip_sim_core.cloth import meshes
 
 
 def test_ten_fabrics() -> None:
@@ -32,14 +42,14 @@ def test_fabric_is_stable(name: str) -> None:
 
 def test_isotropic() -> None:
     """Pulled along one axis, free along the other, it has Young's modulus; curvatures couple by Poisson's ratio."""
-    sheet = isotropic(0.2, 100.0, 1e-5, 0.3)
-    k0, k1, k2, k3 = sheet.stretching[0]
+    cloth = isotropic(0.2, 100.0, 1e-5, 0.3)
+    k0, k1, k2, k3 = cloth.stretching[0]
     assert k0 == k2
     assert k0 - k1**2 / k2 == pytest.approx(100.0)
     assert k3 == pytest.approx(2.0 * 100.0 / (2.0 * 1.3))  # W = 2 G (G01)^2
-    assert (sheet.stretching == sheet.stretching[0]).all()
-    assert sheet.rigidity[0, 1] / sheet.rigidity[0, 0] == pytest.approx(0.3)
-    assert sheet.rigidity[2, 2] == pytest.approx(1e-5 * 0.35)
+    assert (cloth.stretching == cloth.stretching[0]).all()
+    assert cloth.rigidity[0, 1] / cloth.rigidity[0, 0] == pytest.approx(0.3)
+    assert cloth.rigidity[2, 2] == pytest.approx(1e-5 * 0.35)
     assert isotropic(0.2, 1.0, 0.2 * 9.81 * 1e-6).bending_length == pytest.approx(0.01)
 
 
@@ -74,3 +84,78 @@ def test_presets() -> None:
     ]
     with pytest.raises(dataclasses.FrozenInstanceError):
         PRESETS["fast"].time_step = 1.0  # type: ignore[misc]
+
+
+class TestOwnFabric:
+    TABLE = np.tile([100.0, 10.0, 80.0, 20.0], (6, 1))
+
+    def test_table(self) -> None:
+        own = own_fabric("own", 0.2, stretching=self.TABLE, bending=(2e-5, 1e-5, 5e-6), damping=0.1)
+        assert (own.stretching == self.TABLE).all()
+        assert (own.rigidity == np.diag([2e-5, 1e-5, 5e-6])).all()
+        assert own.damping == 0.1
+        assert (own_fabric("own", 0.2, stretching=self.TABLE, bending=own.rigidity).rigidity == own.rigidity).all()
+
+    def test_young(self) -> None:
+        """A plate of E, nu, h: Y = E h and D = E h^3 / (12 (1 - nu^2))."""
+        own = own_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4)
+        assert own.stretching[0, 0] == pytest.approx(1e6 * 4e-4 / (1.0 - 0.09))
+        assert own.rigidity[0, 0] == pytest.approx(1e6 * 4e-4**3 / 12.0 / (1.0 - 0.09))
+        softer = own_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4, bending=(1e-6, 1e-6, 4e-7))
+        assert softer.rigidity[0, 0] == 1e-6
+
+    def test_scaled(self) -> None:
+        base = fabric("gray-interlock")
+        other = base.scaled(density=2.0, stretching=0.5, bending=3.0)
+        assert other.density == 2.0 * base.density
+        assert (other.stretching == 0.5 * base.stretching).all()
+        assert (other.rigidity == 3.0 * base.rigidity).all()
+        assert other.name == "gray-interlock, density x 2, stretching x 0.5, bending x 3"
+        assert base.scaled().name == base.name
+
+    def test_scene_takes_it(self) -> None:
+        """The same numbers give the same motion, whether by name or not."""
+        named = drop_and_drag("gray-interlock", 0.5, vertices=7, frames=4)
+        own = drop_and_drag(fabric("gray-interlock").scaled(), 0.5, vertices=7, frames=4)
+        heavy = drop_and_drag(fabric("gray-interlock").scaled(density=2.0), 0.5, vertices=7, frames=4)
+        assert own.positions.tobytes() == named.positions.tobytes()
+        assert heavy.holder_force[0, 2] == pytest.approx(2.0 * named.holder_force[0, 2])
+
+    def test_damping_slows_a_fall(self) -> None:
+        """By v = (g/c)(1 - exp(-c t)), to first order in the step."""
+        mesh = meshes.grid(0.1, 0.1, 4, 4)
+        cloth = Cloth(mesh, dataclasses.replace(fabric("gray-interlock"), damping=5.0), preset_named("certified"))
+        cloth.set_state(np.column_stack([mesh.rest, np.ones(25)]))
+        for _ in range(200):
+            cloth.step(1e-3)
+        assert cloth.velocities[:, 2] == pytest.approx(-9.81 / 5.0 * (1.0 - np.exp(-1.0)), rel=5e-3)
+
+    @pytest.mark.parametrize(
+        ("numbers", "message"),
+        [
+            ({"density": 0.0}, r"density: must be in \[0.001, 100\], got 0"),
+            ({"density": float("nan")}, r"density: must be in \[0.001, 100\], got nan"),
+            ({"stretching": np.ones((5, 4))}, r"stretching: must be \(6, 4\) numbers of 0 ... 1e\+07 N/m"),
+            ({"stretching": -TABLE}, r"stretching: must be \(6, 4\) numbers of 0"),
+            ({"stretching": np.ones((6, 4))}, r"stretching: must have k1\^2 < k0 k2 in every row, and row 0"),
+            ({"bending": (1e-5, -1e-5, 1e-5)}, r"rigidity, an eigenvalue: must be in \[1e-12, 10\], got -1e-05"),
+            ({"bending": (1e-5, 1e-5)}, r"rigidity: must be a symmetric \(3, 3\)"),
+            ({"bending": None}, "bending: must be given with stretching"),
+            ({"damping": -1.0}, r"damping: must be in \[0, 1000\], got -1"),
+            ({"young": 1e6}, "stretching, young: must be one of both, got both"),
+            ({"stretching": None}, "stretching, young: must be one of both, got neither"),
+            ({"stretching": None, "young": 1e6}, "thickness: must be given with young"),
+            ({"stretching": None, "young": 1e6, "thickness": -1.0}, r"thickness: must be in \[1e-06, 0.1\], got -1"),
+            ({"stretching": None, "young": 1e6, "thickness": 1e-3, "poisson": 0.6}, r"poisson: must be in \[0, 0.5\]"),
+        ],
+    )
+    def test_refusals(self, numbers: dict[str, object], message: str) -> None:
+        good = {"name": "own", "density": 0.2, "stretching": self.TABLE, "bending": (1e-5, 1e-5, 1e-5)}
+        with pytest.raises(ValueError, match=message):
+            own_fabric(**{**good, **numbers})  # type: ignore[arg-type]
+
+    def test_factors(self) -> None:
+        with pytest.raises(ValueError, match="bending: must be a finite factor > 0, got 0"):
+            fabric("gray-interlock").scaled(bending=0.0)
+        with pytest.raises(ValueError, match="density: must be in"):
+            fabric("gray-interlock").scaled(density=1e6)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stickslip_sim_core import RodSolution, natural_curvature, solve_general_rods
-from stickslip_sim_core.inverse import integrate_frames
+from stickslip_sim_core.rods.inverse import integrate_frames
 
 Floats = NDArray[np.float64]
 

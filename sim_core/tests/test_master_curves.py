@@ -9,7 +9,7 @@ from scipy.integrate import solve_bvp, solve_ivp
 from scipy.optimize import brentq, root
 from scipy.special import jv
 
-from stickslip_sim_core import boundary_value, master_curves
+from stickslip_sim_core.reference import boundary_value, master_curves
 
 Floats = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import meshes
-from stickslip_sim_core.meshes import Mesh
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.meshes import Mesh
 
 Floats = NDArray[np.float64]
 

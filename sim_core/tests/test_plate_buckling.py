@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from stickslip_sim_core import plate_buckling
-from stickslip_sim_core.plate_buckling import buckling_weight
+from stickslip_sim_core.reference import plate_buckling
+from stickslip_sim_core.reference.plate_buckling import buckling_weight
 
 Floats = NDArray[np.float64]
 

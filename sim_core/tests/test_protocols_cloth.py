@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stickslip_sim_core import PRESETS, master_curves, meshes, preset_named, protocols
-from stickslip_sim_core.cloth import GRAVITY
+from stickslip_sim_core import PRESETS, preset_named, protocols
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import ProtocolResult, cantilever, inclined_plane, lateral_buckling, stick_slip
 from stickslip_sim_core.protocols.strip import LENGTH, strips
+from stickslip_sim_core.reference import master_curves
 
 CERTIFIED = preset_named("certified")
 
@@ -94,11 +96,11 @@ class TestLateralBuckling:
         """A sideways push of 1e-5 g turns a strip 3 % heavier than the threshold, and leaves one 3 % lighter."""
         strip = next(strips(0.02, 20, 1, 0))
         gamma = share * lateral_buckling.threshold(strip, 0.0, CERTIFIED)
-        sheet, flat = lateral_buckling.loaded(strip, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED)
-        sheet.gravity[:, 2] = 1e-5 * GRAVITY
+        cloth, flat = lateral_buckling.loaded(strip, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED)
+        cloth.gravity[:, 2] = 1e-5 * GRAVITY
         for _ in range(1000):
-            sheet.step(0.02, held=flat[strip.held], damping=5.0)
-        sideways = float(np.abs(sheet.positions[strip.tip, 2]).max()) / LENGTH
+            cloth.step(0.02, held=flat[strip.held], damping=5.0)
+        sideways = float(np.abs(cloth.positions[strip.tip, 2]).max()) / LENGTH
         assert (sideways > 0.03) if falls else (sideways < 1e-3)
 
 

@@ -12,9 +12,9 @@ from stickslip_sim_core import (
     solve_general_rods,
     solve_rods,
 )
-from stickslip_sim_core.general_rods import CLAMP_FRAME
-from stickslip_sim_core.rod_fit import _Model, _parameters, _State
-from stickslip_sim_core.splines import bspline_matrix
+from stickslip_sim_core.rods.fit import _Model, _parameters, _State
+from stickslip_sim_core.rods.general import CLAMP_FRAME
+from stickslip_sim_core.rods.splines import bspline_matrix
 
 Floats = NDArray[np.float64]
 

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric, meshes, scenes
-from stickslip_sim_core.cloth import GRAVITY
-from stickslip_sim_core.rotating_sphere import RADIUS, SETTLING, SPEED, rotating_sphere, turned
+from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.solver import GRAVITY
+from stickslip_sim_core.scenes import cloth_drag as scenes
+from stickslip_sim_core.scenes.cloth_sphere import RADIUS, SETTLING, SPEED, rotating_sphere, turned
 
 
 @pytest.fixture(scope="module")
@@ -20,13 +22,13 @@ class TestStage:
         assert scenes.duration_of(0.06) == pytest.approx(7.0)
         assert scenes.duration_of(0.3) == pytest.approx(31.0)
         assert pytest.approx(131.0) == scenes.DURATION
-        ends = [scenes.stage(t).tolist() for t in (0.0, 7.0, 38.0, 69.0, 100.0, 131.0, 140.0)]
+        ends = [scenes.holder_path(t).tolist() for t in (0.0, 7.0, 38.0, 69.0, 100.0, 131.0, 140.0)]
         x = [0.0, 0.0, 0.3, 0.0, 0.3, 0.0, 0.0]
         assert np.array(ends) == pytest.approx(np.column_stack([x, [0.0] + [-0.06] * 6]), abs=1e-12)
 
     def test_speeds(self) -> None:
         t = np.arange(0.0, 131.0, 1e-2)
-        path = np.stack([scenes.stage(time) for time in t])
+        path = np.stack([scenes.holder_path(time) for time in t])
         speed = np.diff(path, axis=0) / 1e-2
         assert np.abs(speed).max() == pytest.approx(0.01, rel=1e-9)
         assert np.abs(np.diff(speed, axis=0) / 1e-2).max() < 0.01 * 2.0 + 1e-6
@@ -56,7 +58,7 @@ class TestDropAndDrag:
         assert dragged.times == pytest.approx(np.arange(110) / 2.4)
         corner = int(np.argmax(dragged.rest.sum(axis=1)))
         came = dragged.positions[:, corner] - dragged.positions[0, corner]
-        stage = np.stack([scenes.stage(t) for t in dragged.times])
+        stage = np.stack([scenes.holder_path(t) for t in dragged.times])
         assert came[:, [0, 2]] == pytest.approx(stage, abs=1e-12)
         assert np.abs(came[:, 1]).max() == 0.0
 
@@ -109,14 +111,14 @@ class TestDropAndDrag:
             ({"frames": 301}, r"frames: must be 1 \.\.\. 300, got 301"),
             ({"vertices": 4}, "vertices: must be at least 5, got 4"),
             ({"preset": "best"}, "preset: must be one of"),
-            ({"material": "silk"}, "fabric: must be one of"),
+            ({"fabric": "silk"}, "fabric: must be one of"),
             ({"mu": -0.1}, "mu: must be finite and >= 0, got -0.1"),
             ({"mu": float("nan")}, "mu: must be finite and >= 0, got nan"),
         ],
     )
     def test_refusals(self, settings: dict[str, object], message: str) -> None:
         with pytest.raises(ValueError, match=message):
-            drop_and_drag(**{"material": "gray-interlock", "mu": 0.5, **settings})  # type: ignore[arg-type]
+            drop_and_drag(**{"fabric": "gray-interlock", "mu": 0.5, **settings})  # type: ignore[arg-type]
 
 
 class TestRotatingSphere:
@@ -126,7 +128,7 @@ class TestRotatingSphere:
         assert turned(3.0 * SETTLING) - turned(2.0 * SETTLING) == pytest.approx(SPEED * SETTLING)
 
     def test_rough_sphere_takes_the_cloth_along(self) -> None:
-        scene = rotating_sphere("gray-interlock", 0.2, 0.5, vertices=13, frames=76)
+        scene = rotating_sphere("gray-interlock", 0.5, mu_floor=0.2, vertices=13, frames=76)
         assert scene.valid, scene.reason
         assert scene.times[-1] == pytest.approx(5.0)
         assert scene.angle[-1] == pytest.approx(2.0)
@@ -138,20 +140,27 @@ class TestRotatingSphere:
         centre = np.array([0.0, 0.0, RADIUS])
         assert np.linalg.norm(scene.positions - centre, axis=2).min() > RADIUS - 1e-9
         assert np.hypot(*scene.bias) > 0.0
+        weight = fabric("gray-interlock").density * 0.04 * GRAVITY
+        assert scene.contact_force[-1] == pytest.approx([0.0, 0.0, weight], abs=0.05 * weight)
+        assert (scene.floor_force + scene.sphere_force)[30:] == pytest.approx(
+            scene.contact_force[30:], abs=1e-3 * weight
+        )
+        assert scene.self_intersections.shape == (76,)
 
     def test_smooth_sphere_does_not(self) -> None:
-        scene = rotating_sphere("gray-interlock", 0.2, 0.0, vertices=9, frames=76)
+        scene = rotating_sphere("gray-interlock", 0.0, mu_floor=0.2, vertices=9, frames=76)
         corner = np.unwrap(np.arctan2(scene.positions[:, -1, 1], scene.positions[:, -1, 0]))
         assert abs(corner[-1] - corner[30]) < 0.3
 
     def test_refusals(self) -> None:
         for settings, message in (
-            ({"mu_floor": -1.0}, "mu_floor: must be finite and >= 0, got -1.0"),
-            ({"mu_sphere": float("nan")}, "mu_sphere: must be finite and >= 0, got nan"),
-            ({"frames": 0}, "frames: must be at least 1, got 0"),
+            ({"mu_floor": -1.0}, "mu: must be finite and >= 0, got -1.0"),
+            ({"mu": float("nan")}, "mu: must be finite and >= 0, got nan"),
+            ({"frames": 0}, r"frames: must be 1 \.\.\. 3000, got 0"),
+            ({"speed": 21.0}, r"speed: must be in \[-20, 20\] rad/s, got 21.0"),
             ({"vertices": 3}, "vertices: must be at least 5, got 3"),
             ({"frame_rate": 0.0}, "frame_rate: must be finite and > 0, got 0.0"),
         ):
-            good = {"material": "gray-interlock", "mu_floor": 0.2, "mu_sphere": 0.5}
+            good = {"fabric": "gray-interlock", "mu": 0.5}
             with pytest.raises(ValueError, match=message):
                 rotating_sphere(**{**good, **settings})  # type: ignore[arg-type]

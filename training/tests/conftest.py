@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from stickslip_schemas.arrays import ArrayLayout, describe
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec, job_spec_adapter
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.layout import ArrayLayout, describe, layout
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.kinds.rod_hang import RodHangSpec
+from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.states import Reason
@@ -55,7 +58,7 @@ def write_dataset(
     root: Path, spec: RodHangSpec | ClothDragSpec, content: dict[str, np.ndarray], rejected: tuple[int, ...] = ()
 ) -> MadeDataset:
     """Write a dataset version with zarr-python; `content` has the arrays that are not in every dataset."""
-    builds = Builds(sim_core=sha256(b"sim_core"), blender=sha256(b"blender"), packer=sha256(b"packer"))
+    builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     planned = list(samples(spec, builds))
     valid = np.ones(len(planned), dtype=bool)
     valid[list(rejected)] = False
@@ -208,7 +211,7 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
 
 def write_rods(root: Path, spec: RodHangSpec, rejected: tuple[int, ...] = ()) -> MadeDataset:
     """Write a dataset of made-up rods, with noise for pictures where the spec asks for views."""
-    builds = Builds(sim_core=sha256(b"a"), blender=sha256(b"b"), packer=sha256(b"c"))
+    builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     labels = [sample.labels for sample in samples(spec, builds)]
     parameters = {name: np.array([label[name] for label in labels]) for name in ("gamma", "phi0", "phi1")}
     content = {**parameters, **curves(**parameters), "energy": np.linspace(-1.0, 1.0, len(labels))}
@@ -224,7 +227,7 @@ def write_rods(root: Path, spec: RodHangSpec, rejected: tuple[int, ...] = ()) ->
 
 def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ()) -> MadeDataset:
     """Write a dataset of clips that are noise over a few bits, so that they compress a little."""
-    builds = Builds(sim_core=sha256(b"a"), blender=sha256(b"b"), packer=sha256(b"c"))
+    builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     names = {array.name: array.categories for array in layout(spec)}
     labels = [sample.labels for sample in samples(spec, builds)]
     generator = np.random.default_rng(2)
@@ -239,7 +242,7 @@ def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ())
             continue
         values = generator.standard_normal((len(labels), *array.shape))
         content[array.name] = (10 * values).astype(array.dtype)
-    if spec.store_mesh:  # one mesh for all samples
+    if spec.store_positions:  # one mesh for all samples
         content["rest"][:], content["triangles"][:] = content["rest"][0], content["triangles"][0]
     return write_dataset(root, spec, content, rejected)
 

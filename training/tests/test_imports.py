@@ -6,7 +6,7 @@ import sys
 
 import stickslip_training
 
-MODULES = [f"stickslip_training.{module.name}" for module in pkgutil.iter_modules(stickslip_training.__path__)]
+MODULES = [module.name for module in pkgutil.walk_packages(stickslip_training.__path__, "stickslip_training.")]
 
 BLOCK = """
 import importlib, sys
@@ -36,9 +36,9 @@ def test_everything_imports_without_what_makes_and_serves_datasets():
 
 
 def test_the_block_blocks():
-    assert "No module named 'numpy'" in run(["numpy"], ["stickslip_training.reader"]).stderr
+    assert "No module named 'numpy'" in run(["numpy"], ["stickslip_training.data.reader"]).stderr
 
 
 def test_the_reader_and_the_command_need_no_torch():
-    result = run(["torch", "scipy", "httpx"], ["stickslip_training.reader", "stickslip_training.cli"])
+    result = run(["torch", "scipy", "httpx"], ["stickslip_training.data.reader", "stickslip_training.cli"])
     assert result.returncode == 0, result.stderr

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.chunks import encode_chunk
-from stickslip_schemas.jobs import RodHangSpec
+from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
@@ -35,7 +35,7 @@ os.environ["RAY_AUTH_MODE"] = "token"  # Ray looks once, when it is first import
 HERE = str(Path(__file__).parent)
 sys.path.append(HERE)  # coordinator_double, fake_renderer
 
-BUILDS = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" * 64)
 
 
 @dataclass
@@ -114,7 +114,7 @@ def make_dataset(store: Store) -> Callable[..., Made]:
                 rejections.append(Rejection(**common, reason=Reason.out_of_frame, message="made up"))
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
-            labels = {**sample.labels, "energy": float(rng.standard_normal()), "stable": True}
+            labels = {**sample.labels, "energy": float(rng.standard_normal())}
             arrays["valid"][i] = True
             arrays["energy"][i] = labels["energy"]
             for name, values in curves.items():

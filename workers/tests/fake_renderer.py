@@ -22,7 +22,7 @@ class RenderActor:
         self._beside = Path(store)
 
     def describe(self) -> dict[str, Any]:
-        return {"build": BUILD, "kinds": ["rod_hang"], "versions": {"fake": "1"}}
+        return {"builds": {"rod_hang": BUILD}, "versions": {"fake": "1"}}
 
     def render(self, task: dict[str, Any]) -> dict[str, Any]:
         job = RenderTask.model_validate(task)

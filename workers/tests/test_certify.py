@@ -10,9 +10,10 @@ from stickslip_schemas.certificate import Certificate
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import Certification, plots
 from stickslip_workers.__main__ import main
-from stickslip_workers.builds import sim_core_build
+from stickslip_workers.builds import solver_build
 from stickslip_workers.certify import certify
 
+ROD_SOLVER = "stickslip_sim_core.rods"
 LITTLE = {"rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512}}
 
 
@@ -20,9 +21,12 @@ LITTLE = {"rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512}}
 def presets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two presets that are quick to certify: one that passes, one whose second protocol breaks off."""
     made = {
-        "good": Certification(("rod-lateral-buckling", "rod-cantilever"), {"dt": 0.01, "solver": "<b>"}, LITTLE),
+        "good": Certification(
+            ("rod-lateral-buckling", "rod-cantilever"), ROD_SOLVER, {"dt": 0.01, "solver": "<b>"}, LITTLE
+        ),
         "coarse": Certification(
             ("rod-cantilever", "rod-lateral-buckling"),
+            ROD_SOLVER,
             quick={"rod-cantilever": {"gamma": (1e4,), "elements": 16}, "rod-lateral-buckling": {"elements": 7}},
         ),
     }
@@ -43,7 +47,7 @@ class TestCertify:
         assert "1/2 rod-lateral-buckling" in err
         assert "passed, largest error" in err
         assert (certificate.passed, certificate.extent, certificate.certifies) == (True, "quick", False)
-        assert certificate.sim_core == sim_core_build()
+        assert certificate.sim_core == solver_build(ROD_SOLVER)
         assert certificate.numbers == {"dt": 0.01, "solver": "<b>"}
         assert [report.build_hash for report in certificate.protocols] == [build_info().build_hash] * 2
         assert certificate.protocols[1].settings == {"elements": 512}

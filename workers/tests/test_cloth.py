@@ -8,29 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import stickslip_sim_core
 import tensorstore
 import xarray
 import zarr
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.chunks import encode_chunk, encode_trajectory
-from stickslip_schemas.jobs import ClothDragSpec, Viewpoint
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec, Viewpoint
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import (
-    ChunkRef,
-    ClothSimulation,
-    FileEntry,
-    PackSlot,
-    PackTask,
-    PublishTask,
-    Rejection,
-    SimulateTask,
-)
+from stickslip_schemas.tasks import ChunkRef, FileEntry, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
+from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
@@ -38,7 +29,7 @@ from stickslip_workers.stages.publish import publish
 from stickslip_workers.stages.records import Records, encode_records
 from stickslip_workers.stages.run import run_tasks
 
-BUILDS = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" * 64)
 SIDE = 5
 
 
@@ -93,13 +84,13 @@ class Core:
 def core(monkeypatch: pytest.MonkeyPatch) -> Core:
     """A core that answers at once, in place of the one that takes minutes."""
     core = Core()
-    monkeypatch.setattr(stickslip_sim_core, "drop_and_drag", core, raising=False)
+    monkeypatch.setattr(cloth_drag, "drop_and_drag", core)
     return core
 
 
 def _task(**changes: Any) -> SimulateTask:
     cloth = {"material": "gray-interlock", "mu": 0.25, "preset": "fast", "mesh": SIDE, "seed": 7}
-    return SimulateTask(simulation=ClothSimulation(**(cloth | changes)))
+    return SimulateTask(simulation=ClothDragSimulation(**(cloth | changes)))
 
 
 def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> None:

@@ -11,10 +11,11 @@ from typing import Any
 import fake_renderer
 import pytest
 from coordinator_double import CoordinatorDouble
+from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RecordRef, RenderTask, RodRender, RodSimulation, SimulateTask
-from stickslip_workers.coordinator import SupersededError
+from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask
+from stickslip_workers.coordinator_client import SupersededError
 from stickslip_workers.dispatcher import Dispatcher
 from stickslip_workers.processes import StartError
 from stickslip_workers.settings import Settings
@@ -83,13 +84,13 @@ def start(double: CoordinatorDouble, store: Store, cluster_cpus: int) -> Iterato
 
 
 def _render(what: int) -> RenderTask:
-    look = RodRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
+    look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
     return RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
 
 
 def _simulate(count: int) -> dict[str, SimulateTask]:
     return {
-        f"rod-{i}": SimulateTask(simulation=RodSimulation(gamma=1.0 + i, phi0=2.0, phi1=5.0, poisson=0.5))
+        f"rod-{i}": SimulateTask(simulation=RodHangSimulation(gamma=1.0 + i, phi0=2.0, phi1=5.0, poisson=0.5))
         for i in range(count)
     }
 
@@ -116,8 +117,7 @@ def test_runs_what_it_is_given_and_says_who_it_is(
     assert len({double.results[f"rod-{i}"].output.record.digest for i in range(700)}) <= 4
     assert (store.dataset_path(made.publish_task.dataset, 1) / "manifest.json").exists()
     (registration,) = double.registrations
-    assert registration.builds.blender == fake_renderer.BUILD
-    assert registration.kinds == ("rod_hang",)
+    assert {name: builds.render for name, builds in registration.builds.items()} == {"rod_hang": fake_renderer.BUILD}
     assert registration.slots == 2
     assert registration.versions["fake"] == "1"
 

@@ -1,12 +1,13 @@
 """The lease book: what a late answer says of an old lease does not touch a new one."""
 
-from stickslip_schemas.tasks import RodSimulation, SimulateTask
+from stickslip_schemas.kinds.rod_hang import RodHangSimulation
+from stickslip_schemas.tasks import SimulateTask
 from stickslip_schemas.worker_api import Lease
 from stickslip_workers.leases import LeaseBook
 
 
 def _lease(token: int) -> Lease:
-    task = SimulateTask(simulation=RodSimulation(gamma=1.0, phi0=0.0, phi1=0.0, poisson=0.5))
+    task = SimulateTask(simulation=RodHangSimulation(gamma=1.0, phi0=0.0, phi1=0.0, poisson=0.5))
     return Lease(task_id="one", token=token, attempt=1, task=task)
 
 

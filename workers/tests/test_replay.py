@@ -6,23 +6,17 @@ from pathlib import Path
 
 import fake_renderer
 import pytest
+from stickslip_schemas.kinds import KINDS
+from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import (
-    RecordRef,
-    RenderTask,
-    RodRender,
-    RodSimulation,
-    SimulateTask,
-    TaskResult,
-    task_adapter,
-)
+from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask, TaskResult, task_adapter
 from stickslip_workers.__main__ import main
 from stickslip_workers.replay import replay
 
 
 def test_the_command_prints_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    task = SimulateTask(simulation=RodSimulation(gamma=9.0, phi0=1.0, phi1=2.0, poisson=0.5))
+    task = SimulateTask(simulation=RodHangSimulation(gamma=9.0, phi0=1.0, phi1=2.0, poisson=0.5))
     (tmp_path / "task.json").write_bytes(task_adapter.dump_json(task))
     assert main(["replay", str(tmp_path / "task.json"), "--store", str(tmp_path / "store")]) == 0
     result = TaskResult.model_validate_json(capsys.readouterr().out)
@@ -33,7 +27,7 @@ def test_the_command_prints_the_result(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize("what", [fake_renderer.FINE, fake_renderer.BUG])
 def test_a_render_runs_in_the_other_interpreter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: int) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(fake_renderer.__file__).parent))
-    look = RodRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
+    look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
     task = RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
     result = replay(task, store=tmp_path, blender_python=Path(sys.executable), render_actor="fake_renderer:RenderActor")
     if what == fake_renderer.FINE:
@@ -45,4 +39,6 @@ def test_a_render_runs_in_the_other_interpreter(tmp_path: Path, monkeypatch: pyt
 def test_describe_names_the_builds(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["describe"]) == 0
     described = json.loads(capsys.readouterr().out)
-    assert {name: len(digest) for name, digest in described["builds"].items()} == {"sim_core": 64, "packer": 64}
+    assert described["builds"].keys() == KINDS.keys()
+    for builds in described["builds"].values():
+        assert {stage: len(digest) for stage, digest in builds.items()} == {"sim_core": 64, "simulate": 64, "pack": 64}

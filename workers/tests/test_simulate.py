@@ -6,16 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 import stickslip_sim_core
+from stickslip_schemas.kinds.rod_hang import RodHangSimulation
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RodSimulation, SimulateTask, TaskResult
+from stickslip_schemas.tasks import SimulateTask, TaskResult
 from stickslip_workers.stages.run import run_tasks
 
 
 def _rods(count: int) -> list[SimulateTask]:
     gammas = np.linspace(1, 300, count)
     return [
-        SimulateTask(simulation=RodSimulation(gamma=float(gamma), phi0=2.0, phi1=8.0, poisson=0.5)) for gamma in gammas
+        SimulateTask(simulation=RodHangSimulation(gamma=float(gamma), phi0=2.0, phi1=8.0, poisson=0.5))
+        for gamma in gammas
     ]
 
 
@@ -43,9 +45,9 @@ def test_a_batch_is_one_artifact_and_the_same_again(store: Store) -> None:
 
 
 def test_labels_say_what_a_rod_looks_like(store: Store) -> None:
-    both_hands = SimulateTask(simulation=RodSimulation(gamma=600.0, phi0=0.3, phi1=15.0, poisson=0.5))
-    one_hand = SimulateTask(simulation=RodSimulation(gamma=600.0, phi0=10.0, phi1=15.0, poisson=0.5))
-    coil = SimulateTask(simulation=RodSimulation(gamma=0.0, phi0=2.0, phi1=30.0, poisson=0.5))
+    both_hands = SimulateTask(simulation=RodHangSimulation(gamma=600.0, phi0=0.3, phi1=15.0, poisson=0.5))
+    one_hand = SimulateTask(simulation=RodHangSimulation(gamma=600.0, phi0=10.0, phi1=15.0, poisson=0.5))
+    coil = SimulateTask(simulation=RodHangSimulation(gamma=0.0, phi0=2.0, phi1=30.0, poisson=0.5))
     labels = [_curves(store, result) for result in run_tasks([both_hands, one_hand, coil], store)]
     assert [bool(rod["multistable"]) for rod in labels] == [True, False, False]
     assert [np.isinf(rod["self_contact_distance"]) for rod in labels] == [True, True, False]
@@ -58,7 +60,7 @@ def test_labels_say_what_a_rod_looks_like(store: Store) -> None:
 def test_a_rod_does_not_depend_on_its_batch(store: Store) -> None:
     tasks = _rods(7)
     # Other settings in the same batch make an artifact of their own.
-    odd = SimulateTask(simulation=RodSimulation(gamma=9.0, phi0=1.0, phi1=1.0, poisson=0.3))
+    odd = SimulateTask(simulation=RodHangSimulation(gamma=9.0, phi0=1.0, phi1=1.0, poisson=0.3))
     together = run_tasks([odd, *tasks], store)[1:]
     for task, result in zip(tasks, together, strict=True):
         (alone,) = run_tasks([task], store)

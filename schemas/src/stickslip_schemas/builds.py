@@ -5,14 +5,20 @@ from stickslip_schemas.keys import Sha256, content_key
 
 
 class Builds(Document):
-    """Build digests of a fleet of workers; tasks are leased only to workers of the builds they were planned for.
+    """Build digests of one kind; tasks are leased only to workers of the builds they were planned for.
 
-    Each digest is over sources, compiler and settings, so equal digests mean equal results.
+    Each digest is over the files that the work of that stage imports, over compilers, libraries and settings, so equal
+    digests mean equal results.
     """
 
     sim_core: Sha256
-    blender: Sha256
-    packer: Sha256
+    """Of the solver alone: what a certificate vouches for."""
+    simulate: Sha256
+    """Of all that makes a trajectory: the solver, the scene and the stage."""
+    render: Sha256
+    """Of all that makes pictures: the renderer and the scene."""
+    pack: Sha256
+    """Of all that writes a dataset: the arrays, codecs and metadata."""
 
     @property
     def digest(self) -> str:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import tomllib
 from functools import cache
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -161,26 +162,26 @@ def _parse_rigs(text: str) -> dict[str, tuple[Camera, ...]]:
 
 
 def read_rigs(path: str | Path) -> dict[str, tuple[Camera, ...]]:
-    """Read the rigs of a calibration file, laid out as this package's `cameras.toml`."""
+    """Read the rigs of a calibration file, laid out as those in this package's folder `rigs`."""
     return _parse_rigs(Path(path).read_text(encoding="utf-8"))
 
 
 @cache
-def _own_rigs() -> dict[str, tuple[Camera, ...]]:
-    return _parse_rigs(files("stickslip_schemas").joinpath("cameras.toml").read_text(encoding="utf-8"))
-
-
 def rig_names() -> tuple[str, ...]:
     """Name the rigs that this package ships."""
-    return tuple(_own_rigs())
+    return tuple(sorted(Path(file.name).stem for file in _rig_folder().iterdir() if file.name.endswith(".toml")))
 
 
+@cache
 def load_rig(name: str) -> tuple[Camera, ...]:
     """Return the cameras of one of the shipped rigs, in the order in which their views are stored."""
-    rigs = _own_rigs()
-    if name not in rigs:
-        raise ValueError(f"rig must be one of {', '.join(rigs)}; got {name!r}")
-    return rigs[name]
+    if name not in rig_names():
+        raise ValueError(f"rig must be one of {', '.join(rig_names())}; got {name!r}")
+    return _parse_rigs((_rig_folder() / f"{name}.toml").read_text(encoding="utf-8"))[name]
+
+
+def _rig_folder() -> Traversable:
+    return files("stickslip_schemas").joinpath("rigs")
 
 
 @cache

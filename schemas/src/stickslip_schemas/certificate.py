@@ -8,11 +8,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from stickslip_schemas.base import Document
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import Sha256, canonical_json, content_key
-
-ROD_PRESET = "rods"
-"""Stands for the rod solver, which has no presets to choose from."""
 
 MAX_PAGE_CHARACTERS = 8 * 2**20
 
@@ -69,7 +65,8 @@ class Certificate(Document):
     format: Literal["stickslip-certificate/1"] = "stickslip-certificate/1"
     preset: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")
     numbers: dict[str, Any] = Field(description="the settings that the preset stands for")
-    sim_core: Sha256 = Field(description="build of sim_core as it enters content keys (`Builds.sim_core`)")
+    sim_core: Sha256 = Field(description="build of the solver that was measured (`Builds.sim_core`)")
+    protocol_sources: Sha256 = Field(description="digest of the sources that measured and of the master curves")
     extent: Literal["full", "quick"] = Field(description="quick: few points, to try things out; certifies nothing")
     protocols: tuple[ProtocolReport, ...] = Field(min_length=1)
     passed: bool
@@ -106,8 +103,3 @@ class CertificateUpload(Document):
 
     certificate: Certificate
     page: str = Field(min_length=1, max_length=MAX_PAGE_CHARACTERS, description="one self-contained HTML page")
-
-
-def preset_of(spec: RodHangSpec | ClothDragSpec) -> str:
-    """Return the preset whose certificate vouches for the samples of a spec."""
-    return spec.preset if isinstance(spec, ClothDragSpec) else ROD_PRESET

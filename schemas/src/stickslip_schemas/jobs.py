@@ -1,84 +1,23 @@
-"""What a user asks for: a JobSpec is a parameter grid of one kind."""
+"""What a user asks for: a JobSpec is a parameter grid of one kind.
 
+This module holds what all kinds have in common. A kind itself is one module of `stickslip_schemas.kinds`.
+"""
+
+from collections.abc import Mapping
 from enum import StrEnum
+from functools import cached_property
 from math import prod
-from typing import Annotated, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, model_validator
 
-from stickslip_schemas.axes import (
-    MAX_SAMPLES,
-    SHORTHAND,
-    AnyAxis,
-    LinspaceAxis,
-    ListAxis,
-    RandomAxis,
-    Seed,
-    SobolAxis,
-    quantity,
-)
+from stickslip_schemas.arrays import COMMON_ARRAYS, ArrayLayout
+from stickslip_schemas.axes import MAX_SAMPLES, AnyAxis, Seed
 from stickslip_schemas.base import Document
-from stickslip_schemas.keys import content_key
+from stickslip_schemas.cameras import Camera
+from stickslip_schemas.keys import Sha256, content_key, derived_seed
 
-Gamma = Annotated[
-    float, quantity("Gamma"), Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness")
-]
-Phi = Annotated[
-    float, quantity("Phi"), Field(strict=True, ge=-40, le=40, description="natural curvature times L [rad]")
-]
-Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
-
-
-_TAGGED = Field(discriminator="type")
-GammaAxis = Annotated[ListAxis[Gamma] | LinspaceAxis[Gamma] | RandomAxis[Gamma] | SobolAxis[Gamma], _TAGGED, SHORTHAND]
-PhiAxis = Annotated[ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolAxis[Phi], _TAGGED, SHORTHAND]
-MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], _TAGGED, SHORTHAND]
-
-
-class Material(StrEnum):
-    """The ten fabrics measured by [Wang et al. 2011]."""
-
-    black_denim = "11oz-black-denim"
-    camel_ponte_roma = "camel-ponte-roma"
-    gray_interlock = "gray-interlock"
-    ivory_rib_knit = "ivory-rib-knit"
-    navy_sparkle_sweat = "navy-sparkle-sweat"
-    pink_ribbon_brown = "pink-ribbon-brown"
-    royal_target = "royal-target"
-    tango_red_jet_set = "tango-red-jet-set"
-    white_dots_on_blk = "white-dots-on-blk"
-    white_swim_solid = "white-swim-solid"
-
-
-class Texture(StrEnum):
-    """Procedural cloth textures."""
-
-    checker = "checker"
-    dots = "dots"
-    stripes = "stripes"
-    plaid = "plaid"
-    gingham = "gingham"
-    herringbone = "herringbone"
-    houndstooth = "houndstooth"
-    floral = "floral"
-
-
-class Viewpoint(StrEnum):
-    """Cameras of the drop-and-drag scene; the first is calibrated on the real stage."""
-
-    calibrated = "calibrated"
-    left = "left"
-    right = "right"
-
-
-class Preset(StrEnum):
-    """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
-
-    certified = "certified"
-    fast = "fast"
-    thesis_high = "thesis-high"
-    thesis_low_small_dt = "thesis-low-small-dt"
-    thesis_low_big_dt = "thesis-low-big-dt"
+D = TypeVar("D", bound=Document)
 
 
 class Quality(StrEnum):
@@ -103,28 +42,49 @@ class Splits(Document):
         return self
 
 
-class RodAxes(Document):
-    """Non-dimensional parameters of a suspended rod [Bertails-Descoubes et al. 2018]."""
+class Simulation(Document):
+    """What one trajectory depends on besides the build that makes it. Every kind has a class of its own."""
 
-    gamma: GammaAxis
-    phi0: PhiAxis
-    phi1: PhiAxis
+    kind: str
 
 
-class ClothAxes(Document):
-    """What a clip of dragged cloth depends on."""
+class Render(Document):
+    """What the pictures of one sample depend on besides their trajectory and the renderer's build."""
 
-    material: Annotated[ListAxis[Material], SHORTHAND]
-    mu: MuAxis
-    texture: Annotated[ListAxis[Texture], SHORTHAND]
-    viewpoint: Annotated[ListAxis[Viewpoint], SHORTHAND]
+    kind: str
+    rig: str
+    rig_digest: Sha256
+    quality: Quality
 
 
-class _JobSpec(Document):
+class SeedRule(NamedTuple):
+    """A seed that a document draws from the job's seed and from some of the sample's parameters."""
+
+    field: str
+    """The field of the document that holds the seed."""
+    purpose: str
+    """Keeps seeds apart that are drawn from the same parameters."""
+    axes: tuple[str, ...] | None
+    """The axes whose values enter, as far as the spec has them; None: all axes."""
+
+
+class JobSpec(Document):
+    """What the specs of all kinds have in common, and what common code may ask a spec.
+
+    A kind states which documents describe a simulation and a render. A field of these documents that has the name of an
+    axis takes its value. `simulation_settings` and `render_settings` give the other fields, and `SeedRule`s draw seeds.
+    """
+
+    simulation_type: ClassVar[type[Simulation]]
+    render_type: ClassVar[type[Render]]
+    simulation_seeds: ClassVar[tuple[SeedRule, ...]] = ()
+    render_seeds: ClassVar[tuple[SeedRule, ...]] = ()
+
+    kind: str
     name: str | None = Field(
         default=None,
         pattern=r"^[a-z0-9][a-z0-9-]{0,62}$",
-        description="a word of yours for the job; no part of the content",
+        description="a label that you choose for the job; it does not enter any key",
     )
     combine: Literal["product", "zip"] = Field(
         default="product",
@@ -134,11 +94,46 @@ class _JobSpec(Document):
     samples_per_shard: int = Field(default=64, ge=1, le=4096)
     seed: Seed = 0
 
+    # --- what every kind says of itself ---------------------------------------------------------------------------
+
+    @property
+    def certified_preset(self) -> str:
+        """Name of the preset whose certificate vouches for the samples."""
+        raise NotImplementedError
+
+    @property
+    def needs_certificate(self) -> bool:
+        """True where no sample may be made without a passing certificate."""
+        raise NotImplementedError
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        raise NotImplementedError
+
+    def render_settings(self) -> dict[str, Any] | None:
+        """Return the fields of the render document that are the same for all samples; None renders nothing."""
+        raise NotImplementedError
+
+    def arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the arrays of the dataset that only this kind has."""
+        raise NotImplementedError
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras of the pictures; none where nothing is rendered."""
+        raise NotImplementedError
+
+    def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
+        """Return the fields of documents that a value of an axis sets: by default the one of the axis's name."""
+        return {axis: value}
+
+    # --- what follows from it -------------------------------------------------------------------------------------
+
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
         """The axes by name, in the order in which a product is run through (the last one fastest)."""
         axes: Document = self.axes  # type: ignore[attr-defined]  # every kind has its own
-        return {name: getattr(axes, name) for name in type(axes).model_fields}
+        named = {name: getattr(axes, name) for name in type(axes).model_fields}
+        return {name: axis for name, axis in named.items() if axis is not None}
 
     @property
     def sample_count(self) -> int:
@@ -151,6 +146,39 @@ class _JobSpec(Document):
         """Key of what is asked for, whatever it is called."""
         return content_key("spec", self.model_dump(mode="json", exclude={"name"}))
 
+    @cached_property
+    def arrays_digest(self) -> str:
+        """Key of the arrays of the dataset: their shapes, types, fill values and the names of their codes."""
+        return content_key("arrays", [array.identity for array in (*self.arrays(), *COMMON_ARRAYS)])
+
+    def simulation(self, point: Mapping[str, Any]) -> Simulation:
+        """Return what to simulate at a point of the grid."""
+        return self._document(self.simulation_type, point, self.simulation_settings(), self.simulation_seeds)
+
+    def render(self, point: Mapping[str, Any]) -> Render | None:
+        """Return what to render at a point of the grid; None renders nothing."""
+        settings = self.render_settings()
+        return None if settings is None else self._document(self.render_type, point, settings, self.render_seeds)
+
+    def _document(
+        self, model: type[D], point: Mapping[str, Any], settings: dict[str, Any], seeds: tuple[SeedRule, ...]
+    ) -> D:
+        fields = {
+            name: value
+            for axis, given in point.items()
+            for name, value in self.document_fields(axis, given).items()
+            if name in model.model_fields
+        }
+        drawn = {
+            rule.field: derived_seed(self.seed, rule.purpose, {axis: point[axis] for axis in self.seed_axes(rule)})
+            for rule in seeds
+        }
+        return model(**settings, **fields, **drawn)
+
+    def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:
+        """Return the axes of this spec whose values enter a seed."""
+        return tuple(axis for axis in self.named_axes if rule.axes is None or axis in rule.axes)
+
     @model_validator(mode="after")
     def _countable(self) -> Self:
         sizes = {name: axis.num for name, axis in self.named_axes.items()}
@@ -159,37 +187,3 @@ class _JobSpec(Document):
         if self.sample_count > MAX_SAMPLES:
             raise ValueError(f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}")
         return self
-
-
-class RodHangSpec(_JobSpec):
-    """Rods that hang from a clamp under their own weight, seen by four cameras."""
-
-    kind: Literal["rod_hang"]
-    axes: RodAxes
-    poisson: float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio; GJ/EI = 1/(1+nu)")
-    views: Literal["rod-4"] | None = Field(default="rod-4", description="camera rig; null renders nothing")
-    quality: Quality = Quality.standard
-
-
-class ClothDragSpec(_JobSpec):
-    """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
-
-    kind: Literal["cloth_drag"]
-    axes: ClothAxes
-    preset: Preset = Preset.certified
-    allow_uncertified: bool = Field(
-        default=False,
-        description="make the dataset even where no passing certificate vouches for the preset with the workers' build",
-    )
-    mesh: int = Field(default=41, ge=5, le=161, description="vertices a side")
-    frames: int = Field(default=30, ge=1, le=300, description="rendered frames, at regular intervals of 300")
-    store_mesh: bool = Field(
-        default=True, description="keep the positions of all vertices in all 300 frames, beside the clips"
-    )
-    quality: Quality = Quality.standard
-
-
-JobSpec = Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
-
-job_spec_adapter: TypeAdapter[RodHangSpec | ClothDragSpec] = TypeAdapter(JobSpec)
-"""Validates and dumps a JobSpec of any kind."""

@@ -1,14 +1,14 @@
 """The manifest of a dataset version: what is in it, what it was made from, and how to check it."""
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import Camera
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import Sha256
+from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.tasks import FileEntry, Rejection
 
 MANIFEST_NAME = "manifest.json"
@@ -20,7 +20,7 @@ class Manifest(Document):
     format: Literal["stickslip-dataset/1"] = "stickslip-dataset/1"
     dataset: str
     version: int = Field(ge=1)
-    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec: AnyJobSpec
     spec_digest: Sha256
     builds: Builds
     certificate: Sha256 | None = Field(

@@ -1,14 +1,14 @@
 """What the coordinator answers to users."""
 
 from datetime import datetime
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import Sha256
+from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 T = TypeVar("T")
@@ -68,13 +68,13 @@ class Job(Document):
 class JobDetail(Job):
     """A job with what was asked for."""
 
-    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec: AnyJobSpec
 
 
 class Validation(Document):
     """What a job would be, without making it one."""
 
-    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec: AnyJobSpec
     spec_digest: Sha256
     sample_count: int
     simulation_count: int
@@ -129,14 +129,13 @@ class SampleState(Document):
     message: str
 
 
-class Worker(Document):
+class WorkerEntry(Document):
     """A dispatcher that has registered."""
 
     id: str
     name: str
-    kinds: tuple[str, ...]
     slots: int
-    builds: Builds
+    builds: dict[str, Builds] = Field(description="of each kind that it makes")
     versions: dict[str, str]
     registered_at: datetime
     last_seen_at: datetime

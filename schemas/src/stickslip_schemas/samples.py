@@ -1,21 +1,17 @@
 """From a spec to its samples: which simulation, which render and which split each of them is."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
 from typing import Any, NamedTuple, Protocol
 
 from stickslip_schemas.axes import axis_values
+from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec, Splits
+from stickslip_schemas.jobs import JobSpec, Render, SeedRule, Simulation, Splits
 from stickslip_schemas.keys import canonical_json, content_key, derived_seed, keyed_text, seed_of_key, sha256
-from stickslip_schemas.tasks import ClothRender, ClothSimulation, RodRender, RodSimulation
-
-CLOTH_RIG = "drag-3"
-"""The cameras of cloth clips; their names are those of the viewpoints."""
+from stickslip_schemas.kinds import registered
 
 SPLITS = ("train", "validation", "test")
 """Names of the splits, in the order of their numbers in the array `split`."""
@@ -27,9 +23,9 @@ class Sample:
 
     slot: int
     labels: dict[str, Any]
-    simulation: RodSimulation | ClothSimulation
+    simulation: Simulation
     simulation_key: str
-    render: RodRender | ClothRender | None
+    render: Render | None
     render_key: str | None
     split: int
 
@@ -49,34 +45,36 @@ class Keyed(Protocol):
     def split(self) -> int: ...
 
 
-def simulation_key(simulation: RodSimulation | ClothSimulation, builds: Builds) -> str:
-    """Return the content key of a trajectory: its physics and the sim_core build."""
-    return content_key("simulate", {"simulation": simulation.model_dump(mode="json"), "build": builds.sim_core})
+def simulation_key(simulation: Simulation, builds: Builds) -> str:
+    """Return the content key of a trajectory: its physics and the build that makes it."""
+    return content_key("simulate", {"simulation": simulation.model_dump(mode="json"), "build": builds.simulate})
 
 
-def render_key(render: RodRender | ClothRender, of_simulation: str, builds: Builds) -> str:
+def render_key(render: Render, of_simulation: str, builds: Builds) -> str:
     """Return the content key of a render: its trajectory, its appearance and the renderer's build."""
     return content_key(
         "render",
-        {"render": render.model_dump(mode="json"), "simulation": of_simulation, "build": builds.blender},
+        {"render": render.model_dump(mode="json"), "simulation": of_simulation, "build": builds.render},
     )
 
 
-def pack_key(spec: RodHangSpec | ClothDragSpec, shard: int, members: Sequence[Keyed], builds: Builds) -> str:
-    """Return the content key of a shard group: its slots' samples and splits, and the packer's build."""
+def pack_key(spec: JobSpec, shard: int, members: Sequence[Keyed], builds: Builds) -> str:
+    """Return the content key of a shard group: its slots' samples and splits, its arrays, and the packer's build.
+
+    The arrays are part of it because they depend on the spec, too: on the names of the codes of a label, for example.
+    """
     content = {
         "kind": spec.kind,
         "shard": shard,
         "samples_per_shard": spec.samples_per_shard,
         "slots": [[sample.key, sample.split] for sample in members],
-        "build": builds.packer,
+        "arrays": spec.arrays_digest,
+        "build": builds.pack,
     }
     return content_key("pack", content)
 
 
-def publish_key(
-    spec: RodHangSpec | ClothDragSpec, pack_keys: Sequence[str], builds: Builds, certificate: str | None = None
-) -> str:
+def publish_key(spec: JobSpec, pack_keys: Sequence[str], builds: Builds, certificate: str | None = None) -> str:
     """Return the content key of a dataset version: what was asked for, its shards, and who vouches for them."""
     content: dict[str, Any] = {"spec": spec.content_digest, "shards": list(pack_keys), "builds": builds.digest}
     if certificate is not None:
@@ -84,20 +82,26 @@ def publish_key(
     return content_key("publish", content)
 
 
-def dataset_id(spec: RodHangSpec | ClothDragSpec) -> str:
+def dataset_id(spec: JobSpec) -> str:
     """Return the id of the dataset that answers `spec`: the same spec has the same dataset, in any build."""
     return f"ds-{spec.content_digest[:16]}"
 
 
-def grid(spec: RodHangSpec | ClothDragSpec) -> Iterator[dict[str, Any]]:
+def grid(spec: JobSpec) -> Iterator[dict[str, Any]]:
     """Yield the point of the parameter grid of each sample, in the order of the slots."""
-    zipped = spec.combine == "zip"
-    columns = [
-        axis_values(axis, dimension=position if zipped else 0) for position, axis in enumerate(spec.named_axes.values())
-    ]
     names = tuple(spec.named_axes)
-    for point in zip(*columns, strict=True) if zipped else product(*columns):
+    for point in _combined(spec, _columns(spec)):
         yield dict(zip(names, point, strict=True))
+
+
+def _columns(spec: JobSpec) -> list[list[Any]]:
+    zipped = spec.combine == "zip"
+    axes = spec.named_axes.values()
+    return [axis_values(axis, dimension=position if zipped else 0) for position, axis in enumerate(axes)]
+
+
+def _combined(spec: JobSpec, columns: list[list[Any]]) -> Iterator[tuple[Any, ...]]:
+    return zip(*columns, strict=True) if spec.combine == "zip" else product(*columns)
 
 
 class KeyedPoint(NamedTuple):
@@ -121,116 +125,137 @@ class KeyedPoint(NamedTuple):
         return self.render_key or self.simulation_key
 
 
-def keyed_points(spec: RodHangSpec | ClothDragSpec, builds: Builds) -> Iterator[KeyedPoint]:
+def keyed_points(spec: JobSpec, builds: Builds) -> Iterator[KeyedPoint]:
     """Yield what `samples` yields, with the very same keys, some ten times as fast.
 
-    The canonical JSON of one sample differs from that of the next in the values of the grid point alone, so it is
+    The canonical JSON of one sample differs from that of the next only in what its axes and seeds set. So it is
     composed once, with holes, and the holes are filled in for each point.
     """
-    names = list(spec.named_axes)
-    holes = {name: _hole(name) for name in names}
-    model, render_model = (_rod if isinstance(spec, RodHangSpec) else _cloth)(spec, _first_point(spec))  # type: ignore[arg-type]
-    simulation = _with_holes(model.model_dump(mode="json"), holes)
-    rendered = None
-    if render_model is not None:
-        seed_field = "color_seed" if isinstance(render_model, RodRender) else "light_seed"
-        rendered = _with_holes(render_model.model_dump(mode="json"), holes) | {seed_field: _hole("seed")}
-    labels_text = _template(holes)
-    simulation_text = _template(simulation)
-    simulation_keyed = _template({"simulation": simulation, "build": builds.sim_core}, "simulate")
-    split_seed = _template({"seed": spec.seed, "for": simulation}, "seed/split")
-    purpose = "color" if isinstance(spec, RodHangSpec) else "light"
-    render_seed = _template({"seed": spec.seed, "for": holes}, f"seed/{purpose}")
-    render_text = _template(rendered)
-    render_keyed = _template({"render": rendered, "simulation": _hole("simulation"), "build": builds.blender}, "render")
-    for slot, point in enumerate(grid(spec)):
-        texts = {name: _text(value) for name, value in point.items()}
-        key = sha256((simulation_keyed % texts).encode())
+    registered(spec)
+    names = tuple(spec.named_axes)
+    columns = _columns(spec)
+    first = dict(zip(names, next(_combined(spec, columns)), strict=True))
+    simulation = _Template.of(spec, spec.simulation(first), first, spec.simulation_seeds)
+    shown = spec.render(first)
+    render = None if shown is None else _Template.of(spec, shown, first, spec.render_seeds)
+
+    labels_text = _format({name: _hole(name) for name in names})
+    simulation_text = _format(simulation.document)
+    simulation_keyed = _format({"simulation": simulation.document, "build": builds.simulate}, "simulate")
+    split_seed = _format({"seed": spec.seed, "for": simulation.unseeded}, "seed/split")
+    render_text = render_keyed = ""
+    if render is not None:
+        render_text = _format(render.document)
+        render_keyed = _format(
+            {"render": render.document, "simulation": _hole("simulation"), "build": builds.render}, "render"
+        )
+
+    filled = [
+        [(value, _texts(spec, name, value)) for value in column] for name, column in zip(names, columns, strict=True)
+    ]
+    for slot, cells in enumerate(_combined(spec, filled)):
+        point: dict[str, Any] = {}
+        texts: dict[str, str] = {}
+        for name, (value, own) in zip(names, cells, strict=True):
+            point[name] = value
+            texts.update(own)
         split = _split_at(spec.splits, _seed_of(split_seed % texts))
+        simulation.draw(texts)
+        key = sha256((simulation_keyed % texts).encode())
         labels, physics = labels_text % texts, simulation_text % texts
-        if rendered is None:
+        if render is None:
             yield KeyedPoint(slot, point, labels, physics, key, None, None, split)
             continue
-        texts["seed"] = str(_seed_of(render_seed % texts))
+        render.draw(texts)
         texts["simulation"] = f'"{key}"'
-        look_key = sha256((render_keyed % texts).encode())
-        yield KeyedPoint(slot, point, labels, physics, key, render_text % texts, look_key, split)
+        shown_key = sha256((render_keyed % texts).encode())
+        yield KeyedPoint(slot, point, labels, physics, key, render_text % texts, shown_key, split)
 
 
-def samples(spec: RodHangSpec | ClothDragSpec, builds: Builds) -> Iterator[Sample]:
+def samples(spec: JobSpec, builds: Builds) -> Iterator[Sample]:
     """Yield the samples of `spec` as `builds` would make them."""
     for point in keyed_points(spec, builds):
-        simulation, render = _rod(spec, point.labels) if isinstance(spec, RodHangSpec) else _cloth(spec, point.labels)
         yield Sample(
             slot=point.slot,
             labels=point.labels,
-            simulation=simulation,
+            simulation=spec.simulation(point.labels),
             simulation_key=point.simulation_key,
-            render=render,
+            render=spec.render(point.labels),
             render_key=point.render_key,
             split=point.split,
         )
+
+
+def split_of(spec: JobSpec, point: Mapping[str, Any]) -> int:
+    """Return the number of the split of a sample: a hash of its physics, so that no build or order moves it."""
+    seeds = {rule.field for rule in spec.simulation_seeds}
+    physics = spec.simulation(point).model_dump(mode="json", exclude=seeds)
+    return _split_at(spec.splits, derived_seed(spec.seed, "split", physics))
+
+
+# --- documents with holes ---------------------------------------------------------------------------------------------
+
+
+class _Template(NamedTuple):
+    """A document whose fields that differ between samples are holes, and the seeds that it draws."""
+
+    document: dict[str, Any]
+    unseeded: dict[str, Any]
+    seeds: tuple[tuple[str, str], ...]
+    """Name of the hole of each seed, and the text it is drawn from."""
+
+    @classmethod
+    def of(cls, spec: JobSpec, model: Document, point: Mapping[str, Any], rules: tuple[SeedRule, ...]) -> "_Template":
+        dumped = model.model_dump(mode="json")
+        varying = {field for axis, value in point.items() for field in spec.document_fields(axis, value)}
+        seeds = {rule.field for rule in rules}
+        document = {
+            name: _hole(f"{type(model).__name__}/{name}")
+            if name in seeds
+            else _hole(name)
+            if name in varying
+            else value
+            for name, value in dumped.items()
+        }
+        return cls(
+            document,
+            {name: value for name, value in document.items() if name not in seeds},
+            tuple(
+                (
+                    f"{type(model).__name__}/{rule.field}",
+                    _format(
+                        {"seed": spec.seed, "for": {axis: _hole(axis) for axis in spec.seed_axes(rule)}},
+                        f"seed/{rule.purpose}",
+                    ),
+                )
+                for rule in rules
+            ),
+        )
+
+    def draw(self, texts: dict[str, str]) -> None:
+        """Fill in the seeds of a point."""
+        for hole, text in self.seeds:
+            texts[hole] = str(_seed_of(text % texts))
 
 
 def _hole(name: str) -> str:
     return f"\x00{name}\x00"  # no value holds a NUL
 
 
-def _first_point(spec: RodHangSpec | ClothDragSpec) -> dict[str, Any]:
-    return next(grid(spec))
+def _texts(spec: JobSpec, axis: str, value: Any) -> dict[str, str]:
+    """Return the texts that a value of an axis puts into holes: of the axis itself, and of the fields it sets."""
+    return {name: canonical_json(given) for name, given in {**spec.document_fields(axis, value), axis: value}.items()}
 
 
-def _with_holes(document: dict[str, Any], holes: dict[str, str]) -> dict[str, Any]:
-    return {name: holes.get(name, value) for name, value in document.items()}
-
-
-def _template(document: Any, purpose: str | None = None) -> str:
+def _format(document: Any, purpose: str | None = None) -> str:
     """Return the canonical JSON of `document` (what `content_key` hashes, with a purpose) as a %-format."""
     text = canonical_json(document)
     text = (text if purpose is None else keyed_text(purpose, text)).replace("%", "%%")
-    return re.sub(r'"\\u0000(\w+)\\u0000"', r"%(\1)s", text)
-
-
-def _text(value: Any) -> str:
-    return repr(value + 0.0) if isinstance(value, float) else canonical_json(value)
+    return re.sub(r'"\\u0000([\w/]+)\\u0000"', r"%(\1)s", text)
 
 
 def _seed_of(text: str) -> int:
     return seed_of_key(sha256(text.encode()))
-
-
-def _rod(spec: RodHangSpec, point: dict[str, Any]) -> tuple[RodSimulation, RodRender | None]:
-    simulation = RodSimulation(**point, poisson=spec.poisson)
-    if spec.views is None:
-        return simulation, None
-    render = RodRender(
-        rig=spec.views,
-        rig_digest=_rig_digest(spec.views),
-        quality=spec.quality,
-        color_seed=derived_seed(spec.seed, "color", point),
-    )
-    return simulation, render
-
-
-def _cloth(spec: ClothDragSpec, point: dict[str, Any]) -> tuple[ClothSimulation, ClothRender]:
-    simulation = ClothSimulation(
-        material=point["material"], mu=point["mu"], preset=spec.preset, mesh=spec.mesh, seed=spec.seed
-    )
-    render = ClothRender(
-        texture=point["texture"],
-        viewpoint=point["viewpoint"],
-        frames=spec.frames,
-        quality=spec.quality,
-        rig=CLOTH_RIG,
-        rig_digest=_rig_digest(CLOTH_RIG),
-        light_seed=derived_seed(spec.seed, "light", point),
-    )
-    return simulation, render
-
-
-def split_of(splits: Splits, seed: int, simulation: RodSimulation | ClothSimulation) -> int:
-    """Return the number of the split of `simulation`: a hash of its physics, so no build or order moves it."""
-    return _split_at(splits, derived_seed(seed, "split", simulation.model_dump(mode="json")))
 
 
 def _split_at(splits: Splits, seed: int) -> int:
@@ -238,8 +263,3 @@ def _split_at(splits: Splits, seed: int) -> int:
     if position < splits.train:
         return 0
     return 1 if position < splits.train + splits.validation else 2
-
-
-@cache
-def _rig_digest(name: str) -> str:
-    return content_key("rig", [camera.model_dump(mode="json") for camera in load_rig(name)])

@@ -4,11 +4,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from stickslip_schemas.axes import Seed
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import ClothDragSpec, Material, Preset, Quality, RodHangSpec, Texture, Viewpoint
 from stickslip_schemas.keys import Sha256
+from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.states import Reason
 
 # --- where bytes are ------------------------------------------------------------------------------------------
@@ -40,39 +39,11 @@ class FileEntry(Document):
 # --- simulate -------------------------------------------------------------------------------------------------
 
 
-class RodSimulation(Document):
-    """A rod at rest: all that its shape depends on besides the sim_core build."""
-
-    kind: Literal["rod_hang"] = "rod_hang"
-    gamma: float
-    phi0: float
-    phi1: float
-    poisson: float
-    elements: int = 128
-    points: int = 150
-
-
-class ClothSimulation(Document):
-    """A cloth trajectory: all that it depends on besides the sim_core build."""
-
-    kind: Literal["cloth_drag"] = "cloth_drag"
-    scene: Literal["drop_and_drag"] = "drop_and_drag"
-    material: Material
-    mu: float
-    preset: Preset
-    mesh: int
-    frames: int = 300
-    seed: Seed
-
-
-Simulation = Annotated[RodSimulation | ClothSimulation, Field(discriminator="kind")]
-
-
 class SimulateTask(Document):
     """Make one trajectory."""
 
     stage: Literal["simulate"] = "simulate"
-    simulation: Simulation
+    simulation: AnySimulation
 
 
 class SimulateOutput(Document):
@@ -86,38 +57,11 @@ class SimulateOutput(Document):
 # --- render ---------------------------------------------------------------------------------------------------
 
 
-class RodRender(Document):
-    """How a rod is seen: all that its views depend on besides its trajectory and the renderer's build."""
-
-    kind: Literal["rod_hang"] = "rod_hang"
-    rig: str
-    rig_digest: Sha256
-    quality: Quality
-    color_seed: Seed
-    radius: float = Field(default=0.008, gt=0, lt=0.1, description="radius over length")
-
-
-class ClothRender(Document):
-    """How a cloth is seen: all that its clip depends on besides its trajectory and the renderer's build."""
-
-    kind: Literal["cloth_drag"] = "cloth_drag"
-    rig: str
-    rig_digest: Sha256
-    texture: Texture
-    viewpoint: Viewpoint
-    frames: int
-    quality: Quality
-    light_seed: Seed
-
-
-Render = Annotated[RodRender | ClothRender, Field(discriminator="kind")]
-
-
 class RenderTask(Document):
     """Make the pictures of one sample; `preview` asks for a small PNG besides."""
 
     stage: Literal["render"] = "render"
-    render: Render
+    render: AnyRender
     record: RecordRef
     preview: bool = False
 
@@ -165,7 +109,7 @@ class PackTask(Document):
     """Make the files of shard `shard` of every array."""
 
     stage: Literal["pack"] = "pack"
-    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec: AnyJobSpec
     shard: int = Field(ge=0)
     slots: tuple[PackSlot, ...] = Field(min_length=1)
 
@@ -181,7 +125,7 @@ class PublishTask(Document):
     """Write the metadata and the manifest of a dataset version; its result is the commit."""
 
     stage: Literal["publish"] = "publish"
-    spec: Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+    spec: AnyJobSpec
     dataset: str
     version: int = Field(ge=1)
     builds: Builds

@@ -2,10 +2,11 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.kinds import kind_named
 from stickslip_schemas.states import Stage
 from stickslip_schemas.tasks import Task, TaskResult
 
@@ -14,10 +15,16 @@ class WorkerRegistration(Document):
     """A dispatcher presents itself. A second registration of a `name` takes the first one's leases away."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
-    builds: Builds
-    kinds: tuple[Literal["rod_hang", "cloth_drag"], ...] = Field(min_length=1)
+    builds: dict[str, Builds] = Field(min_length=1, description="of each kind that it makes")
     slots: int = Field(ge=1, description="how many tasks it runs at once")
     versions: dict[str, str] = Field(default_factory=dict, description="for people: sim_core, blender, ray, ...")
+
+    @field_validator("builds")
+    @classmethod
+    def _known_kinds(cls, builds: dict[str, Builds]) -> dict[str, Builds]:
+        for name in builds:
+            kind_named(name)
+        return builds
 
 
 class WorkerSession(Document):

@@ -1,29 +1,94 @@
-"""Run the coordinator.
+"""The coordinator: the parts put together as an ASGI application, and the process that serves it.
 
     python -m stickslip_services.coordinator --data DIR --port N
+    python -m stickslip_services.coordinator --openapi > docs/openapi.json
 
 The port is bound before anything else is done, so that `--port 0` can say which one it got: the line
 `listening on http://...` on standard output is the sign that requests are answered.
 """
 
 import argparse
+import asyncio
+import json
 import logging
 import socket
 import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import uvicorn
+from fastapi import FastAPI
 from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
 
-from stickslip_services.app import make_app
-from stickslip_services.logs import configure_logging
-from stickslip_services.settings import DEFAULT_PORT, Settings
-from stickslip_services.sockets import listen
+from stickslip_services import __version__
+from stickslip_services.addresses import DEFAULT_PORT
+from stickslip_services.api import problems
+from stickslip_services.api.metrics import Metrics
+from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
+from stickslip_services.api.openapi import describe
+from stickslip_services.api.routes import certificates, datasets, health, jobs, tasks, workers
+from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.local.logs import configure_logging
+from stickslip_services.local.sockets import listen
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
 
 GRACE_SECONDS = 3
 """How long open requests (event streams) may go on after a signal to stop [s]."""
+
+
+def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
+    """Return the application; the database is opened when it starts."""
+    coordinator = Coordinator(settings, clock or steady_clock())
+    metrics = Metrics(coordinator.database, coordinator.alive_workers)
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await run_in_threadpool(coordinator.start)
+        sweeper = asyncio.create_task(_sweep_for_ever(coordinator))
+        yield
+        sweeper.cancel()
+        with suppress(asyncio.CancelledError):
+            await sweeper
+        coordinator.close()
+
+    app = FastAPI(
+        title="stickslip",
+        version=__version__,
+        description="Physically verified synthetic datasets of slender things.",
+        lifespan=lifespan,
+        docs_url="/docs",
+        redoc_url=None,
+        openapi_url="/openapi.json",
+    )
+    app.state.coordinator = coordinator
+    app.state.metrics = metrics
+    for module in (jobs, datasets, certificates, tasks, workers, health):
+        app.include_router(module.router)
+    problems.install(app)
+    app.openapi = lambda: describe(app)  # type: ignore[method-assign]
+    app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
+    app.add_middleware(RequestIdMiddleware)
+    app.add_middleware(TimingMiddleware, observe=metrics.observe)
+    return app
+
+
+async def _sweep_for_ever(coordinator: Coordinator) -> None:
+    while True:
+        await asyncio.sleep(coordinator.settings.sweep_seconds)
+        try:
+            await run_in_threadpool(coordinator.sweep)
+        except Exception:  # a full disk, say: the next sweep may find it otherwise
+            logger.exception("the sweep failed")
+
+
+def openapi_text() -> str:
+    """Return the OpenAPI document as it is committed."""
+    return json.dumps(make_app(Settings()).openapi(), indent=2, sort_keys=True) + "\n"
 
 
 class _Server(uvicorn.Server):
@@ -47,8 +112,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")
+    parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
+    if chosen.pop("openapi", False):
+        sys.stdout.write(openapi_text())
+        return 0
     descriptor = chosen.pop("fd", None)
     try:
         settings = Settings(**chosen)

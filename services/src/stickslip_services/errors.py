@@ -1,10 +1,9 @@
-"""What may go wrong when a request is perfectly well-formed. problems.py turns each into a problem document.
+"""What may go wrong when a request is perfectly well-formed. api/problems.py turns each into a problem document.
 
 StickslipError
 ├── NotFoundError               404
 ├── UnknownWorkerError          404
 ├── ConflictError               409
-├── InvalidTokenError           422
 ├── IdempotencyKeyReusedError   422
 ├── KindNotAvailableError       422
 ├── PresetNotCertifiedError     422
@@ -22,14 +21,6 @@ class NotFoundError(StickslipError):
 
 class ConflictError(StickslipError):
     """It cannot be done in the state that the thing is in."""
-
-
-class InvalidTokenError(StickslipError):
-    """A page token that is none of ours."""
-
-    def __init__(self, token: str) -> None:
-        super().__init__(f"page_token must be one that an earlier page gave, and it is {token[:200]!r}")
-        self.token = token
 
 
 class IdempotencyKeyReusedError(StickslipError):
@@ -58,3 +49,7 @@ class UnknownWorkerError(StickslipError):
 
 class MissingArtifactError(StickslipError):
     """The store does not have what the database says it has, or not all of it."""
+
+
+class SupervisorError(Exception):
+    """`stickslip up` cannot go on."""

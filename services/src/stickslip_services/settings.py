@@ -1,13 +1,12 @@
 """Settings of the coordinator, from the environment (`STICKSLIP_...`) or the command line."""
 
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Self
 
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-DEFAULT_PORT = 8765
+from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback
 
 
 class Settings(BaseSettings):
@@ -61,15 +60,4 @@ class Settings(BaseSettings):
     @property
     def url(self) -> str:
         """Where the coordinator can be reached."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}"
-
-
-def is_loopback(host: str) -> bool:
-    """Tell whether only this machine can reach `host`."""
-    if host == "localhost":
-        return True
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
+        return http_url(self.host, self.port)

@@ -16,8 +16,9 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import job_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import (
@@ -45,11 +46,16 @@ from stickslip_schemas.worker_api import (
     WorkerSession,
 )
 
-from stickslip_services.sockets import listen
+from stickslip_services.catalog import datasets
+from stickslip_services.database.paging import PageRequest
+from stickslip_services.local.sockets import listen
+from stickslip_services.queue import jobs
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.jobs import find_job
 
 A = TypeVar("A", bound=BaseModel)
 
-BUILDS = Builds(sim_core="a" * 64, blender="b" * 64, packer="c" * 64)
+BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 ALL_STAGES = dict.fromkeys(Stage, 1000)
 
 
@@ -89,6 +95,24 @@ def rejection(message: str = "it diverged") -> TaskResult:
     return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
 
 
+def show_job(coordinator: Coordinator, job_id: str) -> JobDetail:
+    """Return a job."""
+    with coordinator.database.read() as connection:
+        return coordinator.show(connection, find_job(connection, job_id).seq)
+
+
+def list_jobs(coordinator: Coordinator) -> tuple[Job, ...]:
+    """Return all jobs, newest first."""
+    with coordinator.database.read() as connection:
+        return jobs.list_jobs(connection, PageRequest(1000, None), ()).items
+
+
+def list_datasets(coordinator: Coordinator) -> tuple[Dataset, ...]:
+    """Return all datasets, newest first."""
+    with coordinator.database.read() as connection:
+        return datasets.list_datasets(connection, PageRequest(1000, None)).items
+
+
 @dataclass
 class PretendWorker:
     """Does what a dispatcher does, at once and with made-up data that the store really holds."""
@@ -106,7 +130,7 @@ class PretendWorker:
     def register(self) -> "PretendWorker":
         """Present itself."""
         registration = WorkerRegistration(
-            name=self.name, builds=self.builds, kinds=self.kinds, slots=self.slots, versions={}
+            name=self.name, builds=dict.fromkeys(self.kinds, self.builds), slots=self.slots, versions={}
         )
         self.id = self.api.register(registration).worker_id
         return self

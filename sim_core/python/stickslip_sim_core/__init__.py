@@ -1,16 +1,17 @@
 """The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python face."""
 
 from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
-from stickslip_sim_core.cloth import Body, Cloth, box, plane, sphere
-from stickslip_sim_core.fabrics import Fabric, fabric, fabric_names, isotropic
-from stickslip_sim_core.general_rods import solve_general_rods
-from stickslip_sim_core.inverse import NaturalCurvature, natural_curvature
-from stickslip_sim_core.multistability import OtherMinima, other_minima
-from stickslip_sim_core.presets import PRESETS, Preset, preset_named
-from stickslip_sim_core.rod_fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
-from stickslip_sim_core.rod_labels import reach, self_contact_distance
-from stickslip_sim_core.rods import RodSolution, solve_rods
-from stickslip_sim_core.scenes import DropAndDrag, drop_and_drag
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
+from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import Body, Cloth, box, plane, sphere
+from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
+from stickslip_sim_core.rods.general import solve_general_rods
+from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
+from stickslip_sim_core.rods.labels import reach, self_contact_distance
+from stickslip_sim_core.rods.multistability import OtherMinima, other_minima
+from stickslip_sim_core.rods.solve import RodSolution, solve_rods
+from stickslip_sim_core.scenes.cloth_drag import DropAndDrag, drop_and_drag
+from stickslip_sim_core.scenes.cloth_sphere import RotatingSphere, rotating_sphere
 
 __all__ = [
     "PRESETS",
@@ -23,8 +24,9 @@ __all__ = [
     "NaturalFit",
     "OtherMinima",
     "ParameterFit",
-    "Preset",
     "RodSolution",
+    "RotatingSphere",
+    "SolverSettings",
     "box",
     "build_info",
     "drop_and_drag",
@@ -35,9 +37,11 @@ __all__ = [
     "isotropic",
     "natural_curvature",
     "other_minima",
+    "own_fabric",
     "plane",
     "preset_named",
     "reach",
+    "rotating_sphere",
     "self_contact_distance",
     "self_intersections",
     "solve_general_rods",

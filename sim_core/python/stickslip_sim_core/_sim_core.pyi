@@ -45,12 +45,12 @@ def solve_rods(gamma: Annotated[NDArray[numpy.float64], dict(shape=(None,), orde
 
 def solve_general_rods(gamma: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], stiffness: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], clamp: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C', device='cpu', writable=False)], natural: Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], start: Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], slope: Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], natural_at_points: Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], elements: int, curvature_max: float, start_level: int = -1, kernel: str = '') -> tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, None, 3, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.bool_], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.bool_], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')]]:
     """
-    Internal: see stickslip_sim_core.solve_general_rods; arrays as in general_rods.hpp.
+    Internal: see stickslip_sim_core.solve_general_rods; arrays as in rods/general_rods.hpp.
     """
 
 def relax_chain(gamma: float, stiffness: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], natural: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], quaternions: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')]) -> tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')], float, bool, bool]:
     """
-    Internal: equilibrium of one chain: quaternions (N + 1, 4), energy, converged, stable. See rod_chain.hpp.
+    Internal: equilibrium of one chain: quaternions (N + 1, 4), energy, converged, stable. See rods/chain.hpp.
     """
 
 def chain_frames(curvature: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], clamp: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C')]) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')]:
@@ -63,7 +63,7 @@ def chain_centerline(quaternions: Annotated[NDArray[numpy.float64], dict(shape=(
 
 def chain_jacobian(gamma: float, stiffness: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], natural: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], quaternions: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')], basis: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C')], stride: int) -> Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C')]:
     """
-    Internal: derivatives of nodal positions by gamma and natural curvature. See rod_chain.hpp.
+    Internal: derivatives of nodal positions by gamma and natural curvature. See rods/chain.hpp.
     """
 
 def rod_kernels() -> list[str]:
@@ -86,6 +86,9 @@ def check_mesh(rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), ord
 
 def self_intersections(positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')]) -> int:
     """Internal: see stickslip_sim_core.self_intersections."""
+
+def cloth_kernels() -> list[str]:
+    """Internal: cloth kernels this processor can run, narrowest first."""
 
 class StepReport:
     """How a step of cloth went."""
@@ -116,9 +119,9 @@ class StepReport:
     def sliding(self) -> int: ...
 
 class ClothSolver:
-    """Internal: see stickslip_sim_core.cloth and cloth_solver.hpp."""
+    """Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp."""
 
-    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], density: float, stretching: Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], rigidity: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, halvings_max: int) -> None: ...
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], density: float, stretching: Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], rigidity: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, halvings_max: int, kernel: str = '') -> None: ...
 
     def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
 

@@ -22,11 +22,12 @@ from stickslip_blender.color import silicone_color, to_linear
 from stickslip_blender.rods import RodRenderer
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.chunks import decode_chunk
-from stickslip_schemas.jobs import Quality, Texture
+from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import RenderOutput, TaskResult
+from stickslip_schemas.textures import Texture
 
 LONG_WAY_DOWN = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.1), 150)  # a tenth too long for the rig
 

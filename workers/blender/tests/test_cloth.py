@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.engine import Sampling
 from stickslip_schemas.cameras import Camera, load_rig
-from stickslip_schemas.jobs import Texture
+from stickslip_schemas.textures import Texture
 
 QUICK = Sampling(samples=2, denoiser="fast")
 LAMP = Light(azimuth=-30.0, elevation=50.0, power=1.0, floor=0.025, roughness=0.35)
@@ -49,7 +49,7 @@ import numpy as np
 from stickslip_blender.cloth import ClothRenderer, Light
 from stickslip_blender.engine import Sampling
 from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Texture
+from stickslip_schemas.textures import Texture
 sheet = np.load(sys.argv[1])
 light = Light(azimuth=-30.0, elevation=50.0, power=1.0, floor=0.025, roughness=0.35)
 with ClothRenderer(sheet["triangles"], sheet["rest"], quality=Sampling(samples=2, denoiser="fast")) as renderer:

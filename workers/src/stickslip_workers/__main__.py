@@ -10,7 +10,7 @@ from pathlib import Path
 
 from stickslip_schemas.tasks import task_adapter
 
-from stickslip_workers.coordinator import CoordinatorError
+from stickslip_workers.coordinator_client import CoordinatorError
 from stickslip_workers.settings import Settings, default_blender_python
 
 

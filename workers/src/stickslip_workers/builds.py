@@ -1,46 +1,59 @@
-"""Which code runs here: the digests that go into content keys."""
+"""Which code runs here: the digests that go into content keys, for each kind and stage.
 
-from collections.abc import Iterable
+A build covers the files that the work imports (see `stickslip_schemas.sources`), the compiled core where it is used,
+and the versions of libraries that decide on bytes. One module is cut: the list of kinds. It decides on nothing by
+itself, and it would make every build depend on every kind. The documents that it leads to are in the content keys as a
+whole.
+"""
+
 from importlib import metadata
-from pathlib import Path
 
-import stickslip_schemas
-from stickslip_schemas.keys import content_key, sha256
+from stickslip_schemas.keys import content_key
+from stickslip_schemas.sources import digests, sources
 
-import stickslip_workers
+from stickslip_workers.kinds import kind
 
-_SIMULATING = ("rods.py", "cloth.py", "records.py")
-# What the stages call, and what that imports: a test follows the imports.
-_FACE = (
-    *("rods.py", "general_rods.py", "multistability.py", "rod_labels.py", "splines.py"),
-    *("scenes.py", "cloth.py", "fabrics.py", "fabrics.toml", "meshes.py", "presets.py"),
-)
-_PACKING = ("pack.py", "publish.py", "metadata.py", "records.py")
-_CONTRACT = ("chunks.py", "clips.py", "layout.py", "manifest.py")
-_STAGES = Path(stickslip_workers.__file__).parent / "stages"
+CUT = ("stickslip_schemas.kinds",)
+
+_STAGES = "stickslip_workers.stages"
 _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 
 
-def packer_build() -> str:
-    """Return the digest of everything that decides on the bytes of a packed dataset."""
-    contract = Path(stickslip_schemas.__file__).parent
-    sources = [_STAGES / name for name in _PACKING] + [contract / name for name in _CONTRACT]
-    libraries = {name: metadata.version(name) for name in _LIBRARIES}
-    return content_key("packer", {"sources": _digests(sources), "libraries": libraries})
+def roots(stage: str, name: str) -> tuple[str, ...]:
+    """Return the modules that do the work of a stage for a kind."""
+    if stage == "simulate":
+        return (f"{_STAGES}.actor", f"{_STAGES}.simulate", f"stickslip_workers.kinds.{name}")
+    if stage == "pack":
+        return (f"{_STAGES}.actor", f"{_STAGES}.pack", f"{_STAGES}.publish", f"stickslip_schemas.kinds.{name}")
+    raise ValueError(f"stage must be simulate or pack; got {stage!r}")
 
 
-def sim_core_build() -> str:
-    """Return the digest of everything that decides on a trajectory: the compiled core, its face, and our stage."""
+def build(stage: str, name: str) -> str:
+    """Return the digest of everything that decides on what a stage makes for a kind."""
+    libraries = {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
+    core = "" if stage == "pack" else _core()
+    files = digests(sources(roots(stage, name), cut=CUT))
+    return content_key(f"build/{stage}", {"kind": name, "sources": files, "core": core, "libraries": libraries})
+
+
+def solver_build(module: str) -> str:
+    """Return the digest of a solver: a module of sim_core, all that it imports, and the compiled core."""
+    return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=CUT))})
+
+
+def kind_builds(name: str) -> dict[str, str]:
+    """Return the builds of the stages that run in this interpreter."""
+    return {
+        "sim_core": solver_build(kind(name).solver),
+        "simulate": build("simulate", name),
+        "pack": build("pack", name),
+    }
+
+
+def _core() -> str:
     import stickslip_sim_core
 
-    face = [Path(stickslip_sim_core.__file__).parent / name for name in _FACE]
-    sources = {f"stage/{name}": digest for name, digest in _digests([_STAGES / name for name in _SIMULATING]).items()}
-    core = str(stickslip_sim_core.build_info().build_hash)
-    return content_key("sim_core", {"core": core, "sources": sources | _digests(face)})
-
-
-def _digests(sources: Iterable[Path]) -> dict[str, str]:
-    return {path.name: sha256(path.read_bytes()) for path in sources}
+    return str(stickslip_sim_core.build_info().build_hash)
 
 
 def versions() -> dict[str, str]:

@@ -12,14 +12,14 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
-import stickslip_sim_core
 from stickslip_schemas.certificate import Certificate, ProtocolReport
-from stickslip_schemas.keys import canonical_json, content_key, sha256
+from stickslip_schemas.keys import canonical_json, content_key
+from stickslip_schemas.sources import digests, sources
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
 
-from stickslip_workers.builds import sim_core_build
+from stickslip_workers.builds import solver_build
 from stickslip_workers.certificate_page import certificate_page
 
 DOCUMENT_NAME = "certificate.json"
@@ -63,7 +63,8 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
     certificate = Certificate(
         preset=preset,
         numbers=dict(certification.numbers),
-        sim_core=sim_core_build(),
+        sim_core=solver_build(certification.solver),
+        protocol_sources=_protocol_sources(),
         extent="quick" if quick else "full",
         protocols=tuple(reports),
         passed=all(report.passed for report in reports),
@@ -110,16 +111,12 @@ def _environment() -> dict[str, str]:
         "sim_core": build.version,
         "compiler": build.compiler,
         "isa": build.isa,
-        "protocol_sources": _protocol_sources(),
     }
 
 
 def _protocol_sources() -> str:
-    """Return the digest of what measures and of what is measured against; neither is part of the core's build."""
-    package = Path(stickslip_sim_core.__file__).parent
-    names = ("master_curves.py", "plate_buckling.py", "boundary_value.py")
-    sources = [package / name for name in names] + sorted((package / "protocols").glob("*.py"))
-    return content_key("protocols", {path.name: sha256(path.read_bytes()) for path in sources})
+    """Return the digest of what measures and of what is measured against."""
+    return content_key("protocols", digests(sources(["stickslip_sim_core.protocols"])))
 
 
 def _processor() -> str:

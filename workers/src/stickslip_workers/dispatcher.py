@@ -18,13 +18,18 @@ from stickslip_schemas.tasks import SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
 from stickslip_workers.backoff import Backoff
-from stickslip_workers.coordinator import Coordinator, CoordinatorError, UnknownWorkerError, UnreachableError
+from stickslip_workers.coordinator_client import (
+    CoordinatorClient,
+    CoordinatorError,
+    UnknownWorkerError,
+    UnreachableError,
+)
 from stickslip_workers.failures import failed, failure, process_failure
 from stickslip_workers.heartbeat import HeartbeatThread
+from stickslip_workers.kinds import kind, kind_names
 from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import Settings
-from stickslip_workers.stages.kinds import KINDS, KindName
 from stickslip_workers.stages.run import AnyTask
 
 log = logging.getLogger(__name__)
@@ -42,7 +47,7 @@ MOST_AHEAD = 16
 """Tasks that wait here, for each slot: enough for so long, but one at least and not more than so many. A request costs
 the coordinator about 10 ms whatever it asks for."""
 
-LARGEST_BATCH = max(kind.batch for kind in KINDS.values())
+LARGEST_BATCH = max(kind(name).batch for name in kind_names())
 """How many simulations to ask for at once: one call takes them all."""
 
 _PRECEDENCE = (Stage.publish, Stage.pack, Stage.simulate, Stage.render)
@@ -96,7 +101,7 @@ class Dispatcher:
                 **common,
             )
         )
-        self._coordinator = Coordinator(settings.url)
+        self._coordinator = CoordinatorClient(settings.url)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
         self._heartbeat: HeartbeatThread | None = None
@@ -298,8 +303,11 @@ class Dispatcher:
         assert render is not None
         registration = WorkerRegistration(
             name=self._settings.name,
-            builds=Builds(**stage["builds"], blender=render["build"]),
-            kinds=tuple(kind for kind in KINDS if kind in render["kinds"]),
+            builds={
+                name: Builds(**own, render=render["builds"][name])
+                for name, own in stage["builds"].items()
+                if name in render["builds"]
+            },
             slots=self._slots,
             versions={**stage["versions"], **render.get("versions", {})},
         )
@@ -405,9 +413,9 @@ class Dispatcher:
 def _next_batch(queue: deque[Lease]) -> list[Lease]:
     """Take what one process can do together from the front of `queue`: simulations of one kind, or one task."""
     batch = [queue.popleft()]
-    kind = _simulated_kind(batch[0])
-    limit = KINDS[kind].batch if kind in KINDS else 1
-    while queue and len(batch) < limit and _simulated_kind(queue[0]) == kind:
+    simulated = _simulated_kind(batch[0])
+    limit = 1 if simulated is None else kind(simulated).batch
+    while queue and len(batch) < limit and _simulated_kind(queue[0]) == simulated:
         batch.append(queue.popleft())
     return batch
 
@@ -425,7 +433,7 @@ def _batch_count(stage: Stage, queue: deque[Lease]) -> int:
     return -(-len(queue) // LARGEST_BATCH) if stage is Stage.simulate else len(queue)
 
 
-def _simulated_kind(lease: Lease) -> KindName | None:
+def _simulated_kind(lease: Lease) -> str | None:
     return lease.task.simulation.kind if isinstance(lease.task, SimulateTask) else None
 
 

@@ -5,7 +5,7 @@ import threading
 
 from stickslip_schemas.worker_api import Heartbeat, WorkerSession
 
-from stickslip_workers.coordinator import Coordinator, CoordinatorError, UnknownWorkerError
+from stickslip_workers.coordinator_client import CoordinatorClient, CoordinatorError, UnknownWorkerError
 from stickslip_workers.leases import LeaseBook
 
 log = logging.getLogger(__name__)
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 class HeartbeatThread(threading.Thread):
     """Beats three times a lease. A daemon: it never keeps the process alive."""
 
-    def __init__(self, coordinator: Coordinator, session: WorkerSession, book: LeaseBook) -> None:
+    def __init__(self, coordinator: CoordinatorClient, session: WorkerSession, book: LeaseBook) -> None:
         super().__init__(name="heartbeat", daemon=True)
         self._coordinator = coordinator
         self._session = session

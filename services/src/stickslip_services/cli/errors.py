@@ -8,10 +8,10 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from stickslip_services.certifying import CertifyError
 from stickslip_services.cli.specs import SpecFileError
-from stickslip_services.client import ClientError, ProblemError, UnreachableError
-from stickslip_services.supervisor import SupervisorError
+from stickslip_services.client.http import ClientError, ProblemError, UnreachableError
+from stickslip_services.errors import SupervisorError
+from stickslip_services.local.certifying import CertifyError
 
 P = ParamSpec("P")
 R = TypeVar("R")

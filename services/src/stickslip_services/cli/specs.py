@@ -1,4 +1,4 @@
-"""Spec files: YAML or JSON."""
+"""JobSpec files: YAML or JSON."""
 
 import json
 import math

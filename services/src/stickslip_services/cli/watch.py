@@ -12,7 +12,7 @@ from stickslip_schemas.responses import Progress as JobProgress
 from stickslip_schemas.states import JobState, Stage, TaskState
 
 from stickslip_services.cli import wording
-from stickslip_services.client import Client
+from stickslip_services.client.http import Client
 
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
 

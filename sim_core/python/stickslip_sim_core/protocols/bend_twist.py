@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from stickslip_sim_core import build_info, master_curves
+from stickslip_sim_core import build_info
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import (
     check_elements,
@@ -18,6 +18,7 @@ from stickslip_sim_core.protocols.rod_chain import (
     planar_frames,
     round_rod,
 )
+from stickslip_sim_core.reference import master_curves
 
 # Natural curvature times L [rad]: 6 ... 25 pi.
 PHI = (6.0, 6.5, 7.0, 8.0, 10.0, 12.5, 16.0, 20.0, 27.0, 36.0, 48.0, 62.0, 25.0 * np.pi)

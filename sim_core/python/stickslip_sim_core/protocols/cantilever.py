@@ -4,12 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stickslip_sim_core import build_info, master_curves
-from stickslip_sim_core.cloth import GRAVITY, Cloth
-from stickslip_sim_core.fabrics import isotropic
-from stickslip_sim_core.presets import Preset, preset_named
+from stickslip_sim_core import build_info
+from stickslip_sim_core.cloth.fabrics import isotropic
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+from stickslip_sim_core.reference import master_curves
 
 # Weights rho_A g L^3 / D [-].
 GAMMA = (0.01, 0.1, 1.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
@@ -33,7 +34,7 @@ FORCE_SHARE = 0.1  # of a node's weight: the force that residuals are measured i
 
 def run(
     *,
-    preset: str | Preset = "certified",
+    preset: str | SolverSettings = "certified",
     gamma: Sequence[float] = GAMMA,
     cells: int = 50,
     structured: int = 1,
@@ -59,10 +60,10 @@ def run(
     for number, (light, heavy) in enumerate(pairs):
         measured = []
         for weight in gamma:
-            ratio, sheet = hang(heavy if weight > HEAVY else light, weight, settings)
+            ratio, cloth = hang(heavy if weight > HEAVY else light, weight, settings)
             measured.append(ratio)
-            steps += sheet.steps
-            unconverged += sheet.unconverged_steps
+            steps += cloth.steps
+            unconverged += cloth.unconverged_steps
         curves.append(Curve({"mesh": float(number)}, tuple(float(g) for g in gamma), tuple(measured), master))
         names.append(f"{number} {light.name}")
     return ProtocolResult(
@@ -87,10 +88,10 @@ def run(
     )
 
 
-def hang(strip: Strip, gamma: float, preset: Preset, stretching: float = STRETCHING) -> tuple[float, Cloth]:
-    """Let a strip that was straight and horizontal settle; return H/W, NaN if it did not, and the sheet."""
+def hang(strip: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING) -> tuple[float, Cloth]:
+    """Let a strip that was straight and horizontal settle; return H/W, NaN if it did not, and the cloth."""
     weight = DENSITY * GRAVITY * LENGTH  # N/m
-    sheet = Cloth(
+    cloth = Cloth(
         strip.mesh,
         isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma),
         preset,
@@ -99,13 +100,13 @@ def hang(strip: Strip, gamma: float, preset: Preset, stretching: float = STRETCH
         force_scale=FORCE_SHARE * DENSITY * GRAVITY * strip.mesh.spacing**2,
     )
     straight = np.stack([strip.along, strip.across, np.zeros_like(strip.along)], axis=1)
-    sheet.set_state(straight, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
+    cloth.set_state(straight, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
     dt, at_rest = preset.time_step, False
-    while sheet.steps < STEPS_MAX and not at_rest:
-        before = sheet.positions
-        sheet.step(dt, held=straight[strip.held], damping=DAMPING)
-        at_rest = 2.0 * dt > LONGEST and float(np.abs(sheet.positions - before).max()) < REST * LENGTH
-        if sheet.steps > STEADY_STEPS:
+    while cloth.steps < STEPS_MAX and not at_rest:
+        before = cloth.positions
+        cloth.step(dt, held=straight[strip.held], damping=DAMPING)
+        at_rest = 2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
+        if cloth.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)
-    reach, _, drop = sheet.positions[strip.tip].mean(axis=0)
-    return float(-drop / reach) if at_rest else np.nan, sheet
+    reach, _, drop = cloth.positions[strip.tip].mean(axis=0)
+    return float(-drop / reach) if at_rest else np.nan, cloth

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_sim_core.presets import PRESETS
+from stickslip_sim_core.cloth.presets import PRESETS
 
 
 @dataclass(frozen=True)
@@ -14,6 +14,9 @@ class Certification:
 
     protocols: tuple[str, ...]
     """Names in PROTOCOLS, in the order in which they run: the quick ones first."""
+
+    solver: str
+    """The module whose build the certificate is of."""
 
     numbers: Mapping[str, Any] = field(default_factory=dict)
     """The settings that the preset stands for, in JSON's types."""
@@ -37,8 +40,13 @@ _CLOTH_QUICK: Mapping[str, Mapping[str, Any]] = {
 
 CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
     {
-        "rods": Certification(("rod-lateral-buckling", "rod-cantilever", "bend-twist"), quick=_ROD_QUICK),
-        **{name: Certification(_CLOTH, asdict(preset), _CLOTH_QUICK) for name, preset in PRESETS.items()},
+        "rods": Certification(
+            ("rod-lateral-buckling", "rod-cantilever", "bend-twist"), "stickslip_sim_core.rods", quick=_ROD_QUICK
+        ),
+        **{
+            name: Certification(_CLOTH, "stickslip_sim_core.cloth", asdict(preset), _CLOTH_QUICK)
+            for name, preset in PRESETS.items()
+        },
     }
 )
 """By preset; "rods" stands for the rod solver, which has none."""

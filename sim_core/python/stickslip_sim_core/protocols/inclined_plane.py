@@ -3,19 +3,18 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stickslip_sim_core import build_info, meshes
-from stickslip_sim_core.cloth import GRAVITY, Cloth, plane
-from stickslip_sim_core.fabrics import fabric
-from stickslip_sim_core.presets import Preset, preset_named
+from stickslip_sim_core import build_info
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, plane
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-
-Floats = NDArray[np.float64]
 
 FRICTION = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
 SIDE = 0.1  # m
-MATERIAL = "gray-interlock"
+FABRIC = "gray-interlock"
 DIRECTION = np.array([np.cos(0.5), np.sin(0.5)])  # down the slope, along no edge
 
 RATE = 0.01  # 1/s: of tan(alpha) over mu
@@ -33,7 +32,7 @@ FORCE_SHARE = 1.0
 
 def run(
     *,
-    preset: str | Preset = "certified",
+    preset: str | SolverSettings = "certified",
     friction: Sequence[float] = FRICTION,
     cells: int = 10,
     structured: int = 1,
@@ -87,27 +86,27 @@ def run(
     )
 
 
-def slip_slope(mesh: meshes.Mesh, mu: float, preset: Preset, *, force_share: float = FORCE_SHARE) -> float:
+def slip_slope(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_share: float = FORCE_SHARE) -> float:
     """Return tan(alpha) of the slope, growing by 1 % of mu a second, at which all of the patch slides, or NaN."""
-    sheet, start = _laid(mesh, preset, force_share)
+    cloth, start = _laid(mesh, preset, force_share)
     floor, dt = [plane(mu)], preset.time_step
     for step in range(1, round((UP_TO - FROM) / (RATE * dt)) + 1):
         slope = mu * (FROM + RATE * step * dt)
-        sheet.gravity[:] = tilted(np.arctan(slope))
-        sheet.step(dt, bodies=floor)
-        if np.abs(sheet.positions - start).max(axis=1).min() > MOVED:
+        cloth.gravity[:] = tilted(np.arctan(slope))
+        cloth.step(dt, bodies=floor)
+        if np.abs(cloth.positions - start).max(axis=1).min() > MOVED:
             return float(slope)
     return np.nan
 
 
-def drift(mesh: meshes.Mesh, mu: float, preset: Preset, *, force_share: float = FORCE_SHARE) -> float:
+def drift(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_share: float = FORCE_SHARE) -> float:
     """Return how far any vertex comes in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
-    sheet, start = _laid(mesh, preset, force_share)
-    sheet.gravity[:] = tilted(HOLD_SHARE * np.arctan(mu))
+    cloth, start = _laid(mesh, preset, force_share)
+    cloth.gravity[:] = tilted(HOLD_SHARE * np.arctan(mu))
     floor = [plane(mu)]
     for _ in range(round(HOLD_TIME / preset.time_step)):
-        sheet.step(preset.time_step, bodies=floor)
-    return float(np.abs(sheet.positions - start).max())
+        cloth.step(preset.time_step, bodies=floor)
+    return float(np.abs(cloth.positions - start).max())
 
 
 def tilted(angle: float) -> Floats:
@@ -115,13 +114,13 @@ def tilted(angle: float) -> Floats:
     return GRAVITY * np.append(np.sin(angle) * DIRECTION, -np.cos(angle))
 
 
-def _laid(mesh: meshes.Mesh, preset: Preset, force_share: float) -> tuple[Cloth, Floats]:
-    material = fabric(MATERIAL)
-    weight = material.density * mesh.spacing**2 * GRAVITY
-    sheet = Cloth(mesh, material, preset, force_scale=force_share * weight)
+def _laid(mesh: meshes.Mesh, preset: SolverSettings, force_share: float) -> tuple[Cloth, Floats]:
+    laid = fabric(FABRIC)
+    weight = laid.density * mesh.spacing**2 * GRAVITY
+    cloth = Cloth(mesh, laid, preset, force_scale=force_share * weight)
     start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
-    sheet.set_state(start)
-    return sheet, start
+    cloth.set_state(start)
+    return cloth, start
 
 
 def _patches(cells: int, structured: int, unstructured: int) -> Iterator[tuple[str, meshes.Mesh]]:

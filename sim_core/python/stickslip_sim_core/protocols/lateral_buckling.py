@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stickslip_sim_core import build_info, master_curves
-from stickslip_sim_core.cloth import GRAVITY, Cloth
-from stickslip_sim_core.fabrics import isotropic
-from stickslip_sim_core.presets import Preset, preset_named
+from stickslip_sim_core import build_info
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.fabrics import isotropic
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.reference import master_curves
 
 ASPECT = (0.1, 0.2, 0.5)
 POISSON = (0.0, 0.3)
@@ -32,7 +32,7 @@ DIFFERENCE = 1e-7  # of the length
 
 def run(
     *,
-    preset: str | Preset = "certified",
+    preset: str | SolverSettings = "certified",
     aspect: Sequence[float] = ASPECT,
     poisson: Sequence[float] = POISSON,
     cells: int = 50,
@@ -83,14 +83,14 @@ def run(
     )
 
 
-def threshold(strip: Strip, poisson: float, preset: Preset) -> float:
+def threshold(strip: Strip, poisson: float, preset: SolverSettings) -> float:
     """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
-    sheet, flat = loaded(strip, poisson, RIGIDITY, preset)
+    cloth, flat = loaded(strip, poisson, RIGIDITY, preset)
     free = np.setdiff1d(np.arange(len(flat)), strip.held)
-    bending = out_of_plane(sheet, flat, free)
+    bending = out_of_plane(cloth, flat, free)
     for step in range(STEPS):
-        sheet.step(preset.time_step * GROWTH**step, held=flat[strip.held])
-    stress = out_of_plane(sheet, sheet.positions, free) - bending
+        cloth.step(preset.time_step * GROWTH**step, held=flat[strip.held])
+    stress = out_of_plane(cloth, cloth.positions, free) - bending
     if not np.isfinite(stress).all():
         return np.nan
     # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of L^-1 (-stress) L^-T.
@@ -101,9 +101,9 @@ def threshold(strip: Strip, poisson: float, preset: Preset) -> float:
     return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
 
 
-def loaded(strip: Strip, poisson: float, rigidity: float, preset: Preset) -> tuple[Cloth, Floats]:
+def loaded(strip: Strip, poisson: float, rigidity: float, preset: SolverSettings) -> tuple[Cloth, Floats]:
     """Return a flat strip at rest, to bear its weight along its width, and where its vertices are."""
-    sheet = Cloth(
+    cloth = Cloth(
         strip.mesh,
         isotropic(DENSITY, STRETCHING * DENSITY * GRAVITY * LENGTH, rigidity, poisson),
         preset,
@@ -112,20 +112,20 @@ def loaded(strip: Strip, poisson: float, rigidity: float, preset: Preset) -> tup
         force_scale=FORCE_SHARE * DENSITY * GRAVITY * strip.mesh.spacing**2,
     )
     flat = np.stack([strip.along, strip.across, np.zeros_like(strip.along)], axis=1)
-    sheet.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
-    sheet.gravity[:] = [0.0, -GRAVITY, 0.0]
-    return sheet, flat
+    cloth.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
+    cloth.gravity[:] = [0.0, -GRAVITY, 0.0]
+    return cloth, flat
 
 
-def out_of_plane(sheet: Cloth, at: Floats, free: NDArray[np.int64]) -> Floats:
-    """Return the stiffness (F, F) of the free vertices of a flat sheet against moving out of its plane."""
+def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> Floats:
+    """Return the stiffness (F, F) of the free vertices of a flat cloth against moving out of its plane."""
     columns = np.empty((len(free), len(free)))
     moved = at.copy()
     for column, vertex in enumerate(free):
         ends = []
         for sign in (1.0, -1.0):
             moved[vertex, 2] = at[vertex, 2] + sign * DIFFERENCE * LENGTH
-            ends.append(sheet._solver.energies(moved, sheet.slopes)[2][free, 2])
+            ends.append(cloth._solver.energies(moved, cloth.slopes)[2][free, 2])
         moved[vertex, 2] = at[vertex, 2]
         columns[:, column] = (ends[0] - ends[1]) / (2.0 * DIFFERENCE * LENGTH)
     return 0.5 * (columns + columns.T)

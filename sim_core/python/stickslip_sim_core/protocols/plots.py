@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stickslip_sim_core import master_curves
 from stickslip_sim_core.protocols.bend_twist import POISSON, lower_boundary, upper_boundary
 from stickslip_sim_core.protocols.result import ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import extrapolated
 from stickslip_sim_core.protocols.stick_slip import EXTENDED, SLIP, STICK
+from stickslip_sim_core.reference import master_curves
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

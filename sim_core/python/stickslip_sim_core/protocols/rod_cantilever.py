@@ -5,9 +5,10 @@ from functools import partial
 
 import numpy as np
 
-from stickslip_sim_core import build_info, master_curves
+from stickslip_sim_core import build_info
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import check_elements, extrapolated, planar_frames, round_rod, tip
+from stickslip_sim_core.reference import master_curves
 
 # Weights rho A g L^3 / EI [-]: 1e-3 ... 1e5.
 GAMMA = tuple(float(g) for g in 10.0 ** np.arange(-3.0, 5.1, 0.5))

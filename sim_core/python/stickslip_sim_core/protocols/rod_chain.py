@@ -4,11 +4,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stickslip_sim_core import _sim_core
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
 
 # Bisections end at this relative width.
 BISECTION = 1e-12

@@ -9,17 +9,18 @@ from functools import partial
 
 import numpy as np
 
-from stickslip_sim_core import _sim_core, build_info, master_curves
+from stickslip_sim_core import _sim_core, build_info
+from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult, Setting
 from stickslip_sim_core.protocols.rod_chain import (
     Equilibrium,
-    Floats,
     Relax,
     check_elements,
     extrapolated,
     loss_of_stability,
     planar_frames,
 )
+from stickslip_sim_core.reference import master_curves
 
 POISSON = (0.0, 0.3, 0.5)
 

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stickslip_sim_core import build_info, master_curves
-from stickslip_sim_core.cloth import Cloth, plane
-from stickslip_sim_core.fabrics import isotropic
-from stickslip_sim_core.presets import Preset, preset_named
+from stickslip_sim_core import build_info
+from stickslip_sim_core.cloth.fabrics import isotropic
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import Cloth, plane
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)
 CELLS_ACROSS = 2
@@ -59,7 +60,7 @@ class Press:
 
 def run(
     *,
-    preset: str | Preset = "certified",
+    preset: str | SolverSettings = "certified",
     friction: Sequence[float] = FRICTION,
     cells: int = 50,
     structured: int = 2,
@@ -127,11 +128,11 @@ def run(
     )
 
 
-def press(strip: Strip, mu: float, preset: Preset, strain_end: float) -> Press:
+def press(strip: Strip, mu: float, preset: SolverSettings, strain_end: float) -> Press:
     """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`."""
     width = float(np.ptp(strip.across))
     buckling = 20.1907 * RIGIDITY * width / LENGTH**2  # N
-    sheet = Cloth(
+    cloth = Cloth(
         strip.mesh,
         isotropic(DENSITY, STRETCHING, RIGIDITY),
         preset,
@@ -142,21 +143,21 @@ def press(strip: Strip, mu: float, preset: Preset, strain_end: float) -> Press:
     # The wall is the floor, the clamp above it; the outward slope at the clamp points up.
     upright = np.stack([np.zeros_like(strip.along), strip.across, LENGTH - strip.along], axis=1)
     slopes = np.tile([0.0, 0.0, 1.0], (len(strip.clamped), 1))
-    sheet.set_state(upright, None, slopes)
+    cloth.set_state(upright, None, slopes)
     wall, clamp = [plane(mu)], upright[strip.held]
-    mass = float(sheet.masses.sum())
+    mass = float(cloth.masses.sum())
     dt = preset.time_step
     history: list[tuple[float, float, float]] = []
     slip = extended = np.nan
     for step in range(1, int(np.sqrt(strain_end) / (RATE * dt)) + 1):
         strain = (RATE * step * dt) ** 2
         load = min(STRETCHING * width * strain, buckling)
-        sheet.gravity[:] = [BIAS * load / mass * max(0.0, 1.0 - strain / BIAS_UNTIL), 0.0, 0.0]
-        sheet.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
-        force = sheet.reactions[strip.tip].sum(axis=0)
-        moved = abs(sheet.positions[strip.tip, 0].mean()) / LENGTH
+        cloth.gravity[:] = [BIAS * load / mass * max(0.0, 1.0 - strain / BIAS_UNTIL), 0.0, 0.0]
+        cloth.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
+        force = cloth.reactions[strip.tip].sum(axis=0)
+        moved = abs(cloth.positions[strip.tip, 0].mean()) / LENGTH
         history.append((strain, float(np.hypot(force[0], force[1]) / max(force[2], 1e-15)), float(moved)))
-        touching = np.flatnonzero(sheet.contacts >= 0)
+        touching = np.flatnonzero(cloth.contacts >= 0)
         if np.isnan(extended) and not np.isin(touching, strip.tip).all():
             extended = strain
         if not moved <= MOVED:
@@ -172,7 +173,7 @@ def press(strip: Strip, mu: float, preset: Preset, strain_end: float) -> Press:
     )
     some = np.flatnonzero(on_curve)[:: max(1, int(on_curve.sum()) // 20)]
     static = np.abs(ratio[some] / master_curves.stick_slip(strain_at[some]) - 1.0)
-    return Press(slip, extended, float(static.max()) if len(static) else np.nan, sheet.steps, sheet.unconverged_steps)
+    return Press(slip, extended, float(static.max()) if len(static) else np.nan, cloth.steps, cloth.unconverged_steps)
 
 
 def _phases(mu: float, one: Press, end: float) -> list[tuple[float, float, float]]:

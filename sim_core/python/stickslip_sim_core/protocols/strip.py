@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stickslip_sim_core import meshes
-from stickslip_sim_core.meshes import Diagonals, Mesh
-
-Floats = NDArray[np.float64]
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.meshes import Diagonals, Mesh
 
 LENGTH = 0.1
 """Of every strip [m]."""

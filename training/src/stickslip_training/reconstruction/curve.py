@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import BSpline
 
-Floats = npt.NDArray[np.float64]
+from stickslip_training.arrays import Floats
 
 DEGREE = 3
 

@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.view import View
-
-Floats = npt.NDArray[np.float64]
 
 ROOM = 1.05  # [L]: the rod cannot reach farther from its clamp
 CELL = 0.0025  # [L]: the cloud's spacing, about half a pixel of the views that the project renders

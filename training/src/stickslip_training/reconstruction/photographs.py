@@ -43,7 +43,7 @@ def reconstruct_folder(
 ) -> FolderReconstruction:
     """Reconstruct the rod in the photographs of a folder.
 
-    The calibration is laid out as stickslip_schemas/cameras.toml; `rig` says which of its rigs, if there are several.
+    The calibration is laid out as `rigs/rod-4.toml` of the schemas; `rig` says which of its rigs, if it has several.
     Lengths and positions are in its unit. Photographs must have been freed of lens distortion.
     """
     cameras = read_calibration(calibration, rig)

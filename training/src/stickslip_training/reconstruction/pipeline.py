@@ -20,14 +20,13 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
+from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction import curve
 from stickslip_training.reconstruction.hull import HullTooLargeError, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
 from stickslip_training.reconstruction.silhouette import NoRodError, silhouette_of_light, to_linear
 from stickslip_training.reconstruction.tracking import follow
 from stickslip_training.reconstruction.view import View, shrink_image
-
-Floats = npt.NDArray[np.float64]
 
 CONTROL_POINTS = 44
 STARTS = 4  # ways of the tracking that are refined

@@ -16,15 +16,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.curve import basis
 from stickslip_training.reconstruction.tube_image import Shading, TubeImage, tube_image
 from stickslip_training.reconstruction.view import View
-
-Floats = npt.NDArray[np.float64]
 
 PIXEL = 0.12  # of the brightness of the rod: what a pixel may be off
 ROBUST = 3.0  # in units of PIXEL: beyond it a pixel's pull falls again

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-Floats = npt.NDArray[np.float64]
+from stickslip_training.arrays import Floats
 
 GROUND_DEGREE = 2  # of the polynomial in (x, y) that an unevenly lit ground follows
 GROUND_SAMPLES = 20_000  # pixels that the polynomial is fitted to

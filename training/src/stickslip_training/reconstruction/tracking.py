@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.view import View
-
-Floats = npt.NDArray[np.float64]
 
 STEPS = 100
 BEAM = 200  # ways that are kept

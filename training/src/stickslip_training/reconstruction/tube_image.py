@@ -18,10 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from stickslip_training.arrays import Floats, Integers
 from stickslip_training.reconstruction.view import View
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 BAND = 2.5  # blurs beyond the edge of the rod that are looked at
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
-Floats = npt.NDArray[np.float64]
+from stickslip_training.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-from importlib.resources import files
-from importlib.resources.abc import Traversable
+from importlib import metadata
 
 from stickslip_schemas.keys import content_key
+from stickslip_schemas.sources import digests, sources
 
 from stickslip_blender.blender import import_bpy
+
+CUT = ("stickslip_schemas.kinds",)
+"""The list of kinds decides on nothing by itself; the documents it leads to are in the content keys as a whole."""
+
+_LIBRARIES = ("numcodecs", "google-crc32c", "numpy")
 
 
 def blender_version() -> dict[str, str]:
@@ -17,19 +21,17 @@ def blender_version() -> dict[str, str]:
     return {"bpy": app.version_string, "blender_build": app.build_hash.decode()}
 
 
-def build_digest() -> str:
-    """Return the SHA-256 over this package's sources and Blender's version; no path, time or machine is in it."""
-    sources = {
-        name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in _sources(files("stickslip_blender"), "")
+def roots(kind: str) -> tuple[str, ...]:
+    """Return the modules that render a kind."""
+    return ("stickslip_blender.actor", f"stickslip_blender.scenes.{kind}")
+
+
+def build_digest(kind: str) -> str:
+    """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
+    content = {
+        "kind": kind,
+        "sources": digests(sources(roots(kind), cut=CUT)),
+        "libraries": {library: metadata.version(library) for library in _LIBRARIES},
+        **blender_version(),
     }
-    return content_key("build/blender", {"sources": sources, **blender_version()})
-
-
-def _sources(folder: Traversable, prefix: str) -> list[tuple[str, Traversable]]:
-    found: list[tuple[str, Traversable]] = []
-    for item in folder.iterdir():
-        if item.is_dir():
-            found += _sources(item, f"{prefix}{item.name}/")
-        elif item.name.endswith(".py"):
-            found.append((prefix + item.name, item))
-    return found
+    return content_key("build/render", content)

@@ -1,12 +1,13 @@
-"""The drop-and-drag scene: a square of cloth between two holders over a dark floor, under one lamp, before black.
+"""The stage of all scenes of cloth: a square of cloth over a dark floor, under one lamp, before black.
 
 The cloth is the solver's, refined so that no facet shows; the rest is dressing. The lamp and the gloss of the floor are
-drawn from a seed, within the bounds that `Light` states.
+drawn from a seed, within the bounds that `Light` states. What else stands on the stage is the scene's: see
+`stickslip_blender.scenes`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +16,8 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
-from stickslip_schemas.jobs import Quality, Texture
+from stickslip_schemas.jobs import Quality
+from stickslip_schemas.textures import Texture
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.engine import CLOTH_SAMPLING, Sampling, new_scene, set_sampling
@@ -33,8 +35,6 @@ _LAMP_DISTANCE = 1.2  # [m]
 _LAMP_SIZE = 0.5  # [m], diameter
 _LAMP_POWER = 24.0  # [W]
 _AMBIENT = 0.012  # radiance of the black curtains around the stage; cameras see none of it
-_HOLDER = (0.004, 0.01, 0.01)  # [m], in the plane of the cloth as in the simulation
-_ROD = (0.003, 0.003, 0.5)  # [m]
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,6 @@ class ClothRenderer:
         """Build the stage for a mesh of triangles (T, 3) with the rest shape (V, 2) [m], held edge last."""
         flat = np.asarray(rest, dtype=np.float64)
         self._vertices = len(flat)
-        low, high = flat.min(axis=0), flat.max(axis=0)
-        corners = np.array([(low[0], high[1]), (high[0], high[1])])
-        self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
-        inward = np.sign((low + high) / 2 - corners) * _HOLDER[1] / 2
-        self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
         self._levels, faces, uv = _refined(np.asarray(triangles), flat)
         self._scene = new_scene()
         set_sampling(self._scene, quality if isinstance(quality, Sampling) else CLOTH_SAMPLING[quality])
@@ -99,10 +94,18 @@ class ClothRenderer:
         self._floor = _add_floor(self._scene)
         self._mesh = _add_cloth(self._scene, faces, uv)
         self._picture = _add_fabric(self._mesh)
-        self._holders = [_add_holder(self._scene) for _ in self._held]
+        self.add_props(self._scene, flat)
         self._images: dict[Texture, Any] = {}
         new_view(self._scene)
         self._reader = FrameReader(self._scene, scratch)
+
+    def add_props(self, scene: Any, rest: npt.NDArray[np.float64]) -> None:
+        """Put what else stands on the stage into the scene, for a cloth of the rest shape (V, 2) [m]."""
+        raise NotImplementedError
+
+    def place_props(self, instant: int, vertices: npt.NDArray[np.float64]) -> None:
+        """Move the props to where they are at an instant of the motion, with the cloth at vertices (V, 3) [m]."""
+        raise NotImplementedError
 
     def __enter__(self) -> Self:
         return self
@@ -117,9 +120,18 @@ class ClothRenderer:
         self._reader.close()
 
     def render(
-        self, positions: npt.ArrayLike, camera: Camera, *, texture: Texture, light: Light
+        self,
+        positions: npt.ArrayLike,
+        camera: Camera,
+        *,
+        texture: Texture,
+        light: Light,
+        instants: Sequence[int] | None = None,
     ) -> npt.NDArray[np.uint8]:
-        """Render positions (frames, V, 3) [m] in turn: 8-bit sRGB, shape (frames, height, width, 3)."""
+        """Render positions (frames, V, 3) [m] in turn: 8-bit sRGB, shape (frames, height, width, 3).
+
+        `instants` says at which instants of the motion the frames are, for props that move; by default 0, 1, ...
+        """
         track = np.asarray(positions, dtype=np.float64)
         if track.ndim != 3 or track.shape[1:] != (self._vertices, 3) or not np.isfinite(track).all():
             raise ValueError(
@@ -128,12 +140,11 @@ class ClothRenderer:
         set_view(self._scene, camera)
         self._set_light(light)
         self._picture.image = self._image(texture)
-        return np.stack(list(self._frames(track)))
+        return np.stack(list(self._frames(track, range(len(track)) if instants is None else instants)))
 
-    def _frames(self, track: npt.NDArray[np.float64]) -> Iterator[npt.NDArray[np.uint8]]:
-        for vertices in track:
-            for holder, middle in zip(self._holders, vertices[self._held] + self._grips, strict=True):
-                holder.location = middle
+    def _frames(self, track: npt.NDArray[np.float64], instants: Sequence[int]) -> Iterator[npt.NDArray[np.uint8]]:
+        for instant, vertices in zip(instants, track, strict=True):
+            self.place_props(instant, vertices)
             fine = vertices
             for level in self._levels:
                 fine = level(fine)
@@ -205,7 +216,8 @@ def _add_lamp(scene: Any) -> Any:
     return lamp
 
 
-def _add_object(scene: Any, name: str, vertices: npt.ArrayLike, faces: list[tuple[int, ...]], material: Any) -> Any:
+def add_object(scene: Any, name: str, vertices: npt.ArrayLike, faces: list[tuple[int, ...]], material: Any) -> Any:
+    """Add a mesh to the scene and return its object."""
     bpy = import_bpy()
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(np.asarray(vertices).tolist(), [], faces)
@@ -215,7 +227,8 @@ def _add_object(scene: Any, name: str, vertices: npt.ArrayLike, faces: list[tupl
     return made
 
 
-def _new_material(name: str, **inputs: Any) -> Any:
+def new_material(name: str, **inputs: Any) -> Any:
+    """Return a material whose shader has the given inputs."""
     material = import_bpy().data.materials.new(name)
     shader = material.node_tree.nodes["Principled BSDF"]
     for words, value in inputs.items():
@@ -225,10 +238,10 @@ def _new_material(name: str, **inputs: Any) -> Any:
 
 def _add_floor(scene: Any) -> Any:
     """Return the floor's shader, whose color and roughness are to be set."""
-    material = _new_material("floor", Base_Color=(0.04, 0.04, 0.04, 1.0), Roughness=0.4, Specular_IOR_Level=0.35)
+    material = new_material("floor", Base_Color=(0.04, 0.04, 0.04, 1.0), Roughness=0.4, Specular_IOR_Level=0.35)
     half, z = 6.0, -_HALF_THICKNESS
     corners = [(-half, -half, z), (half, -half, z), (half, half, z), (-half, half, z)]
-    _add_object(scene, "floor", corners, [(0, 1, 2, 3)], material)
+    add_object(scene, "floor", corners, [(0, 1, 2, 3)], material)
     return material.node_tree.nodes["Principled BSDF"]
 
 
@@ -245,7 +258,7 @@ def _add_cloth(scene: Any, faces: npt.NDArray[np.integer[Any]], uv: npt.NDArray[
 
 def _add_fabric(mesh: Any) -> Any:
     """Give the cloth a matt, slightly fuzzy look; return the node whose image is to be set."""
-    material = _new_material("fabric", Roughness=0.85, Specular_IOR_Level=0.2, Sheen_Weight=0.15, Sheen_Roughness=0.5)
+    material = new_material("fabric", Roughness=0.85, Specular_IOR_Level=0.2, Sheen_Weight=0.15, Sheen_Roughness=0.5)
     tree = material.node_tree
     picture = tree.nodes.new("ShaderNodeTexImage")
     picture.extension = "EXTEND"
@@ -254,21 +267,10 @@ def _add_fabric(mesh: Any) -> Any:
     return picture
 
 
-def _add_holder(scene: Any) -> Any:
-    """Add a clip of one centimetre and the rod it hangs on; it holds a square at a corner of the cloth."""
-    bpy = import_bpy()
-    metal = bpy.data.materials.get("metal") or _new_material(
-        "metal", Base_Color=(0.05, 0.05, 0.052, 1.0), Roughness=0.45, Metallic=0.0
-    )
-    boxes = [_box(_HOLDER, (0.0, 0.0, 0.0)), _box(_ROD, (0.0, 0.0, _ROD[2] / 2))]
-    vertices = np.concatenate([corners for corners, _ in boxes])
-    faces = [tuple(8 * number + index for index in face) for number, (_, box) in enumerate(boxes) for face in box]
-    return _add_object(scene, "holder", vertices, faces, metal)
-
-
-def _box(
+def box(
     size: tuple[float, float, float], center: tuple[float, float, float]
 ) -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:
+    """Return the corners (8, 3) and faces of a box."""
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces: list[tuple[int, ...]] = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return np.asarray(center) + 0.5 * np.asarray(size) * signs, faces

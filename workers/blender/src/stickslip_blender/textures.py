@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.jobs import Texture
+from stickslip_schemas.textures import Texture
 
 SIZE = 512
 """Side of a texture [texels]: 0.4 mm on the cloth, a seventh of a pixel."""

@@ -7,6 +7,7 @@ from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import Task, TaskResult
 
 from stickslip_workers import builds
+from stickslip_workers.kinds import kind_names
 from stickslip_workers.stages.run import AnyTask, run_tasks
 
 _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
@@ -22,7 +23,7 @@ class StageActor:
     def describe(self) -> dict[str, Any]:
         """Return the builds of what runs here, and versions for people."""
         return {
-            "builds": {"sim_core": builds.sim_core_build(), "packer": builds.packer_build()},
+            "builds": {name: builds.kind_builds(name) for name in kind_names()},
             "versions": builds.versions(),
         }
 

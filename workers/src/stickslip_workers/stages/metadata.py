@@ -3,14 +3,13 @@
 import warnings
 
 import numpy as np
+from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.chunks import BLOSC_LEVEL, ZSTD_LEVEL
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
-from stickslip_schemas.layout import FORMAT, ArrayLayout, describe, layout
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.layout import layout
 
 
-def metadata_files(
-    spec: RodHangSpec | ClothDragSpec, *, dataset: str, version: int, sample_count: int
-) -> dict[str, bytes]:
+def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: int) -> dict[str, bytes]:
     """Return the metadata files of a dataset by path: the group, consolidated, and every array."""
     import zarr
     from zarr.storage import MemoryStore

@@ -1,14 +1,21 @@
 """Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
+from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.chunks import check_chunk, encode_chunk, encode_shard, encode_trajectory
-from stickslip_schemas.layout import ArrayLayout, layout
+from stickslip_schemas.layout import layout
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry, PackOutput, PackSlot, PackTask, RecordRef
+from stickslip_schemas.tasks import FileEntry, PackOutput, PackSlot, PackTask, RecordRef, TaskResult
 
-from stickslip_workers.stages.kinds import KINDS
 from stickslip_workers.stages.records import Array, Records
+
+
+def run(tasks: Sequence[PackTask], store: Store) -> list[TaskResult]:
+    """Run pack tasks, one after the other."""
+    return [TaskResult(outcome="succeeded", output=pack(task, store)) for task in tasks]
 
 
 def pack(task: PackTask, store: Store) -> PackOutput:
@@ -42,7 +49,6 @@ class _Shard:
     def __init__(self, task: PackTask, store: Store) -> None:
         self._store = store
         self._records = Records(store)
-        self._record_arrays = KINDS[task.spec.kind].record_arrays
         self._arrays = layout(task.spec)
         size = task.spec.samples_per_shard
         # A sample that is not there has no chunk; in a column, it keeps the fill value, for a chunk is always whole.
@@ -58,18 +64,24 @@ class _Shard:
 
     def fill(self, row: int, slot: PackSlot) -> None:
         """Put a sample in its place."""
+        self._check_labels(slot)
         for array in self._arrays:
-            recorded = array.name in self._record_arrays
-            if not array.per_sample and not recorded:
+            if not array.per_sample and not array.is_recorded:
                 self._columns[array.name][row] = _label(array, slot)
             elif not slot.valid:
                 continue
             elif not array.per_sample:
                 self._columns[array.name][row] = self._recorded(array, _record(slot))
-            elif recorded:
+            elif array.is_recorded:
                 self._chunks[array.name][row] = self._trajectory(array, _record(slot))
             else:
                 self._chunks[array.name][row] = self._rendered(array, slot)
+
+    def _check_labels(self, slot: PackSlot) -> None:
+        """Refuse a label that no array takes: it would be lost without a word."""
+        columns = {array.name for array in self._arrays if not array.per_sample and not array.is_recorded}
+        if unknown := set(slot.labels) - columns:
+            raise ValueError(f"labels of slot {slot.slot} must have an array each; there is none for {sorted(unknown)}")
 
     def encode(self, array: ArrayLayout) -> bytes:
         """Return the file of an array."""

@@ -1,17 +1,22 @@
 """Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
 
+from collections.abc import Sequence
+
 import numpy as np
-from stickslip_schemas.cameras import Camera, load_rig
 from stickslip_schemas.chunks import decode_chunk
-from stickslip_schemas.jobs import ClothDragSpec, RodHangSpec
 from stickslip_schemas.keys import canonical_json
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
-from stickslip_schemas.samples import CLOTH_RIG, SPLITS, dataset_id
+from stickslip_schemas.samples import SPLITS, dataset_id
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask
+from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskResult
 
 from stickslip_workers.stages.metadata import metadata_files
+
+
+def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:
+    """Run publish tasks, one after the other."""
+    return [TaskResult(outcome="succeeded", output=publish(task, store)) for task in tasks]
 
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:
@@ -28,7 +33,7 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         spec_digest=task.spec.content_digest,
         builds=task.builds,
         certificate=task.certificate,
-        cameras=_cameras(task.spec),
+        cameras=task.spec.cameras(),
         sample_count=len(task.sample_keys),
         valid_count=len(task.sample_keys) - len(task.rejections),
         split_counts=_split_counts(task, store),
@@ -59,12 +64,6 @@ def _check_complete(task: PublishTask, store: Store) -> None:
         size = store.path(file.sha256).stat().st_size
         if size != file.size:
             raise OSError(f"artifact {file.sha256} of {file.path} must have {file.size} bytes; it has {size}")
-
-
-def _cameras(spec: RodHangSpec | ClothDragSpec) -> tuple[Camera, ...]:
-    if isinstance(spec, ClothDragSpec):
-        return load_rig(CLOTH_RIG)
-    return () if spec.views is None else load_rig(spec.views)
 
 
 def _split_counts(task: PublishTask, store: Store) -> dict[str, int]:

@@ -2,14 +2,12 @@
 
 import time
 from collections.abc import Sequence
+from importlib import import_module
 
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult
 
 from stickslip_workers.failures import failure
-from stickslip_workers.stages.kinds import KINDS
-from stickslip_workers.stages.pack import pack
-from stickslip_workers.stages.publish import publish
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
@@ -32,15 +30,7 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    simulations = [task.simulation for task in tasks if isinstance(task, SimulateTask)]
-    kinds = {simulation.kind for simulation in simulations}
-    if len(simulations) == len(tasks) and len(kinds) == 1:
-        return KINDS[kinds.pop()].simulate(simulations, store)
-    if len(tasks) == 1:
-        (task,) = tasks
-        if isinstance(task, PackTask):
-            return [TaskResult(outcome="succeeded", output=pack(task, store))]
-        if isinstance(task, PublishTask):
-            return [TaskResult(outcome="succeeded", output=publish(task, store))]
-    stages = sorted({str(task.stage) for task in tasks})
-    raise ValueError(f"tasks must be simulations of one kind, or one pack or publish; got {len(tasks)} of {stages}")
+    """Hand the tasks to the module of their stage, which is imported only now: a packer needs no simulator."""
+    (stage,) = {task.stage for task in tasks}
+    results: list[TaskResult] = import_module(f"stickslip_workers.stages.{stage}").run(tasks, store)
+    return results

@@ -1,0 +1,71 @@
+"""What an array of a dataset is. The first dimension of every array is `sample`.
+
+Labels and curves are one chunk per shard group; pictures, clips and meshes are one chunk per sample, and the chunks of
+a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for those of trajectories:
+`transpose(sample axes reversed) -> bytes(little) -> blosc(zstd 5, shuffle) -> crc32c`.
+"""
+
+from dataclasses import dataclass, field, fields
+from math import prod
+from typing import Any
+
+import numpy as np
+
+FORMAT = "stickslip-dataset/1"
+
+SAMPLE_KEY_BYTES = 32
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayLayout:
+    """One array: `shape` and `dimensions` are those of a single sample."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    dimensions: tuple[str, ...]
+    description: str
+    fill: float | int | bool = 0
+    per_sample: bool = False
+    """True where a chunk is one sample and the chunks of a shard group lie in one shard."""
+    is_recorded: bool = False
+    """True where the values come from the record of the simulation, not from a label or from the renderer."""
+    categories: tuple[str, ...] = ()
+    """Names of the codes 0, 1, ... of a categorical label."""
+    is_trajectory: bool = False
+    """True where the first dimension of a sample is time and the values change slowly: coded by `encode_trajectory`."""
+    attributes: dict[str, Any] = field(default_factory=dict, hash=False)
+    """What else the Zarr array says of itself."""
+
+    @property
+    def sample_bytes(self) -> int:
+        """Decoded size of one sample [bytes]."""
+        return prod(self.shape) * np.dtype(self.dtype).itemsize
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What decides on the bytes of the array, as JSON: everything but the description."""
+        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "description"}
+        return own | {"fill": repr(self.fill)}  # NaN has no JSON form
+
+    def shard_path(self, shard: int) -> str:
+        """Path, inside the dataset, of the file that holds shard group `shard` [Zarr v3 default chunk keys]."""
+        return "/".join([self.name, "c", str(shard), *("0" for _ in self.shape)])
+
+
+COMMON_ARRAYS = (
+    ArrayLayout("split", "uint8", (), (), "0 train, 1 validation, 2 test", categories=("train", "validation", "test")),
+    ArrayLayout("valid", "bool", (), (), "false where the sample was rejected; the manifest says why", fill=False),
+    ArrayLayout("sample_key", "uint8", (SAMPLE_KEY_BYTES,), ("byte",), "content key (SHA-256) of the sample"),
+)
+"""The arrays of every dataset."""
+
+
+def describe(array: ArrayLayout) -> dict[str, Any]:
+    """Return the attributes that the Zarr array carries."""
+    attributes: dict[str, Any] = {"description": array.description, **array.attributes}
+    if array.categories:
+        attributes["categories"] = list(array.categories)
+    return attributes

@@ -1,0 +1,316 @@
+"""What the kinds of cloth have in common: materials, presets, clips, and the arrays of a trajectory."""
+
+from enum import StrEnum
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from stickslip_schemas.arrays import NAN, ArrayLayout
+from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.base import Document
+from stickslip_schemas.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.fabrics import MATERIAL_NAME, FabricNumbers, Material
+from stickslip_schemas.hints import did_you_mean
+from stickslip_schemas.jobs import JobSpec, Quality, Render, Simulation
+from stickslip_schemas.textures import Texture
+
+Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
+Factor = Annotated[
+    float, quantity("Factor"), Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric")
+]
+MaterialName = Annotated[str, quantity("Material"), Field(pattern=MATERIAL_NAME)]
+
+_TAGGED = Field(discriminator="type")
+MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], _TAGGED, SHORTHAND]
+FactorAxis = Annotated[
+    ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor], _TAGGED, SHORTHAND
+]
+MaterialAxis = Annotated[ListAxis[MaterialName], SHORTHAND]
+TextureAxis = Annotated[ListAxis[Texture], SHORTHAND]
+
+
+class PresetName(StrEnum):
+    """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
+
+    certified = "certified"
+    fast = "fast"
+    thesis_high = "thesis-high"
+    thesis_low_small_dt = "thesis-low-small-dt"
+    thesis_low_big_dt = "thesis-low-big-dt"
+
+
+class ClothAxes(Document):
+    """What the material of a cloth and its friction may be."""
+
+    material: MaterialAxis
+    mu: MuAxis
+    density: FactorAxis | None = Field(default=None, description="factors of the fabric's mass per area")
+    bending: FactorAxis | None = Field(default=None, description="factors of the fabric's rigidity against bending")
+    stretching: FactorAxis | None = Field(default=None, description="factors of the fabric's stiffness in its plane")
+
+
+PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
+"""The axes that a trajectory of dragged cloth depends on."""
+
+
+class ClothSimulation(Simulation):
+    """A cloth trajectory: all that it depends on besides the build."""
+
+    material: str
+    fabric: FabricNumbers | None = Field(
+        description="the numbers of a material of the user's own; null: a measured one"
+    )
+    density: float = 1.0
+    bending: float = 1.0
+    stretching: float = 1.0
+    mu: float
+    preset: PresetName
+    mesh: int
+    frames: int
+    seed: Seed
+
+
+class ClothRender(Render):
+    """How a cloth is seen: all that its clip depends on besides its trajectory and the build."""
+
+    texture: Texture
+    viewpoint: str
+    instants: tuple[int, ...] = Field(description="which instants of the trajectory the frames of the clip show")
+    light_seed: Seed
+
+
+class ClothSpec(JobSpec):
+    """What the specs of all kinds of cloth have in common."""
+
+    instants: ClassVar[int]
+    """How many instants of the motion a trajectory holds."""
+    instants_per_second: ClassVar[float]
+    rig: ClassVar[str]
+    """The cameras; their names are those of the viewpoints."""
+
+    materials: dict[Annotated[str, Field(pattern=MATERIAL_NAME)], FabricNumbers] = Field(
+        default_factory=dict, description="fabrics of your own, by the names that the axis `material` uses"
+    )
+    preset: PresetName = PresetName.certified
+    allow_uncertified: bool = Field(
+        default=False,
+        description="make the dataset even where no passing certificate vouches for the preset with the workers' build",
+    )
+    mesh: int = Field(default=41, ge=5, le=161, description="vertices along a side of the square mesh")
+    frames: int = Field(default=30, ge=1, description="frames of a clip, evenly spread over the instants of the motion")
+    store_positions: bool = Field(
+        default=True, description="keep the positions of all vertices at all instants, beside the clips"
+    )
+    quality: Quality = Quality.standard
+
+    @property
+    def certified_preset(self) -> str:
+        """Name of the preset whose certificate vouches for the samples."""
+        return self.preset.value
+
+    @property
+    def needs_certificate(self) -> bool:
+        """True unless the spec allows for the lack of one."""
+        return not self.allow_uncertified
+
+    def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
+        """Return the fields that a value of an axis sets: a material of the user's own brings its numbers along."""
+        if axis != "material":
+            return {axis: value}
+        own = self.materials.get(value)
+        return {"material": value, "fabric": None if own is None else own.model_dump(mode="json")}
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        return {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
+
+    def render_settings(self) -> dict[str, Any] | None:
+        """Return the fields of the render document that are the same for all samples."""
+        return {
+            "rig": self.rig,
+            "rig_digest": rig_digest(self.rig),
+            "quality": self.quality,
+            "instants": self.shown_instants,
+        }
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras of the viewpoints, by name."""
+        return load_rig(self.rig)
+
+    @property
+    def shown_instants(self) -> tuple[int, ...]:
+        """Which instants of the trajectory the frames of a clip show."""
+        return shown_frames(self.frames, self.instants)
+
+    @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of the codes of the label `material`: the measured ones, then the user's own."""
+        return (*Material, *self.materials)
+
+    @model_validator(mode="after")
+    def _known_materials(self) -> Self:
+        for name in self.materials:
+            if name in list(Material):
+                raise ValueError(f"materials must not redefine a measured fabric, and {name!r} is one")
+        named = self.axes.material.values  # type: ignore[attr-defined]  # every kind of cloth has the axis
+        unknown = [
+            InitErrorDetails(
+                type=PydanticCustomError(
+                    "unknown_material",
+                    "Input should be one of {known}{hint}",
+                    {"known": ", ".join(self.material_names), "hint": did_you_mean(name, self.material_names)},
+                ),
+                loc=("axes", "material", "list", "values", position),
+                input=name,
+            )
+            for position, name in enumerate(named)
+            if name not in self.material_names
+        ]
+        if unknown:
+            raise ValidationError.from_exception_data(type(self).__name__, unknown)
+        return self
+
+    @model_validator(mode="after")
+    def _frames_there_are(self) -> Self:
+        if self.frames > self.instants:
+            raise ValueError(f"frames must be at most {self.instants}, the instants of the motion; got {self.frames}")
+        return self
+
+    # --- arrays ---------------------------------------------------------------------------------------------------
+
+    def clip_arrays(self, viewpoints: tuple[str, ...]) -> tuple[ArrayLayout, ...]:
+        """Return the clip and the labels of what it shows."""
+        return (
+            ArrayLayout(
+                "video",
+                "uint8",
+                (self.frames, 224, 224, 3),
+                ("frame", "y", "x", "rgb"),
+                "sRGB clip",
+                per_sample=True,
+                attributes={"instants": list(self.shown_instants)},
+            ),
+            _codes("texture", tuple(Texture)),
+            _codes("viewpoint", viewpoints),
+            ArrayLayout("light_seed", "int32", (), (), "seed of the light", fill=-1),
+            ArrayLayout(
+                "light",
+                "float32",
+                (5,),
+                ("light",),
+                "azimuth and elevation of the lamp [degree], its power over the nominal, albedo and roughness of the "
+                "floor",
+                fill=NAN,
+            ),
+        )
+
+    def physical_arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the labels of what the cloth is made of, and its friction."""
+        factors = {
+            "density": "factor of the fabric's mass per area",
+            "bending": "factor of the fabric's rigidity against bending",
+            "stretching": "factor of the fabric's stiffness in its plane",
+        }
+        return (
+            _codes("material", self.material_names),
+            ArrayLayout("mu", "float64", (), (), "friction coefficient", fill=NAN),
+            *(
+                ArrayLayout(name, "float64", (), (), text, fill=NAN)
+                for name, text in factors.items()
+                if name in self.named_axes
+            ),
+            ArrayLayout("areal_density", "float64", (), (), "mass per area [kg/m^2]", fill=NAN),
+            ArrayLayout(
+                "bending_rigidity",
+                "float64",
+                (3,),
+                ("direction",),
+                "plate rigidities along the warp, along the weft, and of twist [N m]",
+                fill=NAN,
+            ),
+            ArrayLayout(
+                "stretching_stiffness",
+                "float64",
+                (4,),
+                ("coefficient",),
+                "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]",
+                fill=NAN,
+            ),
+        )
+
+    def solver_arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return what the solver says of its work."""
+        return (
+            ArrayLayout("steps", "int32", (), (), "time steps of the solver", fill=-1),
+            ArrayLayout("unconverged_steps", "int32", (), (), "steps that stopped short of the tolerance", fill=-1),
+            ArrayLayout(
+                "worst_residual",
+                "float64",
+                (),
+                (),
+                "largest residual force of a node in any step, over the weight of a node",
+                fill=NAN,
+            ),
+            self.over_time("self_intersections", "int16", (), (), "pairs of triangles that cross", fill=-1),
+        )
+
+    def mesh_arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the mesh and its motion; nothing where the spec does not keep it.
+
+        Rest shape and triangles are the same for all samples of a dataset, and every sample has them all the same: a
+        repeated row costs some bytes, an array without the dimension `sample` would be an exception in every reader.
+        """
+        if not self.store_positions:
+            return ()
+        vertices, triangles = self.mesh**2, 2 * (self.mesh - 1) ** 2
+        return (
+            self.over_time(
+                "positions",
+                "float32",
+                (vertices, 3),
+                ("vertex", "xyz"),
+                "positions of the vertices [m]; the floor is z = 0",
+                fill=NAN,
+                per_sample=True,
+                is_trajectory=True,
+            ),
+            ArrayLayout(
+                "rest",
+                "float32",
+                (vertices, 2),
+                ("vertex", "uv"),
+                "the flat cloth (warp, weft) [m]",
+                fill=NAN,
+                is_recorded=True,
+            ),
+            ArrayLayout(
+                "triangles",
+                "int32",
+                (triangles, 3),
+                ("triangle", "corner"),
+                "vertices of the triangles",
+                fill=-1,
+                is_recorded=True,
+            ),
+        )
+
+    def over_time(
+        self, name: str, dtype: str, shape: tuple[int, ...], dimensions: tuple[str, ...], description: str, **more: Any
+    ) -> ArrayLayout:
+        """Return an array of the record that has a value of `shape` at each instant."""
+        return ArrayLayout(
+            name,
+            dtype,
+            (self.instants, *shape),
+            ("instant", *dimensions),
+            description,
+            is_recorded=True,
+            attributes={"instants_per_second": self.instants_per_second},
+            **more,
+        )
+
+
+def _codes(name: str, names: tuple[str, ...]) -> ArrayLayout:
+    return ArrayLayout(name, "int16", (), (), f"code of the {name}", fill=-1, categories=tuple(map(str, names)))

@@ -1,0 +1,40 @@
+"""The kinds of dataset. A kind is one module here; this one only lists them.
+
+To add a kind, import its module and add its classes to the table and to the three unions.
+"""
+
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter
+
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulation, ClothDragSpec
+from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation, RodHangSpec
+
+KINDS: dict[str, type[JobSpec]] = {"rod_hang": RodHangSpec, "cloth_drag": ClothDragSpec}
+"""The class of the specs of each kind, by name."""
+
+AnyJobSpec = Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
+AnySimulation = Annotated[RodHangSimulation | ClothDragSimulation, Field(discriminator="kind")]
+AnyRender = Annotated[RodHangRender | ClothDragRender, Field(discriminator="kind")]
+
+job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
+"""Validates and dumps the spec of any kind."""
+
+
+class UnknownKindError(ValueError):
+    """A kind, or a class of one, that is not in the table."""
+
+
+def registered(spec: JobSpec) -> JobSpec:
+    """Return a spec as it is if its class is that of its kind; raise UnknownKindError."""
+    if KINDS.get(spec.kind) is not type(spec):
+        raise UnknownKindError(f"kind must be one of {', '.join(KINDS)}; got {spec.kind!r} of {type(spec).__name__}")
+    return spec
+
+
+def kind_named(name: str) -> type[JobSpec]:
+    """Return the class of the specs of a kind; raise UnknownKindError."""
+    if name not in KINDS:
+        raise UnknownKindError(f"kind must be one of {', '.join(KINDS)}; got {name!r}")
+    return KINDS[name]

@@ -1,0 +1,138 @@
+"""Rods that hang from a clamp under their own weight, seen by four cameras."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from stickslip_schemas.arrays import NAN, ArrayLayout
+from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.base import Document
+from stickslip_schemas.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.jobs import JobSpec, Quality, Render, SeedRule, Simulation
+
+ROD_PRESET = "rods"
+"""Stands for the rod solver, which has no presets to choose from."""
+
+Gamma = Annotated[
+    float, quantity("Gamma"), Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness")
+]
+Phi = Annotated[
+    float, quantity("Phi"), Field(strict=True, ge=-40, le=40, description="natural curvature times L [rad]")
+]
+
+_TAGGED = Field(discriminator="type")
+GammaAxis = Annotated[ListAxis[Gamma] | LinspaceAxis[Gamma] | RandomAxis[Gamma] | SobolAxis[Gamma], _TAGGED, SHORTHAND]
+PhiAxis = Annotated[ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolAxis[Phi], _TAGGED, SHORTHAND]
+
+
+class RodHangAxes(Document):
+    """Non-dimensional parameters of a suspended rod [Bertails-Descoubes et al. 2018]."""
+
+    gamma: GammaAxis
+    phi0: PhiAxis
+    phi1: PhiAxis
+
+
+class RodHangSimulation(Simulation):
+    """A rod at rest: all that its shape depends on besides the build."""
+
+    kind: Literal["rod_hang"] = "rod_hang"
+    gamma: float
+    phi0: float
+    phi1: float
+    poisson: float
+    elements: int = 128
+    points: int = 150
+
+
+class RodHangRender(Render):
+    """How a rod is seen: all that its views depend on besides its shape and the build."""
+
+    kind: Literal["rod_hang"] = "rod_hang"
+    color_seed: Seed
+    radius: float = Field(default=0.008, gt=0, lt=0.1, description="radius over length")
+
+
+class RodHangSpec(JobSpec):
+    """Rods that hang from a clamp under their own weight, seen by four cameras."""
+
+    simulation_type = RodHangSimulation
+    render_type = RodHangRender
+    render_seeds = (SeedRule("color_seed", "color", None),)
+
+    kind: Literal["rod_hang"]
+    axes: RodHangAxes
+    poisson: float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio; GJ/EI = 1/(1+nu)")
+    views: Literal["rod-4"] | None = Field(default="rod-4", description="camera rig; null renders nothing")
+    quality: Quality = Quality.standard
+
+    @property
+    def certified_preset(self) -> str:
+        """The rod solver has one set of numbers."""
+        return ROD_PRESET
+
+    @property
+    def needs_certificate(self) -> bool:
+        """Rods are made without a certificate, too: every shape is checked against its own equations."""
+        return False
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        return {"poisson": self.poisson}
+
+    def render_settings(self) -> dict[str, Any] | None:
+        """Return the fields of the render document that are the same for all samples; None renders nothing."""
+        if self.views is None:
+            return None
+        return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras of the array `views`, in its order."""
+        return () if self.views is None else load_rig(self.views)
+
+    def arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the arrays of a dataset of rods."""
+        return (*_curves(), *(() if self.views is None else _views(len(self.cameras()))), *_labels())
+
+
+def _curves() -> tuple[ArrayLayout, ...]:
+    points = RodHangSimulation.model_fields["points"].default
+    curves = (
+        ("centerline", (points, 3), ("point", "xyz"), "positions over L at uniform arc length, clamp first"),
+        ("curvature", (points, 3), ("point", "strain"), "(twist, bend1, bend2) times L"),
+        ("frame", (points, 3, 3), ("point", "xyz", "director"), "columns d1 (tangent), d2, d3"),
+    )
+    return tuple(
+        ArrayLayout(name, "float32", shape, names, text, fill=NAN, is_recorded=True)
+        for name, shape, names, text in curves
+    )
+
+
+def _views(count: int) -> tuple[ArrayLayout, ...]:
+    shape, dimensions = (count, 224, 224, 3), ("view", "y", "x", "rgb")
+    return (
+        ArrayLayout("views", "uint8", shape, dimensions, "sRGB pictures", per_sample=True),
+        ArrayLayout("color", "float32", (3,), ("rgb",), "colour of the rod, linear RGB, 0 to 1", fill=NAN),
+    )
+
+
+def _labels() -> tuple[ArrayLayout, ...]:
+    labels = (
+        ("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
+        ("phi0", "natural twist times L [rad]"),
+        ("phi1", "natural curvature times L [rad]"),
+        ("energy", "elastic and gravity energy over EI/L"),
+    )
+    distances = (
+        (
+            "self_contact_distance",
+            "least distance over L at which the centreline passes another part of itself; infinite where it does not",
+        ),
+        ("reach", "largest distance over L from the vertical of the clamp"),
+    )
+    other = "another stable shape of the same rod was found"
+    return (
+        *(ArrayLayout(name, "float64", (), (), text, fill=NAN) for name, text in labels),
+        ArrayLayout("multistable", "bool", (), (), other, fill=False, is_recorded=True),
+        *(ArrayLayout(name, "float64", (), (), text, fill=NAN, is_recorded=True) for name, text in distances),
+    )

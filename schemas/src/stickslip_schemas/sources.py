@@ -1,0 +1,133 @@
+"""Which files of ours a piece of work is made with: the modules that it imports, found by reading their sources.
+
+A digest over these files is what enters a content key. So a change of a file that a result depends on changes its key,
+and a change of any other file does not. Four rules say what is followed:
+
+- An import counts wherever it stands, also inside a function; `if TYPE_CHECKING:` does not count.
+- A name that a package's `__init__` only passes on leads to the module that defines it.
+- A module also counts the data files beside it that it names in a string.
+- A module that is cut is neither counted nor followed. The caller says why.
+"""
+
+import ast
+from collections.abc import Collection, Iterable, Iterator
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+from stickslip_schemas.keys import sha256
+
+OURS = "stickslip_"
+"""How the names of our packages begin."""
+
+
+def sources(roots: Iterable[str], *, cut: Collection[str] = ()) -> dict[str, Path]:
+    """Return the files that the modules `roots` are made of, by their paths below the folders of our packages.
+
+    Args:
+        roots: Full names of modules.
+        cut: Names of modules that are left out; `package.*` leaves out all that is below a package.
+
+    Raises:
+        ModuleNotFoundError: There is no file for a module that is imported.
+    """
+    found: dict[str, Path] = {}
+    waiting, seen = list(roots), set()
+    while waiting:
+        name = waiting.pop()
+        if name in seen or _is_cut(name, cut):
+            continue
+        seen.add(name)
+        path = module_file(name)
+        if path is None:  # compiled; its build is known by other means
+            continue
+        for file in (path, *_data_files(path)):
+            found[_short(name, path, file)] = file
+        waiting += _imports(path)
+    return found
+
+
+def digests(files: dict[str, Path]) -> dict[str, str]:
+    """Return the SHA-256 of each file."""
+    return {name: sha256(path.read_bytes()) for name, path in sorted(files.items())}
+
+
+def module_file(name: str) -> Path | None:
+    """Return the source of a module of ours, None where it is compiled; raise ModuleNotFoundError."""
+    package, *rest = name.split(".")
+    base = _package_folder(package).joinpath(*rest)
+    if (base / "__init__.py").is_file():
+        return base / "__init__.py"
+    if base.with_suffix(".py").is_file():
+        return base.with_suffix(".py")
+    if rest and rest[-1].startswith("_") and base.with_suffix(".pyi").is_file():
+        return None
+    raise ModuleNotFoundError(f"there is no source of module {name}", name=name)
+
+
+@cache
+def _package_folder(package: str) -> Path:
+    spec = find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError(f"there is no package {package}", name=package)
+    folders = [Path(place) for place in spec.submodule_search_locations]
+    return next(folder for folder in folders if (folder / "__init__.py").is_file())
+
+
+def _is_cut(name: str, cut: Collection[str]) -> bool:
+    parents = name.split(".")
+    return name in cut or any(".".join([*parents[:length], "*"]) in cut for length in range(1, len(parents)))
+
+
+def _short(name: str, module: Path, file: Path) -> str:
+    folder = name if module.name == "__init__.py" else name.rpartition(".")[0]
+    return "/".join([*folder.split("."), file.name])
+
+
+def _data_files(module: Path) -> list[Path]:
+    """Return the files beside a module that it names."""
+    words = {node.value for node in ast.walk(_parsed(module)) if isinstance(node, ast.Constant)}
+    beside = (file for file in sorted(module.parent.iterdir()) if file.is_file() and file.suffix not in (".py", ".pyi"))
+    return [file for file in beside if file.name in words]
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """Yield the modules of ours that a file imports."""
+    for node in _import_nodes(_parsed(path)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith(OURS))
+        elif (node.module or "").startswith(OURS):
+            for alias in node.names:
+                yield _home(str(node.module), alias.name)
+
+
+def _import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node
+        elif not (isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")):
+            yield from _import_nodes(node)
+
+
+def _home(module: str, name: str) -> str:
+    """Return the module that `from module import name` gets the name from."""
+    path = module_file(module)
+    if path is None or path.name != "__init__.py":
+        return module
+    if (path.parent / name).is_dir() or any((path.parent / f"{name}{end}").is_file() for end in (".py", ".pyi")):
+        return f"{module}.{name}"
+    for node in _import_nodes(_parsed(path)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(OURS):
+            for alias in node.names:
+                if (alias.asname or alias.name) == name:
+                    return _home(str(node.module), alias.name)
+    return module
+
+
+@cache
+def _parsed_text(path: Path, _changed: int) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def _parsed(path: Path) -> ast.Module:
+    return _parsed_text(path, path.stat().st_mtime_ns)

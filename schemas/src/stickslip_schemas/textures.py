@@ -1,0 +1,16 @@
+"""Names of the patterns that cloth can have. The renderer draws them."""
+
+from enum import StrEnum
+
+
+class Texture(StrEnum):
+    """Procedural cloth textures. Their order gives the codes of the label `texture`: add new ones at the end."""
+
+    checker = "checker"
+    dots = "dots"
+    stripes = "stripes"
+    plaid = "plaid"
+    gingham = "gingham"
+    herringbone = "herringbone"
+    houndstooth = "houndstooth"
+    floral = "floral"

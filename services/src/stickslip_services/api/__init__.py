@@ -1,0 +1,1 @@
+"""HTTP: routes, documents, problems, event streams."""

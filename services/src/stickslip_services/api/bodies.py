@@ -1,0 +1,97 @@
+"""Request bodies: JSON documents, read strictly, refused with pointers to what is wrong."""
+
+import json
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from fastapi import Request
+from pydantic import BaseModel, TypeAdapter, ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+from stickslip_schemas.problems import ProblemCode, field_errors
+
+from stickslip_services.api.problems import ProblemError
+
+T = TypeVar("T")
+
+SHOWN_ERRORS = 20
+
+
+class JsonBody(Generic[T]):
+    """A dependency that reads a request's body as a document."""
+
+    def __init__(self, adapter: TypeAdapter[T] | type[BaseModel]) -> None:
+        self._validate: Callable[[Any], Any] = (
+            adapter.validate_python if isinstance(adapter, TypeAdapter) else adapter.model_validate
+        )
+
+    async def __call__(self, request: Request) -> T:
+        """Return the document; raise ProblemError."""
+        media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if media_type != "application/json" and not media_type.endswith("+json"):
+            detail = f"Content-Type must be application/json, and it is {media_type[:100]!r}"
+            raise ProblemError(415, ProblemCode.malformed_body, detail)
+        try:
+            body = await request.body()
+        except ClientDisconnect as error:
+            raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+        # A body of many megabytes keeps a thread busy, and not the event loop.
+        document: T = await run_in_threadpool(self._read, body)
+        return document
+
+    def _read(self, body: bytes) -> Any:
+        document = parse_json(body)
+        try:
+            valid = self._validate(document)
+            json.dumps(document, allow_nan=False)  # models refuse NaN with its place; this is for what is free in form
+            return valid
+        except ValidationError as error:
+            fields = field_errors(error, document)
+        except RecursionError as error:
+            raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
+        except ValueError as error:
+            raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}") from error
+        detail = "; ".join(f"{field.pointer or 'the document'}: {field.rule}" for field in fields[:3])
+        more = f" (and {len(fields) - 3} more)" if len(fields) > 3 else ""
+        raise ProblemError(422, ProblemCode.validation_failed, detail + more, fields=fields[:SHOWN_ERRORS])
+
+
+def parse_json(body: bytes) -> Any:
+    """Parse JSON as RFC 8259 has it, UTF-8 and no key twice, but let NaN and infinities pass; raise ProblemError."""
+    try:
+        document = json.loads(body.decode("utf-8"), object_pairs_hook=_no_key_twice)
+        json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
+    except RecursionError as error:
+        raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
+    except ValueError as error:  # also of bytes that are no UTF-8, and of integers of more than 4300 digits
+        raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}"[:500]) from error
+    return document
+
+
+def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    document = dict(pairs)
+    if len(document) != len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} is there twice")
+    return document
+
+
+def body_schema(name: str) -> dict[str, Any]:
+    """Return what OpenAPI says of a route that reads the document `name`."""
+    reference = {"$ref": f"#/components/schemas/{name}"}
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": reference}}}}
+
+
+def body_components(models: dict[str, TypeAdapter[Any] | type[BaseModel]]) -> dict[str, Any]:
+    """Return the OpenAPI components of the documents that routes read, by name."""
+    adapters = [
+        (name, "validation", model if isinstance(model, TypeAdapter) else TypeAdapter(model))
+        for name, model in models.items()
+    ]
+    schemas, shared = TypeAdapter.json_schemas(adapters, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]
+    components: dict[str, Any] = dict(shared.get("$defs", {}))
+    for (name, _), schema in schemas.items():
+        if schema != {"$ref": f"#/components/schemas/{name}"}:
+            components[str(name)] = schema
+    return components

@@ -1,0 +1,98 @@
+"""Serving artifacts: immutable files with conditional and range requests [RFC 9110, 13 and 14; RFC 9530]."""
+
+import base64
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.problems import ProblemCode
+
+from stickslip_services.api.problems import ProblemError
+from stickslip_services.errors import MissingArtifactError
+
+BLOCK = 1 << 18
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+_MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".html": "text/html"}
+
+OPENAPI_HEADERS = {
+    name: {"description": description, "schema": {"type": "string"}}
+    for name, description in {
+        "ETag": "The SHA-256 of the whole file, quoted",
+        "Repr-Digest": "The SHA-256 of the whole file [RFC 9530]",
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "The file never changes",
+    }.items()
+}
+
+
+def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Response:
+    """Answer with the artifact at `path`, or the part of it that the request asks for."""
+    etag = f'"{digest}"'
+    headers = {
+        "ETag": etag,
+        "Repr-Digest": f"sha-256=:{base64.b64encode(bytes.fromhex(digest)).decode()}:",
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "public, max-age=31536000, immutable",
+    }
+    if _matches(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise MissingArtifactError(f"artifact {digest} is not in the store") from error
+    media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+    wanted = request.headers.get("range")
+    if wanted is not None and request.headers.get("if-range", etag).strip() != etag:
+        wanted = None  # the client has a part of another file
+    span = None if wanted is None or request.method == "HEAD" else _span(wanted, size, headers)
+    first, last = (0, size - 1) if span is None else span
+    headers["Content-Length"] = str(last - first + 1)
+    if span is not None:
+        headers["Content-Range"] = f"bytes {first}-{last}/{size}"
+    status = 200 if span is None else 206
+    if request.method == "HEAD":
+        return Response(status_code=status, headers=headers, media_type=media_type)
+    return StreamingResponse(_blocks(path, first, last + 1), status, headers, media_type)
+
+
+def _matches(header: str | None, etag: str) -> bool:
+    if header is None:
+        return False
+    return header.strip() == "*" or etag in (item.strip().removeprefix("W/") for item in header.split(","))
+
+
+def _span(header: str, size: int, headers: dict[str, str]) -> tuple[int, int] | None:
+    """Return the first and last byte of the range, or None where the whole file is to be sent.
+
+    A range of another form, or several of them, may be ignored, and is.
+    """
+    match = _RANGE.fullmatch(header.strip())
+    if match is None or match.group() == "bytes=-":
+        return None
+    start, end = match.groups()
+    if start and end and int(end) < int(start):
+        return None
+    first = int(start) if start else max(0, size - int(end))
+    last = min(int(end), size - 1) if start and end else size - 1
+    if first > last or (not start and int(end) == 0):
+        raise ProblemError(
+            416,
+            ProblemCode.validation_failed,
+            f"the range {header[:100]!r} lies outside the file, which has {size} bytes",
+            headers=headers | {"Content-Range": f"bytes */{size}", "Cache-Control": "no-store"},
+        )
+    return first, last
+
+
+def _blocks(path: Path, start: int, stop: int) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        file.seek(start)
+        while start < stop:
+            block = file.read(min(BLOCK, stop - start))
+            if not block:
+                raise MissingArtifactError(f"{path.name} has become shorter while it was read")
+            start += len(block)
+            yield block

@@ -1,0 +1,149 @@
+"""Errors to problem documents: one table."""
+
+import json
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+from stickslip_schemas.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
+
+from stickslip_services import errors
+
+logger = logging.getLogger(__name__)
+
+_STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
+    errors.NotFoundError: (404, ProblemCode.not_found),
+    errors.UnknownWorkerError: (404, ProblemCode.unknown_worker),
+    errors.ConflictError: (409, ProblemCode.conflict),
+    errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
+    errors.KindNotAvailableError: (422, ProblemCode.kind_not_available),
+    errors.PresetNotCertifiedError: (422, ProblemCode.preset_not_certified),
+    errors.MissingArtifactError: (500, ProblemCode.storage_error),
+}
+
+_HTTP_CODES = {
+    404: ProblemCode.not_found,
+    405: ProblemCode.method_not_allowed,
+    413: ProblemCode.body_too_large,
+}
+
+
+class ProblemError(Exception):
+    """Carries a problem document to the response."""
+
+    def __init__(
+        self,
+        status: int,
+        code: ProblemCode,
+        detail: str,
+        *,
+        fields: list[FieldError] | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.code = code
+        self.detail = detail
+        self.fields = fields or []
+        self.headers = dict(headers or {})
+
+
+def problem_response(
+    status: int,
+    code: ProblemCode,
+    detail: str,
+    *,
+    path: str,
+    request_id: str | None,
+    fields: list[FieldError] | None = None,
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """Return a problem document as a response."""
+    problem = Problem(
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        code=code,
+        instance=path,
+        request_id=request_id,
+        errors=fields or [],
+    )
+    # What came with the request may hold what has no UTF-8 form; the answer must be readable all the same.
+    content = problem.model_dump_json(ensure_ascii=True)
+    return Response(content, status, dict(headers or {}), MEDIA_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Let `app` answer every error with a problem document."""
+    app.add_exception_handler(ProblemError, _problem)
+    app.add_exception_handler(errors.StickslipError, _stickslip_error)
+    app.add_exception_handler(RequestValidationError, _invalid_parameters)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(OperationalError, _database_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _answer(request: Request, status: int, code: ProblemCode, detail: str, **rest: Any) -> Response:
+    request_id = getattr(request.state, "request_id", None)
+    return problem_response(status, code, detail, path=request.url.path, request_id=request_id, **rest)
+
+
+def _problem(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ProblemError)
+    return _answer(request, error.status, error.code, error.detail, fields=error.fields, headers=error.headers)
+
+
+def _stickslip_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, errors.StickslipError)
+    status, code = _STATUS[type(error)]
+    fields = []
+    if isinstance(error, errors.PresetNotCertifiedError):
+        fields = [FieldError(pointer="/preset", rule=error.rule, value=json.dumps(error.preset))]
+    if status >= 500:
+        logger.error("%s %s: %s", request.method, request.url.path, error)
+    return _answer(request, status, code, str(error), fields=fields)
+
+
+def _invalid_parameters(request: Request, error: Exception) -> Response:
+    """Parameters of path, query and header; bodies are read in bodies.py."""
+    assert isinstance(error, RequestValidationError)
+    fields = [
+        FieldError(
+            pointer="".join(f"/{part}" for part in item["loc"]),
+            rule=item["msg"],
+            value=str(item.get("input", ""))[:200],
+        )
+        for item in error.errors()
+    ]
+    detail = "; ".join(f"{field.pointer[1:]}: {field.rule}" for field in fields)
+    return _answer(request, 422, ProblemCode.validation_failed, detail, fields=fields)
+
+
+def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    code = _HTTP_CODES.get(error.status_code, ProblemCode.malformed_body)
+    detail = error.detail
+    if error.status_code == 404:
+        detail = f"there is nothing at {request.url.path}"
+    elif error.status_code == 405:
+        detail = f"{request.url.path} does not know the method {request.method}"
+    return _answer(request, error.status_code, code, detail, headers=error.headers)
+
+
+def _database_error(request: Request, error: Exception) -> Response:
+    logger.error("%s %s: %s", request.method, request.url.path, error)
+    if "locked" in str(error) or "busy" in str(error):
+        headers = {"Retry-After": "1"}
+        return _answer(request, 503, ProblemCode.busy, "the database is busy; try again", headers=headers)
+    detail = "the coordinator cannot use its database (is the disk full?); its log says more"
+    return _answer(request, 503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"})
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    logger.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return _answer(request, 500, ProblemCode.internal_error, "the coordinator has a fault; its log says more")

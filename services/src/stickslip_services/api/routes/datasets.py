@@ -1,0 +1,118 @@
+"""Datasets, their versions and their files.
+
+`.../versions/N/files/` is the root of a Zarr store: any Zarr reader opens it at its URL.
+"""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Request, Response
+from stickslip_schemas.keys import is_sha256
+from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.responses import Dataset, DatasetVersion, Page
+from stickslip_schemas.tasks import FileEntry
+
+from stickslip_services.api.files import OPENAPI_HEADERS, serve
+from stickslip_services.api.routes.common import PageDep, coordinator_of, problem_responses
+from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets
+from stickslip_services.errors import NotFoundError
+from stickslip_services.pages.dataset_page import dataset_page
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.jobs import is_preview
+
+router = APIRouter(tags=["datasets"])
+
+CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
+
+Version = Annotated[int, Path(ge=1, lt=2**31)]
+
+_INERT = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
+
+_BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+
+
+def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
+    return {
+        200: {"description": "The file", "headers": OPENAPI_HEADERS, "content": content},
+        206: {"description": "The range that was asked for", "headers": OPENAPI_HEADERS, "content": content},
+        304: {"description": "The client has it already", "headers": OPENAPI_HEADERS},
+        **problem_responses(404, 416, 422),
+    }
+
+
+@router.get("/v1/datasets", responses=problem_responses(422))
+def get_datasets(page: PageDep, coordinator: CoordinatorDep) -> Page[Dataset]:
+    """List datasets, newest first."""
+    with coordinator.database.read() as connection:
+        return list_datasets(connection, page)
+
+
+@router.get("/v1/datasets/{dataset}", responses=problem_responses(404))
+def get_dataset(dataset: str, coordinator: CoordinatorDep) -> Dataset:
+    """Return a dataset with its versions."""
+    with coordinator.database.read() as connection:
+        return find_dataset(connection, dataset)
+
+
+@router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404, 422))
+def get_version(dataset: str, version: Version, coordinator: CoordinatorDep) -> DatasetVersion:
+    """Return a version."""
+    with coordinator.database.read() as connection:
+        return find_version(connection, dataset, version)
+
+
+_MANIFEST_CONTENT: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Manifest"}}}
+
+
+@router.get(
+    "/v1/datasets/{dataset}/versions/{version}/manifest",
+    response_class=Response,
+    responses=_file_responses(_MANIFEST_CONTENT),
+)
+@router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
+def get_manifest(dataset: str, version: Version, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return the manifest: every file of the version with its digest, and what it was made from."""
+    return _serve(request, coordinator, dataset, version, MANIFEST_NAME)
+
+
+@router.get("/v1/datasets/{dataset}/versions/{version}/page", include_in_schema=False)
+def get_page(dataset: str, version: Version, coordinator: CoordinatorDep) -> Response:
+    """Return the version's page for people: its acceptance rate, and where in the grid samples were lost."""
+    file = _find(coordinator, dataset, version, MANIFEST_NAME)
+    manifest = Manifest.model_validate_json(coordinator.store.read(file.sha256))
+    return Response(dataset_page(manifest), media_type="text/html", headers=_INERT)
+
+
+@router.get(
+    "/v1/datasets/{dataset}/versions/{version}/files/{path:path}",
+    response_class=Response,
+    responses=_file_responses(_BINARY),
+)
+@router.head("/v1/datasets/{dataset}/versions/{version}/files/{path:path}", include_in_schema=False)
+def get_file(dataset: str, version: Version, path: str, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return a file of the version, or a range of it."""
+    return _serve(request, coordinator, dataset, version, path)
+
+
+@router.get(
+    "/v1/previews/{digest}",
+    response_class=Response,
+    responses=_file_responses({"image/png": {"schema": {"type": "string", "format": "binary"}}}),
+    tags=["jobs"],
+)
+def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+    """Return the picture of a sample."""
+    with coordinator.database.read() as connection:
+        if not (is_sha256(digest) and is_preview(connection, digest)):
+            raise NotFoundError(f"there is no preview {digest[:100]!r}")
+    return serve(request, coordinator.store.path(digest), digest, name="preview.png")
+
+
+def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> FileEntry:
+    with coordinator.database.read() as connection:
+        manifest = find_version(connection, dataset, version).manifest
+    return find_file(coordinator.store, manifest, dataset, version, path)
+
+
+def _serve(request: Request, coordinator: CoordinatorDep, dataset: str, version: int, path: str) -> Response:
+    file = _find(coordinator, dataset, version, path)
+    return serve(request, coordinator.store.path(file.sha256), file.sha256, name=path)

@@ -1,0 +1,48 @@
+"""Whether the coordinator lives, whether it can serve, and its metrics."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+from sqlalchemy import text
+from stickslip_schemas.base import Document
+
+from stickslip_services import __version__
+from stickslip_services.api.metrics import Metrics
+from stickslip_services.api.routes.common import coordinator_of, problem_responses
+from stickslip_services.queue.coordinator import Coordinator
+
+router = APIRouter(tags=["health"])
+
+CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
+
+
+class Health(Document):
+    """The coordinator answers."""
+
+    version: str
+
+
+@router.get("/livez")
+async def get_livez() -> Health:
+    """Tell that the process answers."""
+    return Health(version=__version__)
+
+
+@router.get("/readyz", responses=problem_responses())
+def get_readyz(coordinator: CoordinatorDep) -> Health:
+    """Tell that the database can be read; 503 where it cannot."""
+    with coordinator.database.read() as connection:
+        connection.execute(text("SELECT seq FROM jobs LIMIT 1"))
+    return Health(version=__version__)
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"description": "Metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+def get_metrics(request: Request) -> Response:
+    """Return metrics for Prometheus."""
+    metrics: Metrics = request.app.state.metrics
+    return Response(metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})

@@ -1,0 +1,170 @@
+"""Jobs: submitting, watching and cancelling them."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.responses import Job, JobDetail, Page, Preview, SampleState, Validation
+from stickslip_schemas.states import TaskState
+
+from stickslip_services.api import sse
+from stickslip_services.api.bodies import JsonBody, body_schema
+from stickslip_services.api.problems import ProblemError
+from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.jobs import Replay, find_job, list_jobs, list_previews, list_samples
+
+router = APIRouter(tags=["jobs"])
+
+CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
+
+SpecBody = Annotated[JobSpec, Depends(JsonBody(job_spec_adapter))]
+
+_LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
+_ETAG = {"ETag": {"description": "Changes with the job", "schema": {"type": "string"}}}
+_REPLAYED: dict[str, Any] = {
+    "description": "The answer that this Idempotency-Key got the first time",
+    "model": JobDetail,
+    "headers": _LOCATION,
+}
+
+
+@router.post(
+    "/v1/jobs",
+    status_code=202,
+    response_model=JobDetail,
+    responses={
+        200: _REPLAYED,
+        202: {"description": "The job is in the queue", "headers": _LOCATION},
+        **problem_responses(*BODY_PROBLEMS),
+    },
+    openapi_extra=body_schema("JobSpec"),
+)
+def post_job(
+    spec: SpecBody,
+    coordinator: CoordinatorDep,
+    idempotency_key: Annotated[
+        str | None,
+        Header(
+            min_length=1,
+            max_length=255,
+            description="a word that is yours alone; a request that comes twice with it makes one job. Kept for ever.",
+        ),
+    ] = None,
+) -> Response:
+    """Submit a job. What of it is there already is not done again; what had failed is tried again."""
+    job = coordinator.submit(spec, idempotency_key)
+    if isinstance(job, Replay):
+        return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
+    return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})
+
+
+@router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
+def validate_job(spec: SpecBody, coordinator: CoordinatorDep) -> Validation:
+    """Tell what a job would be, without making one."""
+    return coordinator.validate(spec)
+
+
+@router.get("/v1/jobs", responses=problem_responses(422))
+def get_jobs(page: PageDep, coordinator: CoordinatorDep) -> Page[Job]:
+    """List jobs, newest first."""
+    with coordinator.database.read() as connection:
+        return list_jobs(connection, page, coordinator.alive_workers(connection))
+
+
+@router.get(
+    "/v1/jobs/{job_id}",
+    response_model=JobDetail,
+    responses={
+        200: {"description": "The job", "headers": _ETAG},
+        304: {"description": "The job is as it was at `If-None-Match`", "headers": _ETAG},
+        **problem_responses(404),
+    },
+)
+def get_job(
+    job_id: str, coordinator: CoordinatorDep, if_none_match: Annotated[str | None, Header()] = None
+) -> Response:
+    """Return a job."""
+    with coordinator.database.read() as connection:
+        content = coordinator.show(connection, find_job(connection, job_id).seq).model_dump_json()
+    etag = f'"{sha256(content.encode())[:32]}"'
+    if if_none_match is not None and (if_none_match.strip() == "*" or etag in if_none_match):
+        return Response(status_code=304, headers={"ETag": etag})
+    return _json(content, headers={"ETag": etag})
+
+
+@router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=problem_responses(404, 409))
+def cancel_job(job_id: str, coordinator: CoordinatorDep) -> JobDetail:
+    """Cancel a job. Tasks that only it needs are dropped; what is finished or published stays."""
+    return coordinator.cancel(job_id)
+
+
+@router.post("/v1/jobs/{job_id}:pause", status_code=202, responses=problem_responses(404, 409))
+def pause_job(job_id: str, coordinator: CoordinatorDep) -> JobDetail:
+    """Pause a job: nothing more is started for it, and what runs finishes. Its place in the queue stays."""
+    return coordinator.pause(job_id)
+
+
+@router.post("/v1/jobs/{job_id}:resume", status_code=202, responses=problem_responses(404, 409))
+def resume_job(job_id: str, coordinator: CoordinatorDep) -> JobDetail:
+    """Let a paused job go on."""
+    return coordinator.resume(job_id)
+
+
+@router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404, 422))
+def get_samples(
+    job_id: str,
+    page: PageDep,
+    coordinator: CoordinatorDep,
+    state: Annotated[
+        TaskState | None, Query(description="only samples in this state; `rejected` lists the rejects")
+    ] = None,
+) -> Page[SampleState]:
+    """List the samples of a job by slot; empty until the job is planned."""
+    with coordinator.database.read() as connection:
+        return list_samples(connection, find_job(connection, job_id).seq, page, state)
+
+
+@router.get("/v1/jobs/{job_id}/previews", responses=problem_responses(404))
+def get_previews(job_id: str, coordinator: CoordinatorDep) -> list[Preview]:
+    """List the pictures of samples that there are so far."""
+    with coordinator.database.read() as connection:
+        return list_previews(connection, find_job(connection, job_id).seq)
+
+
+@router.get(
+    "/v1/jobs/{job_id}/events",
+    response_class=Response,
+    responses={
+        200: {
+            "description": (
+                "Server-sent events: `job.state`, `task.state`, `dataset.published` with increasing ids, and "
+                "`job.progress` (about once a second, with the id of the event before it). After the `job.state` that "
+                "ends the job the stream ends."
+            ),
+            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        },
+        **problem_responses(404, 422),
+    },
+)
+def get_events(
+    job_id: str,
+    request: Request,
+    coordinator: CoordinatorDep,
+    last_event_id: Annotated[str | None, Header(description="go on after this event")] = None,
+) -> Response:
+    """Follow a job."""
+    after = last_event_id or "0"
+    if not after.isdecimal() or len(after) > 18:
+        detail = f"Last-Event-ID must be the id of an event, and it is {after[:100]!r}"
+        raise ProblemError(422, ProblemCode.validation_failed, detail)
+    with coordinator.database.read() as connection:
+        job = int(find_job(connection, job_id).seq)
+    return sse.stream(coordinator.database, coordinator.bell, coordinator.show, job, after=int(after))
+
+
+def _json(content: str, *, status: int = 200, headers: dict[str, str] | None = None) -> Response:
+    return Response(content, status, headers, "application/json")

@@ -1,0 +1,1 @@
+"""What has been made: dataset versions and certificates."""

@@ -1,0 +1,108 @@
+"""Certificates: taking them in and finding them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Row, insert, select, update
+from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.responses import CertificateEntry, Page
+from stickslip_schemas.store import Store
+
+from stickslip_services.clock import as_datetime
+from stickslip_services.database.paging import PageRequest, make_page
+from stickslip_services.database.tables import certificates
+from stickslip_services.errors import NotFoundError
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCertificate:
+    """A certificate's artifacts: the document and the page."""
+
+    digest: Sha256
+    artifact: Sha256
+    page: Sha256
+
+
+def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Sha256 | None:
+    """Return the digest of the full certificate of a preset and a build that was registered last if it passed."""
+    columns = certificates.c
+    row = connection.execute(
+        select(columns.digest, columns.passed)
+        .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
+        .order_by(columns.created_at.desc(), columns.seq.desc())
+        .limit(1)
+    ).one_or_none()
+    return row.digest if row is not None and row.passed else None
+
+
+def store_certificate(store: Store, upload: CertificateUpload) -> StoredCertificate:
+    """Write a certificate and its page into the store."""
+    certificate = upload.certificate
+    return StoredCertificate(
+        digest=certificate.digest,
+        artifact=store.publish(certificate.canonical()),
+        page=store.publish(upload.page.encode()),
+    )
+
+
+def insert_certificate(
+    connection: Connection, upload: CertificateUpload, stored: StoredCertificate, now: float
+) -> CertificateEntry:
+    """Register a certificate. One that is there already stays as it is, but it was measured last again."""
+    if _find(connection, stored.digest) is not None:
+        known = certificates.c.digest == stored.digest
+        connection.execute(update(certificates).where(known).values(created_at=now))
+    else:
+        connection.execute(
+            insert(certificates).values(
+                digest=stored.digest,
+                artifact=stored.artifact,
+                page=stored.page,
+                preset=upload.certificate.preset,
+                sim_core=upload.certificate.sim_core,
+                extent=upload.certificate.extent,
+                passed=upload.certificate.passed,
+                created_at=now,
+            )
+        )
+    return _entry(_found(connection, stored.digest))
+
+
+def list_certificates(connection: Connection, page: PageRequest) -> Page[CertificateEntry]:
+    """Return a page of certificates, newest first."""
+    query = select(certificates).order_by(certificates.c.seq.desc()).limit(page.size + 1)
+    if page.after is not None:
+        query = query.where(certificates.c.seq < page.after)
+    rows = connection.execute(query).all()
+    return make_page(rows, page, position=lambda row: int(row.seq), item=_entry)
+
+
+def find_certificate(connection: Connection, digest: str) -> StoredCertificate:
+    """Return where a certificate lies; raise NotFoundError."""
+    row = _found(connection, digest)
+    return StoredCertificate(digest=row.digest, artifact=row.artifact, page=row.page)
+
+
+def _found(connection: Connection, digest: str) -> Row[tuple[Any, ...]]:
+    row = _find(connection, digest)
+    if row is None:
+        raise NotFoundError(f"there is no certificate {digest[:100]!r}")
+    return row
+
+
+def _find(connection: Connection, digest: str) -> Row[tuple[Any, ...]] | None:
+    return connection.execute(select(certificates).where(certificates.c.digest == digest)).one_or_none()
+
+
+def _entry(row: Row[tuple[Any, ...]]) -> CertificateEntry:
+    return CertificateEntry(
+        digest=row.digest,
+        preset=row.preset,
+        sim_core=row.sim_core,
+        extent=row.extent,
+        passed=row.passed,
+        created_at=as_datetime(row.created_at),
+        href=f"/v1/certificates/{row.digest}",
+        page=f"/v1/certificates/{row.digest}/page",
+    )

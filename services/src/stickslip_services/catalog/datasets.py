@@ -1,0 +1,99 @@
+"""Datasets, their versions and their files, as the API shows them."""
+
+import json
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Row, select
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.responses import Dataset, DatasetVersion, Page
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import FileEntry
+
+from stickslip_services.clock import as_datetime
+from stickslip_services.database.paging import PageRequest, make_page
+from stickslip_services.database.tables import dataset_versions, datasets
+from stickslip_services.errors import MissingArtifactError, NotFoundError
+
+
+def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
+    """Return a page of datasets, newest first."""
+    query = select(datasets).order_by(datasets.c.seq.desc()).limit(page.size + 1)
+    if page.after is not None:
+        query = query.where(datasets.c.seq < page.after)
+    rows = connection.execute(query).all()
+    return make_page(rows, page, position=lambda row: int(row.seq), item=lambda row: _shown_dataset(connection, row))
+
+
+def find_dataset(connection: Connection, dataset: str) -> Dataset:
+    """Return a dataset with its committed versions; raise NotFoundError."""
+    row = connection.execute(select(datasets).where(datasets.c.id == dataset)).one_or_none()
+    if row is None:
+        raise NotFoundError(f"there is no dataset {dataset[:100]!r}")
+    return _shown_dataset(connection, row)
+
+
+def find_version(connection: Connection, dataset: str, version: int) -> DatasetVersion:
+    """Return a committed version; raise NotFoundError."""
+    for known in find_dataset(connection, dataset).versions:
+        if known.version == version:
+            return known
+    raise NotFoundError(f"dataset {dataset} has no version {version}")
+
+
+def find_file(store: Store, manifest: Sha256, dataset: str, version: int, path: str) -> FileEntry:
+    """Return the file at `path` of a version; raise NotFoundError where its manifest names none."""
+    if path == MANIFEST_NAME:
+        return FileEntry(path=path, sha256=manifest, size=_size(store, manifest))
+    digest_and_size = _files(store.path(manifest)).get(path)
+    if digest_and_size is None:
+        raise NotFoundError(f"{dataset}, version {version}, has no file {path[:200]!r}")
+    digest, size = digest_and_size
+    if _size(store, digest) != size:
+        raise MissingArtifactError(f"file {path} of {dataset}, version {version}, is damaged in the store")
+    return FileEntry(path=path, sha256=digest, size=size)
+
+
+@lru_cache(maxsize=16)
+def _files(manifest: Path) -> Mapping[str, tuple[Sha256, int]]:
+    """Return digest and size by path; a manifest never changes, so it is read once."""
+    try:
+        document = json.loads(manifest.read_bytes())
+    except OSError as error:
+        raise MissingArtifactError(f"the manifest {manifest.name} is not in the store") from error
+    return {file["path"]: (file["sha256"], file["size"]) for file in document["files"]}
+
+
+def _size(store: Store, digest: Sha256) -> int:
+    try:
+        return store.path(digest).stat().st_size
+    except OSError as error:
+        raise MissingArtifactError(f"artifact {digest} is not in the store") from error
+
+
+def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Dataset:
+    versions = connection.execute(
+        select(dataset_versions)
+        .where(dataset_versions.c.dataset == row.id, dataset_versions.c.manifest.is_not(None))
+        .order_by(dataset_versions.c.version)
+    )
+    return Dataset(
+        id=row.id,
+        name=row.name,
+        kind=row.kind,
+        spec_digest=row.spec_digest,
+        versions=tuple(
+            DatasetVersion(
+                version=version.version,
+                manifest=version.manifest,
+                created_at=as_datetime(version.created_at),
+                sample_count=version.sample_count,
+                valid_count=version.valid_count,
+                bytes=version.bytes,
+            )
+            for version in versions
+        ),
+    )

@@ -1,0 +1,74 @@
+"""Certificates: measuring, registering and listing them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from stickslip_schemas.responses import CertificateEntry
+
+from stickslip_services.addresses import DEFAULT_URL
+from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table
+from stickslip_services.cli.errors import shows_errors
+from stickslip_services.client.http import Client, UnreachableError
+from stickslip_services.local import certifying
+
+
+@shows_errors
+def certify(
+    preset: Annotated[str, typer.Option(help="the preset to certify; rods: the rod solver")],
+    out: Annotated[Path | None, typer.Option(help="folder for the certificate (certificates/PRESET)")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="a few points only; certifies nothing")] = False,
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Measure a preset on the physical protocols with this build, and register its certificate where a coordinator is.
+
+    Writes certificate.json and certificate.html; exits with 1 if the preset does not pass.
+    """
+    screen = console()
+    directory = out or Path("certificates") / preset
+    certificate = certifying.measure(preset, directory, quick=quick)
+    verdict = "passed" if certificate.passed else "did NOT pass"
+    screen.print(f"preset {escape(preset)} {verdict}: {escape(str(directory / certifying.PAGE_NAME))}")
+    try:
+        with Client(url, patience=1.0) as client:
+            _say_registered(client.register(certifying.read_certificate(directory)), url)
+    except UnreachableError:
+        screen.print(f"no coordinator answers at {url}; later: stickslip register {escape(str(directory))}")
+    raise typer.Exit(0 if certificate.passed else 1)
+
+
+@shows_errors
+def register(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="what `stickslip certify` wrote")],
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Register a certificate that was made without a coordinator, or for another one."""
+    upload = certifying.read_certificate(directory)
+    with Client(url) as client:
+        _say_registered(client.register(upload), url)
+
+
+def _say_registered(entry: CertificateEntry, url: str) -> None:
+    console().print(f"certificate {entry.digest} is registered: {url.rstrip('/')}{entry.page}")
+
+
+@shows_errors
+def certificates(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+    """List certificates, newest first, and which of them vouch for the workers that are there."""
+    with Client(url) as client:
+        found = list(client.certificates())
+        if as_json:
+            return print_json(found)
+        builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
+    shown = table("certificate", "preset", "extent", "verdict", "build", "made", no_wrap=("certificate",))
+    for entry in found:
+        shown.add_row(
+            entry.digest[:16],
+            entry.preset,
+            entry.extent,
+            "[green]passed[/]" if entry.passed else "[red]failed[/]",
+            "this" if entry.sim_core in builds else f"another ({entry.sim_core[:12]})",
+            f"{entry.created_at:%Y-%m-%d %H:%M} UTC",
+        )
+    return console().print(shown)

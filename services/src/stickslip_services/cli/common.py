@@ -1,0 +1,37 @@
+"""What commands share: options, a console, JSON output."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel
+from rich.console import Console
+from rich.table import Table
+
+UrlOption = Annotated[str, typer.Option("--url", envvar="STICKSLIP_URL", help="where the coordinator is")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
+SpecArgument = Annotated[Path, typer.Argument(metavar="FILE", help="a JobSpec, YAML or JSON")]
+JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
+
+
+def console() -> Console:
+    """Return a console as wide as the terminal, or wide enough for any table where there is none to fit into."""
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
+
+
+def print_json(value: BaseModel | list[Any]) -> None:
+    """Print documents as JSON."""
+    if isinstance(value, BaseModel):
+        typer.echo(value.model_dump_json(indent=2))
+    else:
+        typer.echo(json.dumps([item.model_dump(mode="json") for item in value], indent=2))
+
+
+def table(*columns: str, no_wrap: tuple[str, ...] = ()) -> Table:
+    """Return an empty table; columns in `no_wrap` are never folded."""
+    made = Table(box=None, header_style="bold")
+    for column in columns:
+        made.add_column(column, overflow="fold", no_wrap=column in no_wrap)
+    return made

@@ -1,0 +1,93 @@
+"""Datasets: listing, pulling and verifying them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+
+from stickslip_services.addresses import DEFAULT_URL
+from stickslip_services.cli import wording
+from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table
+from stickslip_services.cli.errors import shows_errors
+from stickslip_services.client import pull
+from stickslip_services.client.http import Client, ClientError
+
+
+@shows_errors
+def datasets(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+    """List datasets and their versions, newest first."""
+    with Client(url) as client:
+        found = list(client.datasets())
+    if as_json:
+        return print_json(found)
+    shown = table("dataset", "name", "kind", "samples", "valid", "size", "made", no_wrap=("dataset",))
+    for dataset in found:
+        for version in dataset.versions:
+            shown.add_row(
+                f"{dataset.id}:v{version.version}",
+                dataset.name or "",
+                dataset.kind,
+                str(version.sample_count),
+                str(version.valid_count),
+                wording.size(version.bytes),
+                f"{version.created_at:%Y-%m-%d %H:%M} UTC",
+            )
+    return console().print(shown)
+
+
+@shows_errors
+def pull_dataset(
+    dataset: Annotated[str, typer.Argument(metavar="DATASET[:vN]", help="without :vN, the newest version")],
+    target: Annotated[Path, typer.Argument(metavar="DEST", help="directory to write to")],
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Download a dataset, every file checked; what is there already is not loaded again."""
+    screen = console()
+    with Client(url) as client:
+        name, version = _resolve(client, dataset)
+        columns = (BarColumn(bar_width=32), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
+            row = bar.add_task("pull", total=None)
+            done = pull.pull(
+                client,
+                name,
+                version,
+                target,
+                on_plan=lambda _files, count: bar.update(row, total=count),
+                on_bytes=lambda count: bar.advance(row, count),
+            )
+    there = done.files - done.downloaded_files
+    screen.print(
+        f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files loaded "
+        f"({wording.size(done.downloaded_bytes)}), {there} there already"
+    )
+
+
+def _resolve(client: Client, dataset: str) -> tuple[str, int]:
+    name, colon, version = dataset.partition(":v")
+    if not colon:
+        versions = client.dataset(name).versions
+        if not versions:
+            raise ClientError(f"dataset {name} has no version yet")
+        return name, versions[-1].version
+    if not version.isdecimal() or len(version) > 9:
+        raise ClientError(f"a version is written DATASET:v1, and this is {dataset!r}")
+    return name, int(version)
+
+
+@shows_errors
+def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled")]) -> None:
+    """Check every file of a dataset against its manifest; exit with 1 if anything is wrong."""
+    screen = console()
+    faults = pull.verify(target)
+    if not faults:
+        screen.print(f"{escape(str(target))}: every file is as the manifest says")
+        return
+    shown = table("file", "fault", "detail")
+    for fault in faults:
+        shown.add_row(escape(fault.path), fault.fault, escape(fault.detail))
+    screen.print(shown)
+    screen.print(f"{len(faults)} files are not as they should be", style="red")
+    raise typer.Exit(1)

@@ -1,0 +1,162 @@
+"""Jobs: validating, submitting, listing, watching, pausing and cancelling them."""
+
+import secrets
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+from stickslip_schemas.responses import JobDetail
+from stickslip_schemas.states import TaskState
+
+from stickslip_services.addresses import DEFAULT_URL
+from stickslip_services.cli import wording
+from stickslip_services.cli.common import JobArgument, JsonOption, SpecArgument, UrlOption, console, print_json, table
+from stickslip_services.cli.errors import shows_errors
+from stickslip_services.cli.specs import read_spec
+from stickslip_services.cli.watch import GOOD, watch
+from stickslip_services.client.http import Client
+
+SHOWN_REJECTS = 50
+
+
+@shows_errors
+def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+    """Say what a job would be, without submitting it."""
+    with Client(url) as client:
+        answer = client.validate(read_spec(file))
+    if as_json:
+        return print_json(answer)
+    cached = "unknown, as no worker has registered yet" if answer.cached_count is None else f"{answer.cached_count}"
+    shown = Table.grid(padding=(0, 2))
+    shown.add_row("samples", f"{answer.sample_count}")
+    shown.add_row("simulations", f"{answer.simulation_count}")
+    shown.add_row("tasks done already", cached)
+    shown.add_row("arrays before compression", wording.size(answer.bytes_estimate))
+    shown.add_row("spec", answer.spec_digest)
+    return console().print(shown)
+
+
+@shows_errors
+def submit(
+    file: SpecArgument,
+    url: UrlOption = DEFAULT_URL,
+    then_watch: Annotated[bool, typer.Option("--watch", help="watch the job until it ends")] = False,
+    idempotency_key: Annotated[
+        str | None, typer.Option(help="a word of yours: the same one twice makes one job")
+    ] = None,
+) -> None:
+    """Submit a job and print its id."""
+    with Client(url) as client:
+        job = client.submit(read_spec(file), idempotency_key=idempotency_key or secrets.token_hex(16))
+        typer.echo(job.id)
+        if then_watch:
+            raise typer.Exit(0 if watch(client, job.id, console()) in GOOD else 1)
+
+
+@shows_errors
+def jobs(
+    url: UrlOption = DEFAULT_URL,
+    as_json: JsonOption = False,
+    limit: Annotated[int, typer.Option(min=1, help="the most jobs to list")] = 50,
+) -> None:
+    """List jobs, newest first."""
+    with Client(url) as client:
+        found = [job for job, _ in zip(client.jobs(), range(limit), strict=False)]
+    if as_json:
+        return print_json(found)
+    columns = ("job", "name", "kind", "state", "samples", "rejected", "tasks", "time left", "dataset")
+    shown = table(*columns, no_wrap=("job", "dataset"))
+    for job in found:
+        shown.add_row(
+            job.id,
+            job.name or "",
+            job.kind,
+            wording.state(job.state),
+            str(job.sample_count),
+            str(job.rejected_count),
+            wording.done_of(job.progress),
+            "" if job.progress.eta is None else wording.duration(job.progress.eta.seconds),
+            wording.dataset(job.dataset),
+        )
+    return console().print(shown)
+
+
+@shows_errors
+def show(job_id: JobArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+    """Show a job: its state, its progress, and which samples were rejected and why."""
+    with Client(url) as client:
+        job = client.job(job_id)
+        if as_json:
+            return print_json(job)
+        rejects = client.samples(job_id, state=TaskState.rejected) if job.rejected_count else iter(())
+        shown = [reject for reject, _ in zip(rejects, range(SHOWN_REJECTS), strict=False)]
+    screen = console()
+    screen.print(_job_table(job))
+    if shown:
+        rejected = Table(title=f"rejected samples ({job.rejected_count})", title_justify="left", box=None)
+        for column in ("slot", "reason", "message", "parameters"):
+            rejected.add_column(column, overflow="fold")
+        for reject in shown:
+            labels = ", ".join(f"{name}={value}" for name, value in reject.labels.items())
+            rejected.add_row(str(reject.slot), str(reject.reason), escape(reject.message), escape(labels))
+        screen.print(rejected)
+        if job.rejected_count > len(shown):
+            screen.print(
+                f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected"
+            )
+    return None
+
+
+def _job_table(job: JobDetail) -> Table:
+    shown = Table.grid(padding=(0, 2))
+    shown.add_row("job", f"{job.id}{f' ({job.name})' if job.name else ''}, {job.kind}")
+    shown.add_row("state", wording.state(job.state))
+    if job.message:
+        shown.add_row("", escape(job.message))
+    shown.add_row("tasks", escape(wording.stages(job.progress)))
+    if not job.state.is_terminal:
+        shown.add_row("time left", wording.eta(job.progress.eta))
+    cpu = sum(stage.cpu_seconds for stage in job.progress.stages.values())
+    shown.add_row("CPU time", wording.duration(cpu))
+    if job.state in GOOD:
+        rate = 1 - job.rejected_count / job.sample_count
+        shown.add_row("accepted", f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})")
+    else:
+        shown.add_row("samples", f"{job.sample_count}, {job.rejected_count} rejected so far")
+    if job.dataset is not None:
+        shown.add_row("dataset", wording.dataset(job.dataset))
+        shown.add_row("manifest", job.dataset.manifest)
+    return shown
+
+
+@shows_errors
+def watch_job(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+    """Watch a job until it ends; exit with 0 if it succeeded, else 1."""
+    with Client(url) as client:
+        state = watch(client, job_id, console())
+    raise typer.Exit(0 if state in GOOD else 1)
+
+
+@shows_errors
+def cancel(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+    """Cancel a job. What is finished or published stays."""
+    with Client(url) as client:
+        job = client.cancel(job_id)
+    console().print(f"{job.id} is {wording.state(job.state)}")
+
+
+@shows_errors
+def pause(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+    """Pause a job: nothing more is started for it, and what runs finishes."""
+    with Client(url) as client:
+        job = client.pause(job_id)
+    console().print(f"{job.id} is {wording.state(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
+
+
+@shows_errors
+def resume(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+    """Let a paused job go on."""
+    with Client(url) as client:
+        job = client.resume(job_id)
+    console().print(f"{job.id} is {wording.state(job.state)}")

@@ -1,0 +1,226 @@
+"""Pulling a dataset version to a directory, and verifying one that is there.
+
+The manifest says which files there are and what their digests are; nothing that it does not name is written, and
+nothing is given its name before its digest has been checked. What was interrupted goes on where it stopped: a `.part`
+file holds the first bytes of a file, and the server is asked for the rest.
+"""
+
+import hashlib
+import os
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import httpx
+from pydantic import ValidationError
+from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.store import write_durably
+from stickslip_schemas.tasks import FileEntry
+
+from stickslip_services.client.http import Client, ClientError, UnreachableError, raise_for_problem
+
+CONNECTIONS = 4
+TRIES = 5
+PART = ".part"
+
+
+class UnsafePathError(ClientError):
+    """A manifest names a file outside its dataset."""
+
+
+class DamagedError(ClientError):
+    """What arrived is not what the manifest promises."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pulled:
+    """What a pull did."""
+
+    files: int
+    downloaded_files: int
+    downloaded_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What is wrong with a file of a dataset on disk."""
+
+    path: str
+    fault: Literal["missing", "size", "sha256", "extra", "manifest"]
+    detail: str
+
+
+def pull(
+    client: Client,
+    dataset: str,
+    version: int,
+    target: Path,
+    *,
+    on_bytes: Callable[[int], None] = lambda _: None,
+    on_plan: Callable[[int, int], None] = lambda _files, _bytes: None,
+) -> Pulled:
+    """Download a version to `target`; files that are there and right are left alone.
+
+    `on_plan` hears how many files and bytes are to come, `on_bytes` of each piece that arrives. The manifest is written
+    last: where it is, the dataset is whole.
+    """
+    promised = client.version(dataset, version).manifest
+    manifest, content = client.manifest(dataset, version)
+    if sha256(content) != promised:
+        raise DamagedError(f"the manifest of {dataset}, version {version}, has not the digest that was promised")
+    files = [(file, safe_path(target, file.path)) for file in manifest.files]
+    target.mkdir(parents=True, exist_ok=True)
+    missing = [(file, path) for file, path in files if not _is_whole(path, file)]
+    on_plan(len(missing), sum(file.size for file, _ in missing))
+    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    stop = threading.Event()
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        downloads = [pool.submit(_download, client, root, file, path, on_bytes, stop) for file, path in missing]
+        try:
+            for download in as_completed(downloads):
+                download.result()
+        except BaseException:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+    if not (target / MANIFEST_NAME).exists() or (target / MANIFEST_NAME).read_bytes() != content:
+        write_durably(target / MANIFEST_NAME, content)
+    return Pulled(len(files), len(missing), sum(file.size for file, _ in missing))
+
+
+def safe_path(target: Path, path: str) -> Path:
+    """Return where a file of a manifest goes; raise UnsafePathError where that is not inside `target`.
+
+    Symbolic links that are there already are followed for the check, so none of them leads out either.
+    """
+    parts = PurePosixPath(path).parts
+    if not parts or path.startswith("/") or any(part in ("..", ".") for part in path.split("/")) or "\\" in path:
+        raise UnsafePathError(f"the manifest names the file {path!r}, which leaves the dataset; nothing was written")
+    whole = target.joinpath(*parts)
+    if not whole.resolve().is_relative_to(target.resolve()):
+        raise UnsafePathError(f"the file {path!r} would be written outside {target}; nothing was written")
+    if path == MANIFEST_NAME or path.endswith(PART):
+        raise UnsafePathError(f"the manifest names the file {path!r}, a name that is not its to give")
+    return whole
+
+
+def verify(target: Path) -> list[Fault]:
+    """Return all that is wrong with the dataset in `target`."""
+    try:
+        manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
+    except FileNotFoundError:
+        return [Fault(MANIFEST_NAME, "missing", "not there: no dataset, or a pull that was not finished")]
+    except (OSError, ValidationError) as error:
+        return [Fault(MANIFEST_NAME, "manifest", str(error).splitlines()[0])]
+    named = {file.path: file for file in manifest.files}
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        faults = [fault for fault in pool.map(lambda file: _fault(target, file), manifest.files) if fault is not None]
+    for path in _files_below(target):
+        if path not in named and path != MANIFEST_NAME:
+            faults.append(Fault(path, "extra", "not in the manifest"))
+    return sorted(faults, key=lambda fault: fault.path)
+
+
+def _fault(target: Path, file: FileEntry) -> Fault | None:
+    try:
+        path = safe_path(target, file.path)
+        size = path.stat().st_size
+        if size != file.size:
+            return Fault(file.path, "size", f"{size} bytes, and should have {file.size}")
+        digest = _digest(path)
+    except UnsafePathError as error:
+        return Fault(file.path, "manifest", str(error))
+    except FileNotFoundError:
+        return Fault(file.path, "missing", "not there")
+    except OSError as error:
+        return Fault(file.path, "missing", f"cannot be read: {error.strerror}")
+    return None if digest == file.sha256 else Fault(file.path, "sha256", f"{digest}, and should be {file.sha256}")
+
+
+def _files_below(target: Path) -> Iterator[str]:
+    for directory, _, names in os.walk(target):
+        for name in names:
+            yield (Path(directory) / name).relative_to(target).as_posix()
+
+
+def _download(
+    client: Client, root: str, file: FileEntry, path: Path, on_bytes: Callable[[int], None], stop: threading.Event
+) -> None:
+    """Download a file beside its place, check it, and move it there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + PART)
+    if part.is_symlink():
+        part.unlink()
+    on_bytes(part.stat().st_size if part.exists() else 0)
+    reason = ""
+    for attempt in range(TRIES):
+        if stop.wait(0 if attempt == 0 else min(2.0**attempt / 4, client.patience)):
+            return
+        try:
+            _fetch(client, root + file.path, file.sha256, part, on_bytes, stop)
+        except httpx.TransportError as error:
+            reason = str(error) or type(error).__name__
+            continue  # what has arrived stays in the part
+        if stop.is_set():
+            return
+        if part.stat().st_size == file.size and _digest(part) == file.sha256:
+            _sync(part)
+            part.replace(path)
+            return
+        part.unlink()  # a part of something else, or damaged on its way: from the beginning
+        reason = "it arrived damaged"
+    if reason == "it arrived damaged":
+        raise DamagedError(f"{file.path} arrived {TRIES} times with other bytes than the manifest promises")
+    raise UnreachableError(f"{file.path} could not be downloaded in {TRIES} tries: {reason}")
+
+
+def _fetch(
+    client: Client,
+    url: str,
+    digest: Sha256,
+    part: Path,
+    on_bytes: Callable[[int], None],
+    stop: threading.Event,
+) -> None:
+    have = part.stat().st_size if part.exists() else 0
+    etag = f'"{digest}"'
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-", "If-Range": etag} if have else {})
+    with client.stream(url, headers) as response:
+        if response.status_code == 416:  # the part is as long as the file already, or longer
+            return
+        if response.status_code == 503:
+            raise httpx.ReadError("the coordinator is busy")
+        if response.status_code not in (200, 206):
+            response.read()
+            raise_for_problem(response)
+        mode = "ab" if response.status_code == 206 else "wb"
+        with part.open(mode) as target:
+            for block in response.iter_raw():  # as it comes: what has arrived is kept if the rest does not
+                target.write(block)
+                on_bytes(len(block))
+                if stop.is_set():
+                    return
+
+
+def _is_whole(path: Path, file: FileEntry) -> bool:
+    with suppress(OSError):
+        return path.stat().st_size == file.size and _digest(path) == file.sha256
+    return False
+
+
+def _digest(path: Path) -> Sha256:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

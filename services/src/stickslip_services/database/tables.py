@@ -1,0 +1,269 @@
+"""The tables of the coordinator's database.
+
+Tasks are global and keyed by content; jobs point at the tasks that they need. Inside the database a task is its `seq`
+(8 bytes in five indexes, where its name would be 73); outside it is `<stage>-<key>`. Times are seconds since 1970.
+"""
+
+from sqlalchemy import (
+    Boolean,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    text,
+)
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_N_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+workers = Table(
+    "workers",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("name", String, nullable=False, index=True),
+    Column("builds", Text, nullable=False),  # JSON: by kind
+    Column("slots", Integer, nullable=False),
+    Column("versions", Text, nullable=False),  # JSON
+    Column("registered_at", Float, nullable=False),
+    Column("last_seen_at", Float, nullable=False),
+    Column("superseded", Boolean, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("name", String),
+    Column("kind", String, nullable=False),
+    Column("spec", Text, nullable=False),  # JSON
+    Column("sample_count", Integer, nullable=False),
+    Column("builds", Text),  # JSON; null until the job is planned
+    Column("publish_task", Integer, index=True),  # null until the job is planned
+    Column("state", String, nullable=False),
+    Column("reason", String),
+    Column("message", Text, nullable=False),
+    Column("rejected_count", Integer, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("started_at", Float),
+    Column("finished_at", Float),
+    Column("dataset", String),
+    Column("version", Integer),
+    Column("manifest", String),
+    Index(
+        "ix_jobs_open",
+        "seq",
+        sqlite_where=text("state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"),
+        postgresql_where=text("state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"),
+    ),
+    sqlite_autoincrement=True,
+)
+
+idempotency_keys = Table(
+    "idempotency_keys",
+    metadata,
+    Column("key", String, primary_key=True),
+    Column("fingerprint", String, nullable=False),
+    Column("job", Integer, ForeignKey("jobs.seq"), nullable=False),
+    Column("response", Text, nullable=False),
+    Column("created_at", Float, nullable=False),
+)
+
+tasks = Table(
+    "tasks",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("key", LargeBinary(32), nullable=False, unique=True),
+    Column("stage", String, nullable=False),
+    Column("kind", String, nullable=False),
+    Column("build", String, nullable=False),  # of its stage: what a worker must have to run it
+    Column("payload", Text, nullable=False),  # JSON; what the task is besides the results it waits for
+    Column("preview", Boolean, nullable=False),
+    Column("job", Integer, nullable=False),  # the oldest live job that needs it, while it is pending
+    Column("state", String, nullable=False),
+    Column("reason", String),
+    Column("message", Text, nullable=False, server_default=""),
+    Column("waiting_on", Integer, nullable=False),  # dependencies that are not settled
+    Column("token", Integer, nullable=False, server_default="0"),  # fencing: increments at each lease
+    Column("owner", String),  # worker id, while leased or running
+    Column("expires_at", Float),
+    Column("attempts", Integer, nullable=False, server_default="0"),  # times that it was started
+    Column("tries", Integer, nullable=False, server_default="0"),  # of these, the failed ones
+    Column("retry_at", Float),
+    Column("reported_token", Integer),
+    Column("reported_by", String),
+    Column("output", Text),  # JSON
+    Column("cpu_seconds", Float),
+    Column("wall_seconds", Float),
+    Column("started_at", Float),
+    Column("finished_at", Float),
+    Index(
+        "ix_tasks_ready",
+        "stage",
+        "build",
+        "kind",
+        "job",
+        "seq",
+        sqlite_where=text("state = 'pending' AND waiting_on = 0"),
+        postgresql_where=text("state = 'pending' AND waiting_on = 0"),
+    ),
+    Index(
+        "ix_tasks_leased",
+        "owner",
+        sqlite_where=text("owner IS NOT NULL"),
+        postgresql_where=text("owner IS NOT NULL"),
+    ),
+    Index(
+        "ix_tasks_retry",
+        "retry_at",
+        sqlite_where=text("state = 'soft_failed'"),
+        postgresql_where=text("state = 'soft_failed'"),
+    ),
+)
+
+# The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only ever written by
+# planning.py, and the tests audit that both ends are there.
+
+task_dependencies = Table(
+    "task_dependencies",
+    metadata,
+    Column("task", Integer, primary_key=True, autoincrement=False),
+    Column("depends_on", Integer, primary_key=True, autoincrement=False, index=True),
+    sqlite_with_rowid=False,
+)
+
+job_tasks = Table(
+    "job_tasks",
+    metadata,
+    Column("job", Integer, primary_key=True, autoincrement=False),
+    Column("task", Integer, primary_key=True, autoincrement=False, index=True),
+    Column("cached", Boolean, nullable=False),  # it was settled before the job came
+    sqlite_with_rowid=False,
+)
+
+samples = Table(
+    "samples",
+    metadata,
+    Column("job", Integer, primary_key=True, autoincrement=False),
+    Column("slot", Integer, primary_key=True, autoincrement=False),
+    Column("key", LargeBinary(32), nullable=False),
+    Column("simulate_task", Integer, nullable=False),
+    Column("render_task", Integer),
+    Column("split", Integer, nullable=False),
+    Column("labels", Text, nullable=False),  # JSON: the point of the grid
+    sqlite_with_rowid=False,
+)
+
+previews = Table(
+    "previews",
+    metadata,
+    Column("task", Integer, primary_key=True, autoincrement=False),
+    Column("digest", String, nullable=False, index=True),
+)
+
+# Counters, kept by ledger.py in the transaction that moves the tasks, so that nobody counts rows to show progress.
+
+job_counts = Table(
+    "job_counts",
+    metadata,
+    Column("job", Integer, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
+    Column("stage", String, primary_key=True),
+    Column("state", String, primary_key=True),
+    Column("count", Integer, nullable=False),
+)
+
+job_stages = Table(
+    "job_stages",
+    metadata,
+    Column("job", Integer, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
+    Column("stage", String, primary_key=True),
+    Column("cached", Integer, nullable=False),
+    Column("cpu_seconds", Float, nullable=False, server_default="0"),
+    Column("wall_count", Integer, nullable=False, server_default="0"),
+    Column("wall_sum", Float, nullable=False, server_default="0"),
+    Column("wall_squares", Float, nullable=False, server_default="0"),
+)
+
+task_counts = Table(
+    "task_counts",
+    metadata,
+    Column("stage", String, primary_key=True),
+    Column("state", String, primary_key=True),
+    Column("count", Integer, nullable=False),
+)
+
+stage_timings = Table(
+    "stage_timings",
+    metadata,
+    Column("stage", String, primary_key=True),
+    Column("kind", String, primary_key=True),
+    Column("wall_count", Integer, nullable=False),
+    Column("wall_sum", Float, nullable=False),
+    Column("wall_squares", Float, nullable=False),
+)
+
+datasets = Table(
+    "datasets",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("name", String),
+    Column("kind", String, nullable=False),
+    Column("spec_digest", String, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+dataset_versions = Table(
+    "dataset_versions",
+    metadata,
+    Column("dataset", String, primary_key=True),
+    Column("version", Integer, primary_key=True, autoincrement=False),
+    Column("publish_task", Integer, nullable=False, unique=True),
+    Column("manifest", String),  # null: the number is taken, the version is not committed
+    Column("created_at", Float),
+    Column("sample_count", Integer),
+    Column("valid_count", Integer),
+    Column("bytes", Integer),
+)
+
+certificates = Table(
+    "certificates",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("digest", String, nullable=False, unique=True),
+    Column("artifact", String, nullable=False),  # the document
+    Column("page", String, nullable=False),  # its page for people, an artifact
+    Column("preset", String, nullable=False),
+    Column("sim_core", String, nullable=False),
+    Column("extent", String, nullable=False),
+    Column("passed", Boolean, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Index("ix_certificates_preset_sim_core", "preset", "sim_core"),
+    sqlite_autoincrement=True,
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("job", Integer, ForeignKey("jobs.seq"), nullable=False),
+    Column("name", String, nullable=False),
+    Column("data", Text, nullable=False),  # JSON
+    Column("created_at", Float, nullable=False),
+    Index("ix_events_job_id", "job", "id"),
+    sqlite_autoincrement=True,
+)

@@ -1,0 +1,282 @@
+"""`stickslip up`: a coordinator and a dispatcher on this machine, kept alive until they are told to stop.
+
+Everything lies below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (where it listens) and `lock` (two
+of them on one directory refuse). Children that die are started again, ever more slowly; one that keeps dying as soon as
+it starts ends the whole with its last words.
+"""
+
+import ctypes
+import fcntl
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import IO
+
+import httpx
+from stickslip_schemas.store import write_durably
+
+from stickslip_services.addresses import is_loopback
+from stickslip_services.errors import SupervisorError
+from stickslip_services.local.sockets import listen
+from stickslip_services.settings import Settings
+
+START_SECONDS = 60.0
+"""How long the coordinator may take until it answers [s]; a migration may be slow."""
+SOON_SECONDS = 5.0
+"""A child that dies within this time of its start has failed to start [s]."""
+MAX_FAILED_STARTS = 5
+STOP_SECONDS = {"dispatcher": 6.0, "coordinator": 4.0}
+"""How long each child may take to stop before it is killed [s]."""
+_TICK = 0.1
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LocalService:
+    """What `stickslip up` runs."""
+
+    data: Path
+    host: str
+    port: int
+    slots: int | None = None
+    dispatcher: str | None = None
+    """Another command than `python -m stickslip_workers`, for tests."""
+
+
+@dataclass(slots=True)
+class _Child:
+    name: str
+    command: list[str]
+    log: Path
+    inherited: tuple[int, ...] = ()
+    process: subprocess.Popen[bytes] | None = None
+    started_at: float = 0.0
+    failed_starts: int = 0
+    start_again_at: float = field(default=0.0)
+
+    def start(self) -> None:
+        """Start in a session of its own: Ctrl-C is for the supervisor, which then stops children in order."""
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                self.command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=_die_with_parent,
+                pass_fds=self.inherited,
+            )
+        self.started_at = time.monotonic()
+
+    def restart_if_dead(self, say: Callable[[str], None]) -> None:
+        """Start again if it has died; raise SupervisorError where that is of no use."""
+        if self.process is None:
+            if time.monotonic() >= self.start_again_at:
+                self.start()
+            return
+        if not self._has_ended():
+            return
+        self._kill_group()  # what it has left behind would be in the way of its successor
+        status = self.process.wait()
+        self.process = None
+        lived = time.monotonic() - self.started_at
+        self.failed_starts = self.failed_starts + 1 if lived < SOON_SECONDS else 0
+        how = f"was killed by signal {-status}" if status < 0 else f"exited with status {status}"
+        if self.failed_starts >= MAX_FAILED_STARTS:
+            raise SupervisorError(
+                f"the {self.name} {how}, for the {self.failed_starts}th time within {SOON_SECONDS:g} s of its start. "
+                f"The end of {self.log}:\n{self.last_words()}"
+            )
+        wait = 0.0 if self.failed_starts == 0 else 0.25 * 2**self.failed_starts
+        say(f"the {self.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
+        self.start_again_at = time.monotonic() + wait
+
+    def stop(self, is_urgent: Callable[[], bool]) -> None:
+        """Ask it to stop, and kill it where it does not."""
+        if self.process is None:
+            return
+        if not self._has_ended():
+            self.process.terminate()
+            deadline = time.monotonic() + STOP_SECONDS[self.name]
+            while not self._has_ended() and time.monotonic() < deadline and not is_urgent():
+                time.sleep(_TICK / 2)
+        self._kill_group()
+        self.process.wait()
+
+    def last_words(self) -> str:
+        """Return the end of the log."""
+        try:
+            lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:
+            return "(no log)"
+        return "\n".join(f"  {line}" for line in lines[-15:]) or "  (empty)"
+
+    def _has_ended(self) -> bool:
+        """Tell whether it has ended, but leave it a zombie: its number is its group's, and must not be given away."""
+        assert self.process is not None
+        return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+    def _kill_group(self) -> None:
+        assert self.process is not None
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+
+
+def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable[[str], None] | None = None) -> int:
+    """Run until a signal to stop; return the exit status. Raise SupervisorError."""
+    say = say or (lambda message: print_line(sys.stderr, message))
+    if not is_loopback(service.host):
+        raise SupervisorError(
+            f"host must be a loopback address such as 127.0.0.1, and it is {service.host!r}: this version has no API "
+            "keys, so anyone who reached the port could submit and cancel jobs. From afar, use an SSH tunnel."
+        )
+    data = service.data.absolute()
+    (data / "logs").mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        lock = stack.enter_context(_locked(data / "lock"))
+        signals = stack.enter_context(_stop_signals())
+        # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
+        listener = _listen(service.host, service.port)
+        stack.callback(listener.close)
+        settings = Settings(data=data, host=service.host, port=listener.getsockname()[1])
+        coordinator = _Child(
+            "coordinator",
+            _coordinator_command(settings, listener.fileno()),
+            data / "logs" / "coordinator.log",
+            (lock, listener.fileno()),
+        )
+        dispatcher = _Child("dispatcher", _dispatcher_command(service, settings), data / "logs" / "dispatcher.log")
+        children = [coordinator, dispatcher]
+        try:
+            coordinator.start()
+            if not _wait_until_ready(settings.url, coordinator, signals):
+                return 0
+            write_durably(data / "url", f"{settings.url}\n".encode())
+            dispatcher.start()
+            on_ready(settings.url)
+            while not signals:
+                for child in children:
+                    child.restart_if_dead(say)
+                time.sleep(_TICK)
+            return 0
+        finally:
+            for child in (dispatcher, coordinator):  # so that the dispatcher can still give its leases back
+                child.stop(lambda: len(signals) > 1)
+            (data / "url").unlink(missing_ok=True)
+
+
+def print_line(stream: IO[str], message: str) -> None:
+    """Write a line at once."""
+    stream.write(f"{time.strftime('%H:%M:%S')} {message}\n")
+    stream.flush()
+
+
+def _coordinator_command(settings: Settings, listener: int) -> list[str]:
+    module = "stickslip_services.coordinator"
+    place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
+    return [sys.executable, "-m", module, *place]
+
+
+def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
+    program = [sys.executable, "-m", "stickslip_workers"]
+    if service.dispatcher is not None:
+        program = shlex.split(service.dispatcher)
+    slots = [] if service.slots is None else ["--slots", str(service.slots)]
+    return [*program, "dispatch", "--url", settings.url, "--store", str(settings.store_root), "--name", "local", *slots]
+
+
+def _wait_until_ready(url: str, coordinator: _Child, signals: list[int]) -> bool:
+    """Return True when the coordinator answers, False if it is to stop before; raise SupervisorError."""
+    deadline = time.monotonic() + START_SECONDS
+    with httpx.Client(base_url=url, timeout=2.0, trust_env=False) as client:
+        while not signals:
+            assert coordinator.process is not None
+            if coordinator.process.poll() is not None:
+                raise SupervisorError(f"the coordinator does not start:\n{coordinator.last_words()}")
+            try:
+                if client.get("/readyz").is_success:
+                    return True
+            except httpx.TransportError:
+                pass
+            if time.monotonic() > deadline:
+                raise SupervisorError(
+                    f"the coordinator does not answer within {START_SECONDS:g} s:\n{coordinator.last_words()}"
+                )
+            time.sleep(_TICK / 2)
+    return False
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[int]:
+    """Hold the lock of a data directory; the coordinator inherits it, so that it is held while one of them lives."""
+    with path.open("a+") as file:
+        deadline = time.monotonic() + 10
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                holder = path.read_text(encoding="utf-8").strip()
+                # If the holder was killed, its coordinator is about to follow it.
+                if _is_alive(holder) or time.monotonic() > deadline:
+                    raise SupervisorError(f"{path.parent} is in use by another `stickslip up` (pid {holder})") from None
+                time.sleep(_TICK)
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        os.set_inheritable(file.fileno(), True)
+        yield file.fileno()
+
+
+def _is_alive(pid: str) -> bool:
+    if not pid.isdecimal():
+        return False
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+@contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """Collect signals to stop instead of dying of them."""
+    caught: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        caught.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        listener = listen(host, port)
+    except OSError as error:
+        raise SupervisorError(
+            f"cannot listen on {host}:{port}: {error.strerror}. `--port 0` takes any free port."
+        ) from error
+    listener.listen(512)
+    listener.set_inheritable(True)
+    return listener
+
+
+def _die_with_parent() -> None:
+    """Let the kernel end this process when the supervisor dies, however it dies [prctl(2)]."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -1,0 +1,1 @@
+"""The durable queue: from a spec to tasks, leases and results."""

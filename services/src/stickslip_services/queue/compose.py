@@ -1,0 +1,212 @@
+"""Composing a task at the time of its lease: what it is, and where the results lie that it builds on."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, func, insert, select
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.samples import dataset_id
+from stickslip_schemas.states import Stage, TaskState
+from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
+
+from stickslip_services.database.database import batches
+from stickslip_services.database.tables import dataset_versions, jobs, samples, task_dependencies, tasks
+from stickslip_services.errors import ConflictError, NotFoundError
+from stickslip_services.queue.ids import task_id, task_key
+
+AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTask:
+    """The columns of a task that say what it is."""
+
+    seq: int
+    stage: Stage
+    payload: str
+    preview: bool
+
+
+def compose_tasks(connection: Connection, stored: Sequence[StoredTask]) -> dict[int, AnyTask]:
+    """Return the tasks by `seq`; all that they depend on has to be settled."""
+    composers: Mapping[Stage, Callable[[Connection, list[StoredTask]], dict[int, AnyTask]]] = {
+        Stage.simulate: _simulate_tasks,
+        Stage.render: _render_tasks,
+        Stage.pack: lambda connection, group: {task.seq: _pack_task(connection, task) for task in group},
+        Stage.publish: lambda connection, group: {task.seq: _publish_task(connection, task) for task in group},
+    }
+    composed: dict[int, AnyTask] = {}
+    for stage, compose in composers.items():
+        if group := [task for task in stored if task.stage is stage]:
+            composed |= compose(connection, group)
+    return composed
+
+
+def find_task(connection: Connection, name: str) -> AnyTask:
+    """Return a task by its name; raise NotFoundError, or ConflictError where what it builds on is not there yet."""
+    key = task_key(name)
+    columns = (tasks.c.seq, tasks.c.stage, tasks.c.payload, tasks.c.preview, tasks.c.waiting_on)
+    row = None if key is None else connection.execute(select(*columns).where(tasks.c.key == key)).one_or_none()
+    if key is None or row is None or task_id(row.stage, key) != name:
+        raise NotFoundError(f"there is no task {name[:100]!r}")
+    if row.waiting_on:
+        raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
+    if row.stage == Stage.render and _record_of(connection, row.seq) is None:
+        raise ConflictError(f"task {name} has nothing to render: its simulation was rejected")
+    return compose_tasks(connection, [StoredTask(row.seq, Stage(row.stage), row.payload, row.preview)])[row.seq]
+
+
+def _record_of(connection: Connection, render: int) -> str | None:
+    query = select(tasks.c.output).join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
+    return connection.scalar(query.where(task_dependencies.c.task == render))
+
+
+def _simulate_tasks(_connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
+    return {
+        task.seq: task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}') for task in group
+    }
+
+
+def _render_tasks(connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
+    outputs = dict(
+        row
+        for batch in batches(task.seq for task in group)
+        for row in connection.execute(
+            select(task_dependencies.c.task, tasks.c.output)
+            .join(tasks, tasks.c.seq == task_dependencies.c.depends_on)
+            .where(task_dependencies.c.task.in_(batch))
+        )
+    )
+    composed: dict[int, AnyTask] = {}
+    for task in group:
+        record = json.loads(outputs[task.seq] or "null")["record"]
+        composed[task.seq] = RenderTask.model_validate(
+            {"render": json.loads(task.payload), "record": record, "preview": task.preview}
+        )
+    return composed
+
+
+def _pack_task(connection: Connection, task: StoredTask) -> PackTask:
+    payload = json.loads(task.payload)
+    spec, _ = _job_spec(connection, payload["job"])
+    first = payload["shard"] * spec.samples_per_shard
+    slots = _slots(connection, payload["job"], first=first, count=spec.samples_per_shard)
+    return PackTask.model_validate({"spec": spec, "shard": payload["shard"], "slots": slots})
+
+
+def _slots(connection: Connection, job: int, *, first: int, count: int) -> list[dict[str, Any]]:
+    simulated, rendered = tasks.alias(), tasks.alias()
+    rows = connection.execute(
+        select(
+            samples.c.slot,
+            samples.c.key,
+            samples.c.split,
+            samples.c.labels,
+            samples.c.render_task,
+            simulated.c.output.label("simulate_output"),
+            rendered.c.output.label("render_output"),
+            func.coalesce(rendered.c.state, simulated.c.state).label("state"),
+            func.coalesce(rendered.c.reason, simulated.c.reason).label("reason"),
+            func.coalesce(rendered.c.message, simulated.c.message).label("message"),
+        )
+        .join(simulated, simulated.c.seq == samples.c.simulate_task)
+        .outerjoin(rendered, rendered.c.seq == samples.c.render_task)
+        .where(samples.c.job == job, samples.c.slot >= first, samples.c.slot < first + count)
+        .order_by(samples.c.slot)
+    )
+    slots = []
+    for row in rows:
+        labels = json.loads(row.labels)
+        slot: dict[str, Any] = {"slot": row.slot, "sample_key": row.key.hex(), "split": row.split}
+        if row.state == TaskState.rejected:
+            slot["labels"] = labels
+            slot["rejection"] = {
+                "slot": row.slot,
+                "sample_key": row.key.hex(),
+                "reason": row.reason,
+                "message": row.message,
+                "labels": labels,
+            }
+        else:
+            simulation = json.loads(row.simulate_output)
+            render = json.loads(row.render_output) if row.render_task is not None else {"labels": {}, "chunks": {}}
+            slot["labels"] = labels | simulation["labels"] | render["labels"]
+            slot["record"] = simulation["record"]
+            slot["chunks"] = render["chunks"]
+        slots.append(slot)
+    return slots
+
+
+def _publish_task(connection: Connection, task: StoredTask) -> PublishTask:
+    payload = json.loads(task.payload)
+    job = payload["job"]
+    spec, builds = _job_spec(connection, job)
+    dataset = dataset_id(spec)
+    outputs = connection.scalars(
+        select(tasks.c.output)
+        .join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
+        .where(task_dependencies.c.task == task.seq)
+    )
+    files = [file for output in outputs if output for file in json.loads(output)["files"]]
+    files.sort(key=lambda file: str(file["path"]))
+    keys = connection.scalars(select(samples.c.key).where(samples.c.job == job).order_by(samples.c.slot))
+    return PublishTask.model_validate(
+        {
+            "spec": spec,
+            "dataset": dataset,
+            "version": find_version(connection, dataset, task.seq),
+            "builds": builds,
+            "files": files,
+            "sample_keys": [key.hex() for key in keys],
+            "rejections": rejections(connection, job),
+            "certificate": payload.get("certificate"),
+        }
+    )
+
+
+def rejections(connection: Connection, job: int) -> list[dict[str, Any]]:
+    """Return the rejected samples of a job, by slot."""
+    last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
+    rows = connection.execute(
+        select(samples.c.slot, samples.c.key, samples.c.labels, tasks.c.reason, tasks.c.message)
+        .join(tasks, tasks.c.seq == last)
+        .where(samples.c.job == job, tasks.c.state == TaskState.rejected)
+        .order_by(samples.c.slot)
+    )
+    return [
+        {
+            "slot": row.slot,
+            "sample_key": row.key.hex(),
+            "reason": row.reason,
+            "message": row.message,
+            "labels": json.loads(row.labels),
+        }
+        for row in rows
+    ]
+
+
+def find_version(connection: Connection, dataset: str, publish_task: int) -> int:
+    """Return the number of the version that a publish task makes: the one it has been given, or else the next."""
+    mine = connection.scalar(select(dataset_versions.c.version).where(dataset_versions.c.publish_task == publish_task))
+    if mine is not None:
+        return int(mine)
+    query = select(func.coalesce(func.max(dataset_versions.c.version), 0)).where(dataset_versions.c.dataset == dataset)
+    return int(connection.scalar(query) or 0) + 1
+
+
+def reserve_version(connection: Connection, task: StoredTask) -> None:
+    """Give a publish task the number of its version, for good, so that no other takes it."""
+    spec, _ = _job_spec(connection, json.loads(task.payload)["job"])
+    dataset = dataset_id(spec)
+    taken = select(dataset_versions.c.version).where(dataset_versions.c.publish_task == task.seq)
+    if connection.scalar(taken) is None:
+        version = find_version(connection, dataset, task.seq)
+        connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=task.seq))
+
+
+def _job_spec(connection: Connection, job: int) -> tuple[Any, Builds]:
+    row = connection.execute(select(jobs.c.spec, jobs.c.builds).where(jobs.c.seq == job)).one()
+    return job_spec_adapter.validate_json(row.spec), Builds.model_validate_json(row.builds)

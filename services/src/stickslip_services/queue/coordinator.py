@@ -1,0 +1,337 @@
+"""The coordinator's verbs: everything that changes something by a rule, each as one or two transactions.
+
+What only reads is not here: routes ask `jobs`, `workers` and the catalog.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from sqlalchemy import Connection
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.layout import layout
+from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
+from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import PublishOutput, TaskResult
+from stickslip_schemas.worker_api import (
+    Heartbeat,
+    HeartbeatAnswer,
+    LeaseBatch,
+    LeaseRequest,
+    Report,
+    ReportAnswer,
+    ReportBatch,
+    WorkerRegistration,
+    WorkerSession,
+)
+
+from stickslip_services.catalog.certificates import insert_certificate, store_certificate
+from stickslip_services.catalog.versions import ManifestSummary, read_version
+from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.database import migrate
+from stickslip_services.database.database import Database
+from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.queue.bell import Bell
+from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.events import set_job_state
+from stickslip_services.queue.jobs import (
+    Replay,
+    cancel_job,
+    find_replay,
+    fingerprint,
+    has_runnable_job,
+    keep_replay,
+    pause_job,
+    resume_job,
+    show_job,
+    unplanned_jobs,
+)
+from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
+from stickslip_services.queue.ledger import Ledger
+from stickslip_services.queue.planning import Plan, collector_at_rest, expand
+from stickslip_services.queue.reports import take_reports
+from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
+from stickslip_services.queue.stranded import find_stranded, note_stranded
+from stickslip_services.queue.submitting import count_settled, insert_job, plan_job
+from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.workers import (
+    RegisteredWorker,
+    find_worker,
+    insert_worker,
+    note_seen,
+    other_sessions,
+    present_workers,
+)
+from stickslip_services.settings import Settings
+
+_NO_BUILDS = Builds(**dict.fromkeys(Builds.model_fields, "0" * 64))
+"""Stands in where simulations are only counted."""
+
+BUSY_POLL_SECONDS = 0.2
+IDLE_POLL_SECONDS = 1.0
+
+
+@dataclass(slots=True)
+class Coordinator:
+    """The queue, the store's index and the clock."""
+
+    settings: Settings
+    clock: Clock = field(default_factory=steady_clock)
+    bell: Bell = field(default_factory=Bell)
+    database: Database = field(init=False)
+    store: Store = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.database = Database(self.settings.database_path, durable=self.settings.durable)
+        self.store = Store(self.settings.store_root)
+
+    def start(self) -> None:
+        """Bring the database up to date and take up the work where it was left."""
+        with self.database.write() as connection:
+            migrate.upgrade(connection)
+            renew_all_leases(connection, self.clock(), self.settings)
+        self.plan_waiting_jobs()
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self.database.close()
+
+    @contextmanager
+    def _book(self) -> Iterator[Ledger]:
+        with self.database.write() as connection, ledger(connection, self.clock()) as book:
+            yield book
+        self.bell.ring()
+
+    # --- users ----------------------------------------------------------------------------------------------------
+
+    def validate(self, spec: JobSpec) -> Validation:
+        """Tell what a job would be."""
+        with self.database.read() as connection:
+            terms = terms_for(connection, spec)
+        with collector_at_rest():
+            plan = self._expand(spec, terms or Terms(_NO_BUILDS, None))
+        with self.database.read() as connection:
+            cached = None if terms is None else count_settled(connection, plan.tasks)
+        return Validation(
+            spec=spec,
+            spec_digest=spec.content_digest,
+            sample_count=spec.sample_count,
+            simulation_count=plan.simulation_count,
+            cached_count=cached,
+            bytes_estimate=spec.sample_count * sum(array.sample_bytes for array in layout(spec)),
+            certificate=plan.certificate,
+        )
+
+    def submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
+        """Make a job of a spec; with a key that has been here before, return the first answer."""
+        with collector_at_rest():
+            return self._submit(spec, idempotency_key)
+
+    def _submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
+        print_ = fingerprint(spec)
+        plan: Plan | None = None
+        while True:
+            with self.database.read() as connection:
+                if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
+                    return replay
+                terms = terms_for(connection, spec)
+            if terms is not None and (plan is None or Terms(plan.builds, plan.certificate) != terms):
+                plan = self._expand(spec, terms)
+            with self.database.write() as connection:
+                if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
+                    return replay
+                if terms_for(connection, spec) != terms:
+                    continue  # a worker with other builds has registered in between, or a certificate
+                now = self.clock()
+                with ledger(connection, now) as book:
+                    job = insert_job(book, spec, plan)
+                shown = self.show(connection, job)
+                if idempotency_key:
+                    keep_replay(connection, idempotency_key, print_, job, shown.model_dump_json(), now)
+            self.bell.ring()
+            return shown
+
+    def cancel(self, job_id: str) -> JobDetail:
+        """Cancel a job."""
+        with self._book() as book:
+            job = cancel_job(book, job_id)
+        return self._shown(job)
+
+    def pause(self, job_id: str) -> JobDetail:
+        """Pause a job."""
+        with self._book() as book:
+            job = pause_job(book, job_id)
+        return self._shown(job)
+
+    def resume(self, job_id: str) -> JobDetail:
+        """Let a paused job go on, with the builds that it was planned for."""
+        with self._book() as book:
+            job = resume_job(book, job_id)
+        self.plan_waiting_jobs()
+        self._note_stranded()
+        return self._shown(job)
+
+    def _shown(self, job: int) -> JobDetail:
+        with self.database.read() as connection:
+            return self.show(connection, job)
+
+    def show(self, connection: Connection, job: int) -> JobDetail:
+        """Return a job as a transaction sees it."""
+        return show_job(connection, job, self.alive_workers(connection))
+
+    def add_certificate(self, upload: CertificateUpload) -> CertificateEntry:
+        """Register a certificate."""
+        stored = store_certificate(self.store, upload)
+        with self.database.write() as connection:
+            return insert_certificate(connection, upload, stored, self.clock())
+
+    # --- workers --------------------------------------------------------------------------------------------------
+
+    def register(self, registration: WorkerRegistration) -> WorkerSession:
+        """Let a worker in; it takes the leases of an earlier session of its name away."""
+        with self._book() as book:
+            old = other_sessions(book.connection, registration.name)
+            worker = insert_worker(book.connection, registration, book.now)
+            message = f"worker {registration.name} was started anew"
+            lose(book, find_held(book, owners=old), self.settings, message=message)
+        self.plan_waiting_jobs()
+        self._note_stranded()
+        return WorkerSession(worker_id=worker.id, lease_seconds=self.settings.lease_seconds)
+
+    def lease(self, request: LeaseRequest) -> LeaseBatch:
+        """Lease tasks to a worker."""
+        self._take_back()
+        worker = self._meet(request.worker_id)
+        if worker.superseded:
+            raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
+        wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+        with self.database.read() as connection:
+            ready = has_ready_task(connection, worker, wanted.keys())
+            waiting = has_runnable_job(connection)
+        if not ready:
+            return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
+        with self._book() as book:
+            leases = grant_leases(book, find_worker(book.connection, worker.id), wanted, self.settings)
+        return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
+
+    def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
+        """Renew a worker's leases and tell it what to drop."""
+        worker = self._meet(heartbeat.worker_id)
+        if not heartbeat.leases:
+            return HeartbeatAnswer(drop=())
+        with self._book() as book:
+            drop = renew_leases(book, find_worker(book.connection, worker.id), heartbeat.leases, self.settings)
+        return HeartbeatAnswer(drop=drop)
+
+    def report(self, batch: ReportBatch) -> ReportAnswer:
+        """Take results in."""
+        worker = self._meet(batch.worker_id)
+        versions: dict[str, ManifestSummary] = {}
+        reports = [self._with_manifest(report, versions) for report in batch.reports]
+        with self._book() as book:
+            taken = take_reports(book, worker.id, reports, versions)
+            give_back(book, taken.released)
+            fail_tries(book, taken.failures, self.settings)
+        return ReportAnswer(verdicts=taken.verdicts)
+
+    def _with_manifest(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:
+        """Read the manifest that a publish report names; a report whose manifest does not hold is a failure."""
+        if report.result is None or not isinstance(report.result.output, PublishOutput):
+            return report
+        output = report.result.output
+        try:
+            versions[report.task_id] = read_version(self.store, output.manifest, output.bytes)
+        except (OSError, ValueError) as error:
+            failure = TaskResult(
+                outcome="failed",
+                reason=Reason.storage_error,
+                message=f"the published manifest {output.manifest} does not hold: {error}"[:2000],
+                cpu_seconds=report.result.cpu_seconds,
+                wall_seconds=report.result.wall_seconds,
+            )
+            return report.model_copy(update={"result": failure})
+        return report
+
+    def _meet(self, worker_id: str) -> RegisteredWorker:
+        """Return a worker that has just been heard of."""
+        now = self.clock()
+        with self.database.read() as connection:
+            worker = find_worker(connection, worker_id)
+        if now - worker.last_seen_at > self.settings.lease_seconds / 4:  # a poll is not worth a write each time
+            with self.database.write() as connection:
+                note_seen(connection, worker_id, now)
+        return worker
+
+    # --- the coordinator itself ------------------------------------------------------------------------------------
+
+    def sweep(self) -> None:
+        """Take back expired leases, let due retries go on, and let jobs that nobody serves say so."""
+        self._take_back()
+        self._note_stranded()
+
+    def _take_back(self) -> None:
+        with self.database.read() as connection:
+            due = is_sweep_due(connection, self.clock())
+        if due:
+            with self._book() as book:
+                sweep(book, self.settings)
+
+    def plan_waiting_jobs(self) -> None:
+        """Plan the jobs that came before the first worker."""
+        with self.database.read() as connection:
+            waiting = unplanned_jobs(connection)
+        for row in waiting:
+            spec = job_spec_adapter.validate_json(row.spec)
+            with self.database.read() as connection:
+                terms: Terms | None = None
+                refusal, reason = "", Reason.waiting_for_worker
+                try:
+                    terms = terms_for(connection, spec)
+                except KindNotAvailableError as error:
+                    refusal = str(error)
+                except PresetNotCertifiedError as error:
+                    refusal, reason = str(error), Reason.preset_not_certified
+                else:
+                    if terms is None:
+                        return
+            plan = None if terms is None else self._expand(spec, terms)
+            with self.database.write() as connection:
+                if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
+                    continue  # cancelled, or planned by somebody else
+                if plan is None:
+                    set_job_state(
+                        connection,
+                        row.seq,
+                        JobState.failed,
+                        self.clock(),
+                        reason=reason,
+                        message=refusal,
+                    )
+                else:
+                    with ledger(connection, self.clock()) as book:
+                        plan_job(book, row.seq, plan)
+            self.bell.ring()
+
+    def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
+        """Return the workers that were heard of within the time that a lease lasts."""
+        return present_workers(connection, seen_since=self.alive_since)
+
+    @property
+    def alive_since(self) -> float:
+        """Since when a worker must have been heard of to be taken for alive."""
+        return self.clock() - self.settings.lease_seconds
+
+    def _expand(self, spec: JobSpec, terms: Terms) -> Plan:
+        return expand(spec, terms.builds, certificate=terms.certificate, previews=self.settings.previews_per_job)
+
+    def _note_stranded(self) -> None:
+        with self.database.read() as connection:
+            stranded = find_stranded(connection, self.clock(), self.settings)
+        if stranded:
+            with self.database.write() as connection:
+                note_stranded(connection, self.clock(), self.settings)
+            self.bell.ring()

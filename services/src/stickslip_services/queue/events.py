@@ -1,0 +1,73 @@
+"""States and events of jobs: an event is written in the transaction that makes it true, and read by event streams.
+
+Progress is not written: it is read from the counters when somebody watches.
+"""
+
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, func, insert, select, update
+from stickslip_schemas.base import Document
+from stickslip_schemas.events import DatasetPublishedEvent, EventName, JobStateEvent, TaskStateEvent
+from stickslip_schemas.responses import DatasetRef
+from stickslip_schemas.states import JobState, Reason
+
+from stickslip_services.database.tables import events, jobs
+
+
+@dataclass(frozen=True, slots=True)
+class StoredEvent:
+    """An event as the stream sends it; `data` is JSON."""
+
+    id: int
+    name: EventName
+    data: str
+
+    @property
+    def is_last(self) -> bool:
+        """True where the job has come to its end with this event."""
+        return self.name is EventName.job_state and JobStateEvent.model_validate_json(self.data).state.is_terminal
+
+
+def set_job_state(
+    connection: Connection,
+    job: int,
+    state: JobState,
+    now: float,
+    *,
+    reason: Reason | None = None,
+    message: str = "",
+) -> None:
+    """Give a job a state with its reason and message, and tell it in an event."""
+    values: dict[str, object] = {"state": state, "reason": reason, "message": message}
+    if state is JobState.running:
+        values["started_at"] = func.coalesce(jobs.c.started_at, now)
+    if state.is_terminal:
+        values["finished_at"] = now
+    connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
+    event = JobStateEvent(state=state, reason=reason, message=message)
+    _append(connection, job, EventName.job_state, event, now)
+
+
+def append_task_state(connection: Connection, job: int, event: TaskStateEvent, now: float) -> None:
+    """Tell that a task of a job came to an end worth telling."""
+    _append(connection, job, EventName.task_state, event, now)
+
+
+def append_published(connection: Connection, job: int, dataset: DatasetRef, now: float) -> None:
+    """Tell that the dataset of a job is there."""
+    _append(connection, job, EventName.dataset_published, DatasetPublishedEvent(dataset=dataset), now)
+
+
+def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
+    """Return the events of a job after the one with the id `after`."""
+    rows = connection.execute(
+        select(events.c.id, events.c.name, events.c.data)
+        .where(events.c.job == job, events.c.id > after)
+        .order_by(events.c.id)
+        .limit(limit)
+    )
+    return [StoredEvent(row.id, EventName(row.name), row.data) for row in rows]
+
+
+def _append(connection: Connection, job: int, name: EventName, data: Document, now: float) -> None:
+    connection.execute(insert(events).values(job=job, name=name, data=data.model_dump_json(), created_at=now))

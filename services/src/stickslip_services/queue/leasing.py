@@ -1,0 +1,227 @@
+"""Leases: who may run which task, and until when.
+
+A lease is (worker, token); the token of a task increments at each lease, so that a worker that lost its lease is told
+from the one that has it. Between jobs the next task goes to the job that has the fewest tasks on lease: a small job
+does not wait behind a big one, and jobs of one size share evenly. Within a job and stage the order is that of the
+slots, so that shards fill up one after the other. How many tasks of each stage run is the dispatcher's choice.
+"""
+
+import heapq
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, bindparam, func, select, text, update
+from stickslip_schemas.states import Stage, TaskState
+from stickslip_schemas.worker_api import Lease, LeaseState
+
+from stickslip_services.database.database import batches
+from stickslip_services.database.tables import job_counts, jobs, tasks
+from stickslip_services.queue.compose import StoredTask, compose_tasks, reserve_version
+from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.queue.ledger import (
+    RUNNABLE,
+    HeldTask,
+    Ledger,
+    cancel_tasks,
+    live_jobs,
+    release,
+    runnable_tasks,
+    start_tasks,
+)
+from stickslip_services.queue.workers import RegisteredWorker
+from stickslip_services.settings import Settings
+
+_READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # in the words of the partial index
+
+
+@dataclass(frozen=True, slots=True)
+class _Ready:
+    seq: int
+    key: bytes
+    stage: Stage
+    payload: str
+    preview: bool
+    token: int
+    attempts: int
+
+
+def has_ready_task(connection: Connection, worker: RegisteredWorker, stages: Iterable[Stage]) -> bool:
+    """Tell whether a lease request of these stages would be granted anything."""
+    return any(
+        connection.scalar(
+            select(tasks.c.seq)
+            .where(
+                _READY,
+                tasks.c.stage == stage,
+                tasks.c.build == build,
+                tasks.c.kind == kind,
+                tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))),
+            )
+            .limit(1)
+        )
+        for kind in worker.kinds
+        for stage, build in worker.stage_builds(kind).items()
+        if stage in stages
+    )
+
+
+def grant_leases(
+    book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings
+) -> tuple[Lease, ...]:
+    """Lease up to the wanted number of tasks of each stage to `worker`."""
+    granted: list[_Ready] = []
+    for stage in reversed(Stage):  # what is nearest to a dataset first
+        count = min(wanted.get(stage, 0), settings.lease_limit)
+        if count > 0:
+            granted.extend(_pick(book.connection, worker, stage, count))
+    if not granted:
+        return ()
+    for task in granted:
+        book.moved(task.seq, task.stage, TaskState.pending, TaskState.leased)
+    book.connection.execute(
+        update(tasks)
+        .where(tasks.c.seq == bindparam("b_seq"))
+        .values(
+            state=TaskState.leased,
+            token=bindparam("b_token"),
+            owner=worker.id,
+            expires_at=book.now + settings.lease_seconds,
+        ),
+        [{"b_seq": task.seq, "b_token": task.token + 1} for task in granted],
+    )
+    stored = [StoredTask(task.seq, task.stage, task.payload, task.preview) for task in granted]
+    for publish in (task for task in stored if task.stage is Stage.publish):
+        reserve_version(book.connection, publish)
+    composed = compose_tasks(book.connection, stored)
+    return tuple(
+        Lease(
+            task_id=task_id(task.stage, task.key),
+            token=task.token + 1,
+            attempt=task.attempts + 1,
+            task=composed[task.seq],
+        )
+        for task in granted
+    )
+
+
+def _pick(connection: Connection, worker: RegisteredWorker, stage: Stage, count: int) -> list[_Ready]:
+    """Choose ready tasks of a stage, one at a time from the job that has the fewest on lease."""
+    queue: list[tuple[int, int, list[_Ready]]] = []  # tasks on lease, job, its ready tasks in reverse order
+    for job, on_lease in _jobs_with_pending(connection, stage):
+        if ready := _ready_tasks(connection, worker, stage, job, count):
+            queue.append((on_lease, job, ready[::-1]))
+    heapq.heapify(queue)
+    picked: list[_Ready] = []
+    while queue and len(picked) < count:
+        on_lease, job, ready = queue[0]
+        picked.append(ready.pop())
+        if ready:
+            heapq.heapreplace(queue, (on_lease + 1, job, ready))
+        else:
+            heapq.heappop(queue)
+    return picked
+
+
+def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int]]:
+    """Return (job, number of tasks of the stage on lease) of the runnable jobs that wait for tasks of the stage."""
+    counts = job_counts.c
+    on_lease = func.sum(counts.count).filter(counts.state.in_((TaskState.leased, TaskState.running)))
+    pending = func.sum(counts.count).filter(counts.state == TaskState.pending)
+    rows = connection.execute(
+        select(counts.job, func.coalesce(on_lease, 0))
+        .join(jobs, jobs.c.seq == counts.job)
+        .where(jobs.c.state.in_(RUNNABLE), counts.stage == stage)
+        .group_by(counts.job)
+        .having(pending > 0)
+    )
+    return [(job, held) for job, held in rows]
+
+
+def _ready_tasks(connection: Connection, worker: RegisteredWorker, stage: Stage, job: int, count: int) -> list[_Ready]:
+    found: list[_Ready] = []
+    for kind in worker.kinds:
+        rows = connection.execute(
+            select(tasks.c.seq, tasks.c.key, tasks.c.payload, tasks.c.preview, tasks.c.token, tasks.c.attempts)
+            .where(
+                _READY,
+                tasks.c.stage == stage,
+                tasks.c.build == worker.stage_builds(kind)[stage],
+                tasks.c.kind == kind,
+                tasks.c.job == job,
+            )
+            .order_by(tasks.c.seq)
+            .limit(count)
+            .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
+        )
+        found.extend(_Ready(row.seq, row.key, stage, row.payload, row.preview, row.token, row.attempts) for row in rows)
+    return found
+
+
+def renew_leases(
+    book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState], settings: Settings
+) -> tuple[str, ...]:
+    """Renew leases, note which tasks have been started, and return the tasks that the worker has to drop."""
+    drop: list[str] = []
+    mine: list[tuple[LeaseState, HeldTask]] = []
+    keys = {state.task_id: task_key(state.task_id) for state in held}
+    columns = (tasks.c.key, tasks.c.seq, tasks.c.stage, tasks.c.state, tasks.c.tries, tasks.c.token, tasks.c.owner)
+    rows = {
+        row.key: row
+        for batch in batches(key for key in keys.values() if key is not None)
+        for row in book.connection.execute(select(*columns).where(tasks.c.key.in_(batch)))
+    }
+    for lease in held:
+        row = rows.get(keys[lease.task_id] or b"")
+        if row is None or row.owner != worker.id or row.token != lease.token or worker.superseded:
+            drop.append(lease.task_id)
+        else:
+            mine.append((lease, HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries)))
+    unneeded = _unneeded(book, mine)
+    cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
+    halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
+    for _, task in mine:
+        if task.seq in halted:
+            release(book, task, TaskState.pending)
+    drop.extend(lease.task_id for lease, task in mine if task.seq in unneeded | halted)
+    kept = [(lease, task) for lease, task in mine if task.seq not in unneeded | halted]
+    for batch in batches(kept):
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq.in_([task.seq for _, task in batch]))
+            .values(expires_at=book.now + settings.lease_seconds)
+        )
+    started = [task for lease, task in kept if lease.started and task.state is TaskState.leased]
+    start_tasks(book, [(task.seq, task.stage) for task in started])
+    return tuple(drop)
+
+
+def renew_all_leases(connection: Connection, now: float, settings: Settings) -> None:
+    """Give every lease its full time again: while the coordinator was down, no heartbeat could arrive."""
+    connection.execute(
+        update(tasks).where(text("tasks.owner IS NOT NULL")).values(expires_at=now + settings.lease_seconds)
+    )
+
+
+def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
+    """Return the tasks to cancel: those of jobs being cancelled, and of ended jobs those that have not been started.
+
+    What a failed job had already started is left to finish: it is paid for, and kept for the next time.
+    """
+    seqs = [task.seq for _, task in held]
+    needed = live_jobs(book.connection, seqs)
+    cancelling = book.holders(seq for seq in seqs if seq not in needed)
+    return {
+        task.seq
+        for lease, task in held
+        if task.seq not in needed and (task.seq in cancelling or not _is_started(lease, task))
+    }
+
+
+def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
+    """Return the tasks to give back: those that only paused jobs need and that have not been started."""
+    waiting = {task.seq for lease, task in held if not _is_started(lease, task)}
+    return live_jobs(book.connection, waiting).keys() - runnable_tasks(book.connection, waiting)
+
+
+def _is_started(lease: LeaseState, task: HeldTask) -> bool:
+    return lease.started or task.state is TaskState.running

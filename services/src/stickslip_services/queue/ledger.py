@@ -1,0 +1,240 @@
+"""The ledger of one write transaction: what it does to tasks, and which jobs it ends.
+
+Who changes `tasks.state` tells the ledger. `closing.close` then brings counters and jobs up to date, in the same
+transaction.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, bindparam, case, select, update
+from stickslip_schemas.events import TaskStateEvent
+from stickslip_schemas.responses import DatasetRef
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+
+from stickslip_services.database.database import batches
+from stickslip_services.database.tables import job_tasks, jobs, tasks
+
+RUNNABLE = (JobState.queued, JobState.running)
+"""States of a job whose tasks may be leased."""
+
+LIVE = (*RUNNABLE, JobState.pausing, JobState.paused)
+"""States of a job that needs its tasks."""
+
+OPEN = (*LIVE, JobState.cancelling)
+"""States of a job whose counters follow its tasks; those of an ended job stay as they were at its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A job that has a task, and whether the task was settled before the job came."""
+
+    job: int
+    cached: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a job ends, and which dataset version it has made or found."""
+
+    state: JobState
+    reason: Reason | None
+    message: str
+    dataset: DatasetRef | None = None
+    rejected_count: int = 0
+
+    @staticmethod
+    def published(dataset: DatasetRef, *, sample_count: int, rejected_count: int) -> "Ending":
+        """Return the ending of a job whose dataset version exists."""
+        if rejected_count == 0:
+            return Ending(JobState.succeeded, None, "", dataset)
+        message = f"{rejected_count} of {sample_count} samples were rejected; the dataset lists them with their reasons"
+        return Ending(JobState.succeeded_with_rejects, None, message, dataset, rejected_count)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A task that was really run: what it cost."""
+
+    task: int
+    stage: Stage
+    kind: str
+    cpu_seconds: float
+    wall_seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A task that has gone from one state to another."""
+
+    task: int
+    stage: Stage
+    old: TaskState
+    new: TaskState
+
+
+@dataclass(frozen=True, slots=True)
+class HeldTask:
+    """A task on lease, or one that was a moment ago."""
+
+    seq: int
+    key: bytes
+    stage: Stage
+    state: TaskState
+    tries: int
+
+
+class Ledger:
+    """What one write transaction does to tasks."""
+
+    def __init__(self, connection: Connection, now: float) -> None:
+        self.connection = connection
+        self.now = now
+        self.moves: list[Move] = []
+        self.runs: list[Run] = []
+        self.inserted: Counter[tuple[Stage, TaskState]] = Counter()
+        """New tasks by stage and state."""
+        self.news: list[tuple[int, TaskStateEvent]] = []
+        self.endings: dict[int, Ending] = {}
+
+    def moved(self, task: int, stage: str, old: str, new: TaskState) -> None:
+        """Note that a task has gone from one state to another."""
+        self.moves.append(Move(task, Stage(stage), TaskState(old), new))
+
+    def ran(self, run: Run) -> None:
+        """Note what a task cost."""
+        self.runs.append(run)
+
+    def tell(self, task: int, event: TaskStateEvent) -> None:
+        """Note what all jobs of a task are to be told."""
+        self.news.append((task, event))
+
+    def end_job(self, job: int, ending: Ending) -> None:
+        """Note that a live job ends here; the first ending counts."""
+        self.endings.setdefault(job, ending)
+
+    def holders(self, task_seqs: Iterable[int]) -> dict[int, list[Holder]]:
+        """Return the open jobs of each task."""
+        found: dict[int, list[Holder]] = {}
+        for batch in batches(set(task_seqs)):
+            rows = self.connection.execute(
+                select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached)
+                .join(jobs, jobs.c.seq == job_tasks.c.job)
+                .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(OPEN))
+            )
+            for task, job, cached in rows:
+                found.setdefault(task, []).append(Holder(job, cached))
+        return found
+
+
+def give_up_tasks(book: Ledger, job: int, *, ending: Collection[int] = ()) -> None:
+    """Cancel the waiting tasks of a job that is ending; leave those that another live job, not `ending`, needs.
+
+    Tasks that are leased are left: they end by themselves, or the next heartbeat drops them.
+    """
+    for batch in batches(_waiting_tasks(book.connection, job)):
+        chargeable = live_jobs(book.connection, [seq for seq, _, _ in batch], but=ending)
+        _charge(book.connection, chargeable)
+        cancel_tasks(book, [row for row in batch if row[0] not in chargeable])
+
+
+def charge_waiting_tasks(connection: Connection, job: int) -> None:
+    """Charge each waiting task of a live job to the job that it is to run for: a runnable one where there is one.
+
+    Called whenever a job starts or stops being runnable, for a task is leased only on behalf of the job it is
+    charged to.
+    """
+    for batch in batches(seq for seq, _, _ in _waiting_tasks(connection, job)):
+        _charge(connection, live_jobs(connection, batch))
+
+
+def _waiting_tasks(connection: Connection, job: int) -> list[tuple[int, str, str]]:
+    """Return (seq, stage, state) of the tasks of a job that wait to be leased."""
+    rows = connection.execute(
+        select(tasks.c.seq, tasks.c.stage, tasks.c.state)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.state.in_((TaskState.pending, TaskState.soft_failed)))
+    )
+    return [(seq, stage, state) for seq, stage, state in rows]
+
+
+def _charge(connection: Connection, job_of: dict[int, int]) -> None:
+    charges = [{"b_seq": task, "b_job": job} for task, job in job_of.items()]
+    if charges:
+        connection.execute(
+            update(tasks).where(tasks.c.seq == bindparam("b_seq")).values(job=bindparam("b_job")), charges
+        )
+
+
+def cancel_tasks(book: Ledger, rows: Collection[tuple[int, str, str]]) -> None:
+    """Cancel tasks (seq, stage, state), whoever has them on lease."""
+    if not rows:
+        return
+    book.connection.execute(
+        update(tasks)
+        .where(tasks.c.seq.in_([row[0] for row in rows]))
+        .values(
+            state=TaskState.cancelled,
+            reason=Reason.cancelled,
+            message="no job needs it",
+            owner=None,
+            expires_at=None,
+            retry_at=None,
+            finished_at=book.now,
+        )
+    )
+    for seq, stage, state in rows:
+        book.moved(seq, stage, state, TaskState.cancelled)
+
+
+def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) -> None:
+    """Take a task off its lease into another state; `values` are further columns to write."""
+    book.connection.execute(
+        update(tasks).where(tasks.c.seq == task.seq).values(state=state, owner=None, expires_at=None, **values)
+    )
+    book.moved(task.seq, task.stage, task.state, state)
+
+
+def start_tasks(book: Ledger, leased: Collection[tuple[int, str]]) -> None:
+    """Note that leased tasks (seq, stage) have been started: from here on they may fail."""
+    for batch in batches(leased):
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq.in_([seq for seq, _ in batch]))
+            .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=book.now)
+        )
+    for seq, stage in leased:
+        book.moved(seq, stage, TaskState.leased, TaskState.running)
+
+
+def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collection[int] = ()) -> dict[int, int]:
+    """Return, for each of the tasks that have any, its oldest runnable job, or else its oldest live one.
+
+    Jobs in `but` are left out.
+    """
+    found: dict[int, tuple[int, int]] = {}
+    is_halted = case((jobs.c.state.in_(RUNNABLE), 0), else_=1)
+    for batch in batches(task_seqs):
+        rows = connection.execute(
+            select(job_tasks.c.task, is_halted, job_tasks.c.job)
+            .join(jobs, jobs.c.seq == job_tasks.c.job)
+            .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(LIVE))
+        )
+        for task, halted, job in rows:
+            if job not in but:
+                found[task] = min((halted, job), found.get(task, (halted, job)))
+    return {task: job for task, (_, job) in found.items()}
+
+
+def runnable_tasks(connection: Connection, task_seqs: Iterable[int]) -> set[int]:
+    """Return those of the tasks that a runnable job needs."""
+    return {
+        task
+        for batch in batches(task_seqs)
+        for task in connection.scalars(
+            select(job_tasks.c.task)
+            .join(jobs, jobs.c.seq == job_tasks.c.job)
+            .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(RUNNABLE))
+        )
+    }

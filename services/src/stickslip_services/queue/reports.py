@@ -1,0 +1,271 @@
+"""Reports: how leased tasks ended. The first result of the holder of the lease is the task's result, for ever.
+
+A dataset version is committed by the very transaction that accepts the report of its publish task.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+from sqlalchemy import bindparam, insert, select, update
+from stickslip_schemas.events import TaskStateEvent
+from stickslip_schemas.states import Reason, Stage, TaskState
+from stickslip_schemas.tasks import PublishOutput, RenderOutput, TaskResult
+from stickslip_schemas.worker_api import Report, ReportVerdict
+
+from stickslip_services.catalog.versions import ManifestSummary, commit_version, find_committed, find_reserved
+from stickslip_services.database.database import batches
+from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
+from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, Run, start_tasks
+
+Verdict = Literal["accepted", "duplicate", "stale"]
+
+
+class _Row(NamedTuple):
+    seq: int
+    key: bytes
+    stage: Stage
+    kind: str
+    state: TaskState
+    tries: int
+    owner: str | None
+    token: int
+    reported_by: str | None
+    reported_token: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    task: HeldTask
+    kind: str
+    result: TaskResult
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What a batch of reports came to: the verdicts, and the tasks that are for `retrying` to go on with."""
+
+    verdicts: tuple[ReportVerdict, ...]
+    released: tuple[HeldTask, ...]
+    failures: tuple[tuple[HeldTask, Reason, str], ...]
+
+
+def take_reports(
+    book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, ManifestSummary]
+) -> Taken:
+    """Judge each report and write down the results that the accepted ones bring.
+
+    `versions` has, for each publish report by task, what its manifest says; it was read before the transaction.
+    """
+    verdicts: list[ReportVerdict] = []
+    released: list[HeldTask] = []
+    ended: list[_Ended] = []
+    rows = _find(book, reports)
+    for report in reports:
+        row = rows.get(report.task_id)
+        verdict: Verdict = "stale"
+        if row is not None and (row.reported_by, row.reported_token) == (worker_id, report.token):
+            verdict = "duplicate"
+        elif row is not None and (row.owner, row.token) == (worker_id, report.token):
+            verdict = "accepted"
+            rows[report.task_id] = row._replace(owner=None, reported_by=worker_id, reported_token=report.token)
+            task = HeldTask(row.seq, row.key, row.stage, row.state, row.tries)
+            if report.result is None:
+                released.append(task)
+            else:
+                ended.append(_Ended(task, row.kind, _checked(book, task, report.result, versions)))
+        verdicts.append(ReportVerdict(task_id=report.task_id, verdict=verdict))
+    accepted = [*released, *(end.task for end in ended)]
+    for batch in batches(accepted):
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq.in_([task.seq for task in batch]))
+            .values(reported_by=worker_id, reported_token=tasks.c.token)
+        )
+    failures = _take_results(book, ended, versions)
+    return Taken(tuple(verdicts), tuple(released), failures)
+
+
+def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
+    keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
+    columns = tasks.c
+    return {
+        task_id(row.stage, row.key): _Row(
+            row.seq,
+            row.key,
+            Stage(row.stage),
+            row.kind,
+            TaskState(row.state),
+            row.tries,
+            row.owner,
+            row.token,
+            row.reported_by,
+            row.reported_token,
+        )
+        for batch in batches(keys)
+        for row in book.connection.execute(
+            select(
+                columns.seq,
+                columns.key,
+                columns.stage,
+                columns.kind,
+                columns.state,
+                columns.tries,
+                columns.owner,
+                columns.token,
+                columns.reported_by,
+                columns.reported_token,
+            ).where(columns.key.in_(batch))
+        )
+    }
+
+
+def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[str, ManifestSummary]) -> TaskResult:
+    """Return the result, or a failure where it does not answer the task."""
+    name = task_id(task.stage, task.key)
+    wrong: str | None = None
+    reason = Reason.internal_error
+    if result.output is not None and result.output.stage != task.stage:
+        wrong = f"the worker answered with the output of stage {result.output.stage}"
+    elif result.outcome == "rejected" and task.stage in (Stage.pack, Stage.publish):
+        wrong = f"the worker rejected a {task.stage} task, which has no sample to reject: {result.message}"
+    elif result.output is not None and task.stage is Stage.publish:
+        reason = Reason.storage_error
+        reserved = find_reserved(book.connection, task.seq)
+        version = versions.get(name)
+        if version is None or (version.dataset, version.version) != reserved:
+            wrong = f"the manifest is not that of {reserved}"
+    if wrong is None:
+        return result
+    return result.model_copy(update={"outcome": "failed", "reason": reason, "message": wrong, "output": None})
+
+
+def _take_results(
+    book: Ledger, ended: Sequence[_Ended], versions: dict[str, ManifestSummary]
+) -> tuple[tuple[HeldTask, Reason, str], ...]:
+    """Write results down; return the failures."""
+    # Who reports a result has started the task, whether or not a heartbeat said so in between.
+    start_tasks(book, [(end.task.seq, end.task.stage) for end in ended if end.task.state is TaskState.leased])
+    ended = [replace(end, task=replace(end.task, state=TaskState.running)) for end in ended]
+    settled = [end for end in ended if end.result.outcome != "failed"]
+    _settle(book, settled)
+    for end in settled:
+        output = end.result.output
+        if isinstance(output, RenderOutput) and output.preview is not None:
+            book.connection.execute(insert(previews).values(task=end.task.seq, digest=output.preview))
+        elif isinstance(output, PublishOutput):
+            _commit(book, end.task.seq, versions[task_id(end.task.stage, end.task.key)])
+    return tuple(
+        (end.task, end.result.reason or Reason.internal_error, end.result.message)
+        for end in ended
+        if end.result.outcome == "failed"
+    )
+
+
+def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
+    """Let a version exist, and the jobs that asked for it succeed."""
+    connection = book.connection
+    holders = [holder.job for holder in book.holders([publish_task]).get(publish_task, ())]
+    waiting = connection.execute(
+        select(jobs.c.seq, jobs.c.name).where(jobs.c.seq.in_(holders), jobs.c.state.in_(LIVE)).order_by(jobs.c.seq)
+    ).all()
+    name = next((row.name for row in waiting if row.name is not None), None)
+    commit_version(connection, publish_task, summary, name=name, now=book.now)
+    version = find_committed(connection, publish_task)
+    for row in waiting:
+        ending = Ending.published(
+            version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
+        )
+        book.end_job(row.seq, ending)
+
+
+def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
+    """Write results down and let what depends on them go on."""
+    if not settled:
+        return
+    book.connection.execute(
+        update(tasks)
+        .where(tasks.c.seq == bindparam("b_seq"))
+        .values(
+            state=bindparam("b_state"),
+            reason=bindparam("b_reason"),
+            message=bindparam("b_message"),
+            output=bindparam("b_output"),
+            cpu_seconds=bindparam("b_cpu"),
+            wall_seconds=bindparam("b_wall"),
+            owner=None,
+            expires_at=None,
+            finished_at=book.now,
+        ),
+        [
+            {
+                "b_seq": end.task.seq,
+                "b_state": end.result.outcome,
+                "b_reason": end.result.reason,
+                "b_message": end.result.message,
+                "b_output": None if end.result.output is None else end.result.output.model_dump_json(),
+                "b_cpu": end.result.cpu_seconds,
+                "b_wall": end.result.wall_seconds,
+            }
+            for end in settled
+        ],
+    )
+    rejected: dict[int, tuple[Reason, str]] = {}
+    for end in settled:
+        task, result = end.task, end.result
+        state = TaskState(result.outcome)
+        book.moved(task.seq, task.stage, TaskState.running, state)
+        book.ran(Run(task.seq, task.stage, end.kind, result.cpu_seconds, result.wall_seconds))
+        if result.reason is not None:
+            rejected[task.seq] = (result.reason, result.message)
+            name = task_id(task.stage, task.key)
+            event = TaskStateEvent(
+                task_id=name, stage=task.stage, state=state, reason=result.reason, message=result.message
+            )
+            book.tell(task.seq, event)
+    _release_dependents(book, [end.task.seq for end in settled], rejected)
+
+
+def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
+    """Count settled dependencies down; a rejected simulation rejects its renders, which settles them in turn."""
+    edges = [
+        (row.depends_on, row.task, row.stage, row.state)
+        for batch in batches(settled)
+        for row in book.connection.execute(
+            select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
+            .join(tasks, tasks.c.seq == task_dependencies.c.task)
+            .where(task_dependencies.c.depends_on.in_(batch))
+        )
+    ]
+    if not edges:
+        return
+    waits = Counter(task for _, task, _, _ in edges)
+    book.connection.execute(
+        update(tasks)
+        .where(tasks.c.seq == bindparam("b_seq"))
+        .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled")),
+        [{"b_seq": task, "b_settled": count} for task, count in waits.items()],
+    )
+    doomed = [
+        (task, state, rejected[dependency])
+        for dependency, task, stage, state in edges
+        if stage == Stage.render and dependency in rejected and not TaskState(state).is_settled
+    ]
+    if not doomed:
+        return
+    book.connection.execute(
+        update(tasks)
+        .where(tasks.c.seq == bindparam("b_seq"))
+        .values(
+            state=TaskState.rejected,
+            reason=bindparam("b_reason"),
+            message=bindparam("b_message"),
+            finished_at=book.now,
+        ),
+        [{"b_seq": task, "b_reason": reason, "b_message": message} for task, _, (reason, message) in doomed],
+    )
+    for task, state, _ in doomed:
+        book.moved(task, Stage.render, state, TaskState.rejected)
+    _release_dependents(book, [task for task, _, _ in doomed], {})

@@ -1,0 +1,129 @@
+"""What becomes of a task that was not finished: another try, or the end. And when its lease expires.
+
+A try counts only where the task had been started. A failed try waits a little (1 s, 2 s, ...) before the next; after
+`max_tries` of them the task fails, and with it every job that needs it. Such a job starts no further tasks; what is
+running finishes and is kept.
+"""
+
+import shlex
+from collections.abc import Sequence
+
+from sqlalchemy import Connection, select, text, update
+from stickslip_schemas.events import TaskStateEvent
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+
+from stickslip_services.database.database import batches
+from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.queue.ids import task_id
+from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, cancel_tasks, live_jobs, release
+from stickslip_services.settings import Settings
+
+
+def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: bool = False) -> list[HeldTask]:
+    """Return the tasks that `owners` hold, or whose lease has expired."""
+    query = select(tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.tries).where(
+        text("tasks.owner IS NOT NULL")  # in the words of the partial index
+    )
+    if owners is not None:
+        query = query.where(tasks.c.owner.in_(owners))
+    if expired:
+        query = query.where(tasks.c.expires_at <= book.now)
+    return [
+        HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries)
+        for row in book.connection.execute(query)
+    ]
+
+
+def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:
+    """Let tasks wait again as if they had never been leased, or cancel them where no live job needs them."""
+    for task, job in _still_needed(book, held):
+        release(book, task, TaskState.pending, job=job)
+
+
+def lose(book: Ledger, held: Sequence[HeldTask], settings: Settings, *, message: str) -> None:
+    """Take leases from a worker that is lost: tasks that it had started have failed once more."""
+    give_back(book, [task for task in held if task.state is TaskState.leased])
+    started = [task for task in held if task.state is not TaskState.leased]
+    fail_tries(book, [(task, Reason.worker_lost, message) for task in started], settings)
+
+
+def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], settings: Settings) -> None:
+    """Count failed tries; each task tries again or fails for good."""
+    why = {task.seq: (reason, message) for task, reason, message in failures}
+    for task, job in _still_needed(book, [task for task, _, _ in failures]):
+        reason, message = why[task.seq]
+        tries = task.tries + 1
+        state = TaskState.soft_failed if tries < settings.max_tries else TaskState.failed
+        retry_at = book.now + settings.retry_seconds * 2 ** (tries - 1)
+        release(
+            book,
+            task,
+            state,
+            job=job,
+            tries=tries,
+            reason=reason,
+            message=message,
+            retry_at=retry_at if state is TaskState.soft_failed else None,
+            finished_at=book.now if state is TaskState.failed else None,
+        )
+        name = task_id(task.stage, task.key)
+        event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
+        book.tell(task.seq, event)
+        if state is TaskState.failed:
+            _fail_jobs(book, task, f"task {name} failed {tries} times, at last with {reason}: {message}", settings)
+
+
+def is_sweep_due(connection: Connection, now: float) -> bool:
+    """Tell whether a lease has expired or a retry is due, without taking the write lock."""
+    expired = select(tasks.c.seq).where(text("tasks.owner IS NOT NULL"), tasks.c.expires_at <= now).limit(1)
+    due = select(tasks.c.seq).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= now).limit(1)
+    return connection.scalar(expired) is not None or connection.scalar(due) is not None
+
+
+def sweep(book: Ledger, settings: Settings) -> None:
+    """Take expired leases back and let due retries wait for a worker again."""
+    expired = find_held(book, expired=True)
+    lose(book, expired, settings, message=f"no heartbeat for {settings.lease_seconds:g} s")
+    _retry_due(book)
+
+
+def _retry_due(book: Ledger) -> None:
+    """Let tasks whose wait is over be leased again."""
+    due = book.connection.execute(
+        select(tasks.c.seq, tasks.c.stage).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now)
+    ).all()
+    for batch in batches(due):
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq.in_([row.seq for row in batch]))
+            .values(state=TaskState.pending, retry_at=None)
+        )
+    for seq, stage in due:
+        book.moved(seq, stage, TaskState.soft_failed, TaskState.pending)
+
+
+def reproducer(name: str, settings: Settings) -> str:
+    """Return the command that runs a task again, by itself, on a machine with a worker's environment."""
+    fetch = f"curl -s {settings.url}/v1/tasks/{name} -o task.json"
+    return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(str(settings.store_root))}"
+
+
+def _still_needed(book: Ledger, held: Sequence[HeldTask]) -> list[tuple[HeldTask, int]]:
+    """Return the tasks that a live job still needs, each with the job to charge it to; cancel the others."""
+    job_of = live_jobs(book.connection, [task.seq for task in held])
+    cancel_tasks(book, [(task.seq, task.stage, task.state) for task in held if task.seq not in job_of])
+    return [(task, job_of[task.seq]) for task in held if task.seq in job_of]
+
+
+def _fail_jobs(book: Ledger, task: HeldTask, message: str, settings: Settings) -> None:
+    command = reproducer(task_id(task.stage, task.key), settings)
+    ending = Ending(
+        JobState.failed,
+        Reason.failed_tasks,
+        f"{message}. No further tasks are started; what is done is kept, and submitting the job again tries again. "
+        f"To reproduce: {command}",
+    )
+    holders = [holder.job for holder in book.holders([task.seq]).get(task.seq, ())]
+    live = book.connection.scalars(select(jobs.c.seq).where(jobs.c.seq.in_(holders), jobs.c.state.in_(LIVE)))
+    for job in live.all():
+        book.end_job(job, ending)

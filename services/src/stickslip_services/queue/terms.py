@@ -1,0 +1,37 @@
+"""What a job is made with, and the rule that some kinds are made with certified presets only."""
+
+from dataclasses import dataclass
+
+from sqlalchemy import Connection
+from stickslip_schemas.builds import Builds
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.kinds import registered
+
+from stickslip_services.catalog.certificates import standing_certificate
+from stickslip_services.errors import PresetNotCertifiedError
+from stickslip_services.queue.workers import builds_for
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What a job is made with: the builds of the workers, and the certificate that vouches for them, if any does."""
+
+    builds: Builds
+    certificate: Sha256 | None
+
+
+def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
+    """Return what a job of `spec` is made with, None where no worker has ever registered.
+
+    Raise KindNotAvailableError where no worker makes the kind, UnknownKindError where nobody registered its class, and
+    PresetNotCertifiedError where the spec needs a certificate and its preset has none that passed for the workers'
+    build.
+    """
+    builds = builds_for(connection, registered(spec).kind)
+    if builds is None:
+        return None
+    certificate = standing_certificate(connection, spec.certified_preset, builds.sim_core)
+    if certificate is None and spec.needs_certificate:
+        raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core)
+    return Terms(builds, certificate)

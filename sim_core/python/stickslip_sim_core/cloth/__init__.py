@@ -1,0 +1,21 @@
+"""Pieces of cloth: what they are made of, their meshes, and the solver that steps them."""
+
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
+from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import Body, Cloth, box, plane, sphere
+
+__all__ = [
+    "PRESETS",
+    "Body",
+    "Cloth",
+    "Fabric",
+    "SolverSettings",
+    "box",
+    "fabric",
+    "fabric_names",
+    "isotropic",
+    "own_fabric",
+    "plane",
+    "preset_named",
+    "sphere",
+]

@@ -1,0 +1,88 @@
+"""Named, frozen sets of solver settings for cloth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """Numbers by which the cloth solver steps.
+
+    Raises:
+        ValueError: A number breaks its rule.
+    """
+
+    name: str
+    time_step: float
+    """Longest step [s], at most 1; scenes shorten it so that frames fall on steps."""
+
+    tolerance: float = 1e-4
+    """Largest residual force of a node in a converged step, in weights of a node; at most 1."""
+
+    newton_max: int = 40
+    """Iterations of Newton's method in a step that is not halved any more, 1 ... 1000."""
+
+    krylov_max: int = 40
+    """Iterations of GMRES in one of those, 1 ... 40: the solver keeps a vector for each."""
+
+    krylov_tolerance: float = 0.03
+    """Residual over right-hand side at which GMRES stops, below 1."""
+
+    refactor_after: int = 15
+    """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
+
+    halvings_max: int = 6
+    """Times that a step which does not converge is halved, 0 ... 20."""
+
+    unconverged_share_max: float = 0.002
+    """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("name: must not be empty")
+        for name, high in (("time_step", 1.0), ("tolerance", 1.0), ("krylov_tolerance", 1.0)):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and 0.0 < value <= high):
+                raise ValueError(f"{name}: must be above 0 and at most {high:g}, got {value}")
+        for name, low, high in (
+            ("newton_max", 1, 1000),
+            ("krylov_max", 1, 40),
+            ("refactor_after", 0, 10_000),
+            ("halvings_max", 0, 20),
+        ):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                raise ValueError(f"{name}: must be an integer, {low} ... {high}, got {value}")
+        if not 0.0 <= self.unconverged_share_max <= 1.0:
+            raise ValueError(f"unconverged_share_max: must be 0 ... 1, got {self.unconverged_share_max}")
+
+
+PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
+    {
+        settings.name: settings
+        for settings in (
+            SolverSettings("certified", 0.02),
+            SolverSettings("fast", 0.04, tolerance=2e-4),
+            # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
+            SolverSettings("thesis-high", 0.0005),
+            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, unconverged_share_max=1.0),
+            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, unconverged_share_max=1.0),
+        )
+    }
+)
+
+
+def preset_named(preset: str | SolverSettings) -> SolverSettings:
+    """Return the settings of this name; settings are returned as they are.
+
+    Raises:
+        ValueError: There are none of this name.
+    """
+    if isinstance(preset, SolverSettings):
+        return preset
+    if preset not in PRESETS:
+        raise ValueError(f"preset: must be one of {', '.join(PRESETS)}, got {preset!r}")
+    return PRESETS[preset]

@@ -1,0 +1,226 @@
+"""Pieces of cloth that move in contact with bodies: the thin face of the C++ solver."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.fabrics import Fabric
+from stickslip_sim_core.cloth.meshes import Mesh
+from stickslip_sim_core.cloth.presets import SolverSettings
+
+KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
+"""Environment variable that names the level of the kernels."""
+
+GRAVITY = 9.81
+"""[m/s^2]"""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body that cloth touches. In its own axes a plane fills z < 0; others are centred on their origin."""
+
+    mu: float
+    shape: int = 0
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: Floats = field(default_factory=lambda: np.zeros(3))
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.mu) and self.mu >= 0.0):
+            raise ValueError(f"mu: must be finite and >= 0, got {self.mu}")
+
+    def as_tuple(self) -> tuple[int, float, Floats, Floats, Floats]:
+        """Return what the C++ core takes."""
+        return (
+            self.shape,
+            self.mu,
+            np.array(self.size),
+            np.asarray(self.origin, float),
+            np.asarray(self.rotation, float),
+        )
+
+
+def plane(mu: float, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
+    """Return the half-space below a plane."""
+    n = np.asarray(normal, float)
+    n = n / np.linalg.norm(n)
+    other = np.eye(3)[np.argmin(np.abs(n))]
+    t = np.cross(n, other)
+    t /= np.linalg.norm(t)
+    return Body(mu, 0, origin=np.asarray(origin, float), rotation=np.stack([t, np.cross(n, t), n], axis=1))
+
+
+def sphere(mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:
+    """Return a ball, which carries what sticks to it when its rotation (3, 3) changes from step to step."""
+    if not (np.isfinite(radius) and radius > 0.0):
+        raise ValueError(f"radius: must be finite and > 0, got {radius}")
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    return Body(mu, 1, (radius, 0.0, 0.0), np.asarray(origin, float), turn)
+
+
+def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:
+    """Return a box with edges of `size` (3,) [m]."""
+    half = 0.5 * np.asarray(size, float)
+    if half.shape != (3,) or not (np.isfinite(half).all() and (half > 0.0).all()):
+        raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
+
+
+class Cloth:
+    """A piece of cloth, its state, and the settings by which it is stepped.
+
+    Args:
+        mesh: The cloth at rest.
+        fabric: What it is made of.
+        preset: Solver settings.
+        held: (K,) vertices whose positions are prescribed.
+        clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
+            outward normal of the rest plane.
+        force_scale: Force that residuals are measured in [N]; None is the weight of a node.
+        kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
+            that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fabric: Fabric,
+        preset: SolverSettings,
+        *,
+        held: ArrayLike = (),
+        clamped: ArrayLike | None = None,
+        force_scale: float | None = None,
+        kernel: str | None = None,
+    ) -> None:
+        self.mesh, self.fabric, self.preset = mesh, fabric, preset
+        self.held = np.asarray(held, dtype=np.int32).reshape(-1)
+        edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
+        self.slopes = np.zeros((len(edges), 3))
+        check_mesh(mesh.rest, mesh.triangles)
+        node_weight = fabric.density * mesh.spacing**2 * GRAVITY
+        self.force_scale = node_weight if force_scale is None else force_scale
+        """Force that residuals are measured in [N]: the weight of a node, unless another is given."""
+        self._solver = ClothSolver(
+            mesh.rest,
+            mesh.triangles,
+            fabric.density,
+            fabric.stretching,
+            fabric.rigidity,
+            self.held.tolist(),
+            edges,
+            tolerance=preset.tolerance * self.force_scale,
+            newton_max=preset.newton_max,
+            krylov_max=preset.krylov_max,
+            krylov_tolerance=preset.krylov_tolerance,
+            refactor_after=preset.refactor_after,
+            halvings_max=preset.halvings_max,
+            kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
+        )
+        self.time = 0.0
+        self.steps = self.unconverged_steps = 0
+        self.worst_residual = 0.0
+        """Largest residual force of a node in any step, over `force_scale`."""
+        self.newton = self.krylov = self.factorizations = 0
+        self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
+
+    @property
+    def kernel(self) -> str:
+        """Level of the kernels that step it."""
+        return str(self._solver.kernel())
+
+    @property
+    def masses(self) -> Floats:
+        """(V,) [kg]."""
+        return np.asarray(self._solver.masses())
+
+    @property
+    def positions(self) -> Floats:
+        """(V, 3) [m]."""
+        return np.asarray(self._solver.positions())
+
+    @property
+    def velocities(self) -> Floats:
+        """(V, 3) [m/s]."""
+        return np.asarray(self._solver.velocities())
+
+    @property
+    def reactions(self) -> Floats:
+        """(V, 3) [N]: force of bodies on a free vertex, of its holder on a held one, by M a = forces."""
+        return np.asarray(self._solver.reactions())
+
+    @property
+    def contacts(self) -> NDArray[np.int32]:
+        """(V,): body that a vertex touches, -1 where none."""
+        return np.asarray(self._solver.contacts(), dtype=np.int32)
+
+    @property
+    def sliding(self) -> NDArray[np.bool_]:
+        """(V,): whether a vertex slides on its body."""
+        return np.asarray(self._solver.sliding(), dtype=bool)
+
+    def set_state(
+        self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
+    ) -> None:
+        """Put the cloth somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3)."""
+        at = np.asarray(positions, float)
+        speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
+        if slopes is not None:
+            self.slopes = np.asarray(slopes, float)
+        self._solver.set_state(at, speed, self.slopes)
+
+    def step(
+        self,
+        dt: float,
+        *,
+        held: ArrayLike = (),
+        bodies: Sequence[Body] = (),
+        slopes: ArrayLike | None = None,
+        damping: float = 0.0,
+    ) -> StepReport:
+        """Advance by dt [s]; positions of held vertices (K, 3), slopes and bodies are those at its end.
+
+        In the first step after `set_state` bodies are taken to have been where they are.
+
+        `damping` is proportional to mass [1/s]; that of the fabric is added.
+        A step that does not converge is counted and its best iterate kept.
+        """
+        if slopes is not None:
+            self.slopes = np.asarray(slopes, float)
+        ends = np.asarray(held, float).reshape(-1, 3)
+        report = self._solver.step(
+            dt, self.gravity, ends, self.slopes, [body.as_tuple() for body in bodies], damping + self.fabric.damping
+        )
+        self.time += dt
+        self.steps += 1
+        self.unconverged_steps += not report.converged
+        residual = report.residual / self.force_scale
+        if not residual <= self.worst_residual:  # a NaN stays
+            self.worst_residual = residual
+        self.newton += report.newton
+        self.krylov += report.krylov
+        self.factorizations += report.factorizations
+        return report
+
+    def why_invalid(self, path: Floats) -> str:
+        """Return why a simulation with these positions (frames, V, 3) is not valid, or an empty text."""
+        if not np.isfinite(path).all():
+            return f"positions are not finite from frame {len(path) - 1} on"
+        if self.unconverged_steps > self.preset.unconverged_share_max * self.steps:
+            return (
+                f"{self.unconverged_steps} of {self.steps} steps did not converge, "
+                f"and {self.preset.name} allows a share of {self.preset.unconverged_share_max:g}"
+            )
+        return ""
+
+    def phases(self) -> dict[str, float]:
+        """Return CPU seconds by phase since the start."""
+        return dict(zip(("assembly", "factorization", "krylov", "contact"), self._solver.phases(), strict=True))

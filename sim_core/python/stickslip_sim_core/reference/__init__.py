@@ -1,0 +1,1 @@
+"""What physics says: master curves, from the equations of the continuous rod, strip and plate."""

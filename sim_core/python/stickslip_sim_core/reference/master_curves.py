@@ -1,0 +1,426 @@
+"""Master curves: what physics says that a protocol must measure, computed here and never tabulated.
+
+Every curve of a rod, or of a strip that bends in one direction, comes from the differential equations of the continuous
+rod, solved by collocation to 1e-10 (boundary_value.py); that of a plate from plate_buckling.py, to 5e-5. They share
+nothing with the solvers that are measured, so that a protocol compares two independent computations. Symbols,
+definitions and figures: docs/protocols.md.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from math import gamma as gamma_function
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.reference import boundary_value, plate_buckling
+from stickslip_sim_core.reference.boundary_value import NotSolvedError, Numbers, Solution
+
+
+def cantilever(gamma: ArrayLike) -> Floats:
+    """Return H/W of a heavy elastica clamped horizontally: drop of its tip H over horizontal reach W.
+
+    With psi the angle from the downward vertical to the tangent and primes d/ds,
+
+        psi'' = gamma (1 - s) sin psi,   psi(0) = pi/2,   psi'(1) = 0,   H = int cos psi ds,   W = int sin psi ds.
+
+    Of the solutions the one with 0 < psi <= pi/2 is meant; there the energy is convex, so there is no other such.
+
+    Args:
+        gamma: Weight against bending, rho A g L^3 / EI [-], > 0, any shape.
+
+    Raises:
+        ValueError: A gamma is not positive and finite.
+    """
+    values = _positive("gamma", gamma)
+    return np.array([_cantilever(float(g)) for g in values.ravel()]).reshape(values.shape)
+
+
+def _cantilever(gamma: float) -> float:
+    # Widths of the layers at the clamp and at the free end; the fields are psi and psi' / rate.
+    rate = max(1.0, np.sqrt(gamma))
+    clamp, tip = 1.0 / rate, min(1.0, gamma ** (-1.0 / 3.0))
+    mesh = np.unique(np.concatenate([np.geomspace(0.25 * clamp, 0.5, 16), 1.0 - tip * np.linspace(0.0, 0.5, 5), [0.0]]))
+
+    def change(s: Floats, y: Numbers, _: Numbers) -> Numbers:
+        psi, bend = y
+        return np.stack([rate * bend, gamma / rate * (1.0 - s) * np.sin(psi)])
+
+    def ends(first: Numbers, last: Numbers, _: Numbers) -> Numbers:
+        return np.stack([first[0] - np.pi / 2.0, last[1]])
+
+    hanging = np.pi / 2.0 * np.exp(-mesh * np.sqrt(gamma))
+    found = boundary_value.solve(change, ends, mesh, np.stack([hanging, -hanging * np.sqrt(gamma) / rate]))
+    psi = found.y[0]
+    if psi.min() < -1e-12 or psi.max() > np.pi / 2.0 + 1e-12:
+        raise NotSolvedError(f"cantilever: the solution at gamma = {gamma} is not the hanging one")
+    return found.integral(lambda y: np.cos(y[0])) / found.integral(lambda y: np.sin(y[0]))
+
+
+def lateral_buckling_rod() -> float:
+    """Return the weight rho A g L^3 / sqrt(EI GJ) at which a strip clamped edge-on buckles sideways, as w/L -> 0.
+
+    A strip that cannot bend in its own plane stays straight until then. With x from the free end, EI its bending
+    stiffness across the plane, GJ its twisting stiffness and eta the sideways slope,
+
+        eta'' + (weight / 2)^2 x^4 eta = 0,   eta'(0) = 0,   eta(1) = 0,   eta = sqrt(x) J_{-1/6}(weight x^3 / 6)
+
+    [Prandtl 1899]: six times the first zero of the Bessel function J_{-1/6}.
+    """
+    # z^{1/6} J_{-1/6}(z) up to a factor: sum_k a_k z^{2k} with a_k = (-1/4)^k / (k! Gamma(k + 5/6)).
+    k = np.arange(25)
+    coefficients = np.array(
+        [(-0.25) ** i / (gamma_function(i + 1.0) * gamma_function(i + 5.0 / 6.0)) for i in range(25)]
+    )
+    z = 2.0
+    for _ in range(8):  # Newton; quadratic from a start that is 7 % off
+        powers = z ** (2.0 * k)
+        z -= float(coefficients @ powers / (coefficients[1:] * 2.0 * k[1:] @ (powers[1:] / z)))
+    return 6.0 * z
+
+
+def lateral_buckling(aspect: ArrayLike, poisson: float) -> Floats:
+    """Return the weight Gamma* = rho_A g L^3 / D at which a plate strip clamped edge-on buckles sideways, to 5e-5.
+
+    The strip of length L and width aspect * L is clamped along one short edge, with its width vertical, in displacement
+    and slope; its other edges are free. rho_A is its mass per area, D = Y h^3 / (12 (1 - poisson^2)) its bending
+    rigidity, so that per unit of rho_A g L^3 / (Y h^3 / 12) the answer is Gamma* / (1 - poisson^2). Plane stress under
+    its weight and Kirchhoff's plate, both linear until it buckles: a strip much thinner than wide. How they are solved:
+    plate_buckling.py. As aspect goes to zero,
+
+        Gamma* = lateral_buckling_rod() sqrt(2 / (1 + poisson)) (1 - poisson^2) (1 + O(aspect)).
+
+    Args:
+        aspect: Width over length [-], in [0.01, 1], any shape.
+        poisson: Poisson's ratio [-], in [0, 0.5].
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+    values = _within("aspect", aspect, 0.01, 1.0)
+    nu = _checked_poisson(poisson)
+    return np.array([plate_buckling.buckling_weight(float(v), nu) for v in values.ravel()]).reshape(values.shape)
+
+
+def stick_slip(strain: ArrayLike) -> Floats:
+    """Return mu = Q/P of a strip pressed end-on against a wall: at less friction its tip slips.
+
+    The strip of length 1 is clamped at the origin, upright; the wall has come down from height 1 to 1 - strain, and
+    acts on the tip with (Q, -P) in units of EI / L^2. With theta from the x axis to the tangent and primes d/ds,
+
+        theta'' = P cos theta + Q sin theta,   x' = cos theta,   y' = sin theta,
+        theta(0) = pi/2,   theta'(1) = 0,   x(0) = y(0) = x(1) = 0,   y(1) = 1 - strain
+
+    (the thesis's Eq. 3.1 with its sine and cosine the right way round) [Sano et al. 2017]. The tip, on its line, sticks
+    while mu >= Q/P. Of the two mirrored solutions that with theta(1) > pi/2, Q > 0 is meant, of all the modes the first
+    one: P = 20.1907 at buckling. For small strains Q/P = 0.44510 sqrt(strain).
+
+    Beyond `stick_slip_triple_point` there is no answer: the strip lies on the wall with more than its tip.
+
+    Args:
+        strain: Displacement of the wall over the length of the strip [-], > 0 and at most that of the triple point
+            (to 1e-9), any shape.
+
+    Raises:
+        ValueError: A strain is outside its range.
+    """
+    values = _within("strain", strain, 0.0, _triple_point().strain * (1.0 + 1e-9), open_below=True)
+
+    def friction(e: float) -> float:
+        return _pressed(lambda w, p: p[2] - np.sqrt(e), e).friction
+
+    return np.array([friction(float(e)) for e in values.ravel()]).reshape(values.shape)
+
+
+def stick_slip_strain(friction: ArrayLike) -> Floats:
+    """Return the strain at which a strip pressed end-on against a wall of this friction slips: stick_slip's inverse.
+
+    Args:
+        friction: Coefficient of friction mu [-], > 0 and at most that of the triple point (to 1e-9), any shape. At a
+            higher one the strip never slips.
+
+    Raises:
+        ValueError: A friction is outside its range.
+    """
+    top = _triple_point()
+    values = _within("friction", friction, 0.0, top.friction * (1.0 + 1e-9), open_below=True)
+
+    def strain(mu: float) -> float:
+        guess = top.strain * (mu / top.friction) ** 2
+        return _pressed(lambda w, p: p[1] * p[2] - mu * p[0], guess).strain
+
+    return np.array([strain(float(mu)) for mu in values.ravel()]).reshape(values.shape)
+
+
+def stick_slip_triple_point() -> tuple[float, float]:
+    """Return (strain, mu) where sticking, slipping and lying on the wall meet: there theta(1) = pi."""
+    top = _triple_point()
+    return top.strain, top.friction
+
+
+@dataclass(frozen=True)
+class _Pressed:
+    """A strip pressed against the wall."""
+
+    strain: float
+    friction: float
+    """Q/P."""
+
+
+@lru_cache(maxsize=1)
+def _triple_point() -> _Pressed:
+    return _pressed(lambda w, p: p[2] * w - np.pi / 2.0, 0.33)
+
+
+def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> _Pressed:
+    """Find the strip that fulfils one more condition on w(1) and (P, q, a), from a guess of its strain.
+
+    With a = sqrt(strain), theta = pi/2 + a w and Q = a q the problem has no bifurcation, and a may be as small as it
+    likes:
+
+        w'' = -P sin(a w) / a + q cos(a w),   w(0) = w'(1) = 0,   int sin(a w) / a = 0,   int (1 - cos(a w)) / a^2 = 1.
+
+    For a = 0 its solution is w = (q / P) (1 - cos(k s) - k sin(k s)), tan k = k, P = k^2.
+    """
+
+    def change(_: Floats, y: Numbers, p: Numbers) -> Numbers:
+        w, bend = y[0], y[1]
+        P, q, a = p
+        sine = np.sin(a * w) / a
+        return np.stack([bend, q * np.cos(a * w) - P * sine, sine, 0.5 * (np.sin(0.5 * a * w) / (0.5 * a)) ** 2])
+
+    def ends(first: Numbers, last: Numbers, p: Numbers) -> Numbers:
+        at_clamp = [first[0], first[2], first[3]]
+        return np.stack([*at_clamp, last[1], last[2], last[3] - 1.0, condition(last[0], p)])
+
+    k = 4.493409457909064
+    s = np.linspace(0.0, 1.0, 7)
+    w = 1.0 - np.cos(k * s) - k * np.sin(k * s)
+    bend = k * (np.sin(k * s) - k * np.cos(k * s))
+    scale = 0.44510  # q / P that makes int w^2 = 2
+    y = np.stack([scale * w, scale * bend, 0.0 * s, s])
+    found = boundary_value.solve(change, ends, s, y, np.array([k**2, scale * k**2, np.sqrt(guess)]))
+    P, q, a = found.parameters
+    w = found.y[0]
+    if not (P > 0.0 and q > 0.0 and a * w.max() <= np.pi / 2.0 + 1e-6 and w[-1] == w.max()):
+        raise NotSolvedError(f"stick_slip: near strain = {guess} the solution found is not the first mode")
+    return _Pressed(float(a**2), float(a * q / P))
+
+
+def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
+    """Return the weight Gamma above which a curly rod hangs in a plane and below which it turns three-dimensional.
+
+    The rod has natural curvature phi / L about d3 and no natural twist, GJ/EI = C = 1/(1 + poisson), and is clamped
+    with its tangent along gravity. The boundary is the Gamma at which the planar equilibrium, followed from large Gamma
+    downwards, ceases to be a strict minimum over all rotations. NaN where phi is below `bend_twist_onset`: there the
+    planar equilibrium is stable for every weight.
+
+    With Lambda = Gamma^{1/3}, k = phi / Lambda, sigma = (1 - s) Lambda from the free end and a dot for d/dsigma, the
+    planar rod [theta: angle from gravity to tangent; q: moment about d3] is
+
+        theta. = -(k + q),   q. = -sigma sin theta,   q(0) = 0,   theta(Lambda) = 0.
+
+    Its linearised Kirchhoff equations out of the plane [mu0, mu1: moments about d1, d2; eta: slope of the tangent] are
+
+        mu0. = -k mu1,   mu1. = (k + q) mu0 - q mu0 / C - sigma eta,   eta. = -cos(theta) mu1 - sin(theta) mu0 / C
+
+    from mu0 = mu1 = 0, eta = 1 at the free end: the rotation about gravity being the other solution, the determinant of
+    Jacobi's fields is eta. The planar rod is a minimum while eta has no zero; on the boundary the first zero, coming
+    from infinity, is at the clamp: eta(Lambda) = 0.
+
+    Args:
+        phi: Natural curvature times L [rad], > 0, any shape.
+        poisson: Poisson's ratio [-], in [0, 0.5].
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+    values = _positive("phi", phi)
+    curve = _boundary(_checked_poisson(poisson))
+    return np.array([curve.gamma_at(float(v)) for v in values.ravel()]).reshape(values.shape)
+
+
+def bend_twist_onset(poisson: float) -> tuple[float, float]:
+    """Return (phi, Gamma) of the least natural curvature at which a weight makes the rod three-dimensional."""
+    onset = _boundary(_checked_poisson(poisson)).onset
+    return onset.phi, onset.Lambda**3
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundaryPoint:
+    """A planar rod on the Bend-Twist boundary; fields (theta, q, mu0, mu1, eta) over sigma / Lambda."""
+
+    Lambda: float
+    """Gamma^{1/3}."""
+
+    phi: float
+    solution: Solution
+
+    def fields(self, mesh: Floats, Lambda: float) -> Floats:
+        """Fields over sigma, as a guess on the mesh of another Lambda: beyond this rod's clamp they are those there."""
+        return np.stack([np.interp(mesh * Lambda, self.solution.mesh * self.Lambda, y) for y in self.solution.y])
+
+
+class _Boundary:
+    """The boundary curve of one Poisson's ratio, (Lambda, phi(Lambda)), followed from an anchor along a ladder.
+
+    The ladder of Lambda is climbed from the anchor always, so that no point depends on what was asked before.
+    """
+
+    UP, DOWN = 1.1, 0.97  # ratios of neighbours on the ladder: below the anchor rods differ more
+    TOLERANCE = 1e-12  # on Lambda, relative
+
+    def __init__(self, poisson: float) -> None:
+        self.C = 1.0 / (1.0 + poisson)
+        self._up = [self._anchor()]
+        self._down = [self._up[0]]
+
+    @cached_property
+    def onset(self) -> _BoundaryPoint:
+        """The point of least phi, by parabolas through three points ever closer."""
+        rung = 0
+        while self._rung(-rung - 1).phi < self._rung(-rung).phi:
+            rung += 1
+        best = self._rung(-rung)
+        for spread in (0.02, 0.003, 0.0005):
+            below, above = (self._solve(best.Lambda * (1.0 + side * spread), best) for side in (-1.0, 1.0))
+            slope, bend = above.phi - below.phi, above.phi - 2.0 * best.phi + below.phi
+            best = self._solve(best.Lambda * (1.0 - 0.5 * spread * slope / bend), best)
+        return best
+
+    def gamma_at(self, phi: float) -> float:
+        """Gamma on the upper side of the curve, NaN where there is none; a secant that keeps its bracket."""
+        if phi < self.onset.phi:
+            return np.nan
+        rung = 0
+        while self._rung(rung).phi < phi:
+            rung += 1
+        low = self._rung(rung - 1) if rung > 0 else self.onset
+        high = self._rung(rung)
+        before, last = low, high
+        while True:
+            middle = 0.5 * (low.Lambda + high.Lambda)
+            rise = last.phi - before.phi
+            secant = last.Lambda + (phi - last.phi) * (last.Lambda - before.Lambda) / rise if rise else middle
+            # Near the onset phi grows as the square of the distance in Lambda, and a secant may miss.
+            Lambda = secant if low.Lambda < secant < high.Lambda else middle
+            if min(abs(Lambda - last.Lambda), high.Lambda - low.Lambda) <= self.TOLERANCE * Lambda:
+                return float(Lambda**3)
+            before, last = last, self._solve(Lambda, last)
+            low, high = (last, high) if last.phi < phi else (low, last)
+
+    def _rung(self, rung: int) -> _BoundaryPoint:
+        """Rung of the ladder: 0 is the anchor, positive ones are above."""
+        ladder, ratio = (self._up, self.UP) if rung >= 0 else (self._down, self.DOWN)
+        while len(ladder) <= abs(rung):
+            ladder.append(self._solve(ladder[0].Lambda * ratio ** len(ladder), ladder[-1]))
+        return ladder[abs(rung)]
+
+    def _solve(self, Lambda: float, near: _BoundaryPoint) -> _BoundaryPoint:
+        """Find phi for this Lambda, from a point near by."""
+        mesh = near.solution.mesh
+        guess = near.solution.y
+        # Rods of more than a few units of sigma look alike in sigma, shorter ones in s.
+        if not 0.95 < Lambda / near.Lambda < 1.05:
+            mesh = _mesh(Lambda)
+            guess = near.fields(mesh, Lambda)
+
+        def change(x: Floats, y: Numbers, p: Numbers) -> Numbers:
+            return Lambda * _rates(Lambda * x, y, p[0] / Lambda, self.C)
+
+        def ends(tip: Numbers, clamp: Numbers, _: Numbers) -> Numbers:
+            return np.stack([tip[1], tip[2], tip[3], tip[4] - 1.0, clamp[0], clamp[4]])
+
+        phi = near.phi * max(Lambda / near.Lambda, 1.0)
+        found = boundary_value.solve(change, ends, mesh, guess, np.array([phi]))
+        if found.y[4].min() < -1e-9:
+            raise NotSolvedError(f"bend_twist: at Lambda = {Lambda} another mode becomes unstable first")
+        return _BoundaryPoint(Lambda, float(found.parameters[0]), found)
+
+    def _anchor(self) -> _BoundaryPoint:
+        """Follow the planar rod from large weights down until eta has passed zero at the clamp.
+
+        Above the boundary eta grows as exp(2/3 Lambda^{3/2}) from the free end to the clamp; scaled to one at the clamp
+        the problem is a good one, and the sign to watch is that at the free end.
+        """
+        phi = 7.0  # a little more than the onset, which is at 5.56 (C = 2/3) ... 6.39 (C = 1)
+        fields = None
+        for ratio in np.arange(1.2, 0.3, -0.03):
+            Lambda = float(ratio) * phi
+            mesh = _mesh(Lambda)
+
+            def change(x: Floats, y: Numbers, _: Numbers, Lambda: float = Lambda) -> Numbers:
+                return Lambda * _rates(Lambda * x, y, phi / Lambda, self.C)
+
+            def ends(tip: Numbers, clamp: Numbers, _: Numbers) -> Numbers:
+                return np.stack([tip[1], tip[2], tip[3], clamp[4] - 1.0, clamp[0]])
+
+            guess = np.zeros((5, len(mesh))) if fields is None else fields
+            found = boundary_value.solve(change, ends, mesh, guess)
+            fields = found.y
+            if found.y[4, 0] < 0.0:
+                fields[2:] /= found.y[4, 0]
+                return self._solve(Lambda, _BoundaryPoint(Lambda, phi, found))
+        raise NotSolvedError("bend_twist: the planar rod of phi = 7 stays stable")
+
+
+def _rates(sigma: Floats, y: Numbers, k: Numbers | float, C: float) -> Numbers:
+    """d/dsigma of (theta, q, mu0, mu1, eta): see bend_twist."""
+    theta, q, mu0, mu1, eta = y
+    sine, cosine = np.sin(theta), np.cos(theta)
+    return np.stack(
+        [
+            -(k + q),
+            -sigma * sine,
+            -k * mu1,
+            (k + q) * mu0 - q * mu0 / C - sigma * eta,
+            -cosine * mu1 - sine * mu0 / C,
+        ]
+    )
+
+
+def _mesh(Lambda: float) -> Floats:
+    """Mesh over sigma / Lambda: fine where the rod curls, wide where it hangs straight to rounding (sigma > 16)."""
+    if Lambda <= 16.0:
+        return np.linspace(0.0, 1.0, 33)
+    return np.concatenate([np.linspace(0.0, 16.0 / Lambda, 33), np.geomspace(16.0 / Lambda, 1.0, 9)[1:]])
+
+
+@lru_cache(maxsize=8)
+def _boundary(poisson: float) -> _Boundary:
+    return _Boundary(poisson)
+
+
+def _checked_poisson(poisson: float) -> float:
+    if not 0.0 <= poisson <= 0.5:
+        raise ValueError(f"poisson: must be in [0, 0.5], got {poisson}")
+    return float(poisson)
+
+
+def _positive(name: str, values: ArrayLike) -> Floats:
+    """Return `values` as float64 of their own shape."""
+    array = _real(name, values)
+    wrong = array[~(np.isfinite(array) & (array > 0.0))]
+    if wrong.size:
+        raise ValueError(f"{name}: must be finite and > 0, got {wrong.flat[0]}")
+    return array
+
+
+def _within(name: str, values: ArrayLike, low: float, high: float, *, open_below: bool = False) -> Floats:
+    """Return `values` as float64 of their own shape."""
+    array = _real(name, values)
+    above = array > low if open_below else array >= low
+    wrong = array[~(above & (array <= high))]
+    if wrong.size:
+        bracket = "(" if open_below else "["
+        raise ValueError(f"{name}: must be in {bracket}{low:.10g}, {high:.10g}], got {wrong.flat[0]}")
+    return array
+
+
+def _real(name: str, values: ArrayLike) -> Floats:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: must be real numbers, got dtype {array.dtype}")
+    return array.astype(np.float64)

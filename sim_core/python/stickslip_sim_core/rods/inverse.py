@@ -1,0 +1,207 @@
+"""Inverse design: the natural curvature of a rod whose hanging shape is known, and how far to trust it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.general import CLAMP_FRAME, STIFFNESS, clamp_quaternions, rod_stiffness
+from stickslip_sim_core.rods.solve import finite_array
+from stickslip_sim_core.rods.splines import interpolation_matrix
+
+GRAVITY = np.array([0.0, 0.0, -1.0])
+
+ERROR_MODES = 5
+"""Polynomials per component, of degree 0 ... 4, that make a smooth error of curvature."""
+
+
+@dataclass(frozen=True, eq=False)
+class NaturalCurvature:
+    """Natural curvature of n rods, or of one: the leading shape (...) is that of the arguments."""
+
+    curvature: Floats
+    """Natural curvature kappa_bar(s) = (twist, bend about d2, bend about d3) [1/L], shape (..., P, 3)."""
+
+    moment: Floats
+    """Internal moment m(s) in the material frame [EI/L], shape (..., P, 3); zero at the free end."""
+
+    amplification: Floats
+    """Relative error of kappa_bar per relative error of kappa, both as root mean squares along the rod [-], shape
+    (...): expected for a smooth random error of kappa from which the frames are integrated too. Multiply the error
+    that you believe your curvature has by it. First order: it holds while the product stays below about 1/2."""
+
+    amplification_max: Floats
+    """The same for the smooth error that harms most, shape (...)."""
+
+
+def natural_curvature(
+    curvature: ArrayLike,
+    frame: ArrayLike | None,
+    gamma: ArrayLike,
+    *,
+    stiffness: ArrayLike = STIFFNESS,
+    clamp_frame: ArrayLike = CLAMP_FRAME,
+) -> NaturalCurvature:
+    """Compute the unique natural curvature for which a framed curve hangs in equilibrium.
+
+    Eq. 5.1 of the thesis [Bertails-Descoubes et al. 2018, Sec. 4] integrates m' = m x kappa - gamma (1 - s) e_x x g
+    from m(1) = 0 and takes kappa_bar = kappa - K^{-1} m. In the world the moment M = R m needs a quadrature only,
+    M(s) = gamma (int_s^1 (1 - u) t(u) du) x e_g, e_g along gravity. It is done interval by interval with t, t' and t''
+    (error (kappa h)^6 / 100800 of the integrand).
+
+    Args:
+        curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4 points of uniform arc
+            length, clamp and free end included, shape (..., P, 3).
+        frame: Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (..., P, 3, 3). None:
+            integrated from `clamp_frame` by R' = R [kappa]x, with the error of the curvature in them.
+        gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0.
+        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3).
+        clamp_frame: R(0), used without `frame` only, shape (3, 3) or (..., 3, 3).
+
+    Raises:
+        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+    """
+    shape = np.shape(curvature)
+    if len(shape) < 2 or shape[-1] != 3 or shape[-2] < 4:
+        raise ValueError(f"curvature: must have shape (..., P, 3) with P >= 4, got shape {shape}")
+    leading, points = shape[:-2], shape[-2]
+    n = int(np.prod(leading))
+    kappa = finite_array("curvature", np.reshape(curvature, (n, points, 3)), (n, points, 3))
+    if np.shape(gamma) != leading:
+        raise ValueError(f"gamma: must have the leading shape of curvature {leading}, got shape {np.shape(gamma)}")
+    weight = finite_array("gamma", np.reshape(gamma, n), (n,))
+    if (weight < 0).any():
+        raise ValueError(f"gamma: must be >= 0, got {weight.min()}")
+    K = rod_stiffness(_flattened(stiffness, leading, 1), n)
+    if frame is None:
+        R = integrate_frames(kappa, _flattened(clamp_frame, leading, 2))
+    else:
+        if np.shape(frame) != (*shape, 3):
+            raise ValueError(f"frame: must have shape {(*shape, 3)}, got shape {np.shape(frame)}")
+        R = finite_array("frame", np.reshape(frame, (n, points, 3, 3)), (n, points, 3, 3))
+
+    world = weight[:, None, None] * np.cross(_weighted_tangent(kappa, R), GRAVITY)
+    moment = np.einsum("npji,npj->npi", R, world)
+    natural = kappa - moment / K[:, None, :]
+    mean, largest = _amplification(kappa, R, world, natural, weight, K)
+    return NaturalCurvature(
+        natural.reshape(shape), moment.reshape(shape), mean.reshape(leading), largest.reshape(leading)
+    )
+
+
+def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) -> Floats:
+    """Return the frames with R' = R [kappa]x from the clamp on.
+
+    Fourth-order Magnus steps, two per interval, on the cubic spline through the curvature [Iserles and Norsett 1999].
+
+    Args:
+        curvature: kappa [1/L] at points of uniform arc length, shape (n, P, 3), P >= 1.
+        clamp_frame: R(0), shape (3, 3) or (n, 3, 3).
+
+    Returns:
+        Rotations, shape (n, P, 3, 3).
+    """
+    n, points, _ = curvature.shape
+    steps = 2 * (points - 1)
+    h = 1.0 / steps
+    middle = (np.arange(steps) + 0.5) * h
+    gauss = np.sqrt(3.0) / 6.0 * h
+    a = interpolation_matrix(points, middle - gauss) @ curvature
+    b = interpolation_matrix(points, middle + gauss) @ curvature
+    # For R' = R [kappa]x: theta = h (a + b) / 2 + sqrt(3)/12 h^2 a x b.
+    theta = 0.5 * h * (a + b) + np.sqrt(3.0) / 12.0 * h**2 * np.cross(a, b)
+    angle = np.linalg.norm(theta, axis=2)[..., None]
+    half = np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * theta], axis=2)
+    q = clamp_quaternions(clamp_frame, n)
+    frames = [q]
+    for i in range(steps):
+        q = _product(q, half[:, i])
+        if i % 2 == 1:
+            q = q / np.linalg.norm(q, axis=1, keepdims=True)
+            frames.append(q)
+    return _rotation(np.stack(frames, axis=1))
+
+
+def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:
+    """Return a field of shape (..., 3[, 3]) with its leading shape as one; a field for all rods as it is."""
+    array = np.asarray(field)
+    tail = (3,) * rank
+    return array.reshape(-1, *tail) if array.shape == (*leading, *tail) else array
+
+
+def _product(p: Floats, q: Floats) -> Floats:
+    """Multiply quaternions (w, x, y, z), shape (n, 4)."""
+    w = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(axis=1, keepdims=True)
+    return np.concatenate([w, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])], axis=1)
+
+
+def _rotation(q: Floats) -> Floats:
+    """Rotation matrices of unit quaternions, shape (..., 4) to (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
+    """int_s^1 (1 - u) t du, shape (n, P, 3)."""
+    points = kappa.shape[1]
+    s = np.linspace(0.0, 1.0, points)
+    slope = interpolation_matrix(points, s, derivative=1) @ kappa
+    k0, k1, k2 = np.moveaxis(kappa, 2, 0)
+    zero = np.zeros_like(k0)
+    t = R[..., 0]
+    # t' = R (kappa x e_x), t'' = R (kappa x (kappa x e_x) + kappa' x e_x)
+    dt = (R @ np.stack([zero, k2, -k1], axis=2)[..., None])[..., 0]
+    ddt = np.stack([-(k1**2 + k2**2), k0 * k1 + slope[..., 2], k0 * k2 - slope[..., 1]], axis=2)
+    ddt = (R @ ddt[..., None])[..., 0]
+    left = (1.0 - s)[:, None]
+    f, df, ddf = left * t, left * dt - t, left * ddt - 2.0 * dt
+    h = 1.0 / (points - 1)
+    parts = (
+        h / 2 * (f[:, :-1] + f[:, 1:]) + h**2 / 10 * (df[:, :-1] - df[:, 1:]) + h**3 / 120 * (ddf[:, :-1] + ddf[:, 1:])
+    )
+    sums = np.zeros_like(f)
+    sums[:, :-1] = np.cumsum(parts[:, ::-1], axis=1)[:, ::-1]
+    return sums
+
+
+def _amplification(
+    kappa: Floats, R: Floats, world: Floats, natural: Floats, gamma: Floats, K: Floats
+) -> tuple[Floats, Floats]:
+    """Expected and largest relative error of kappa_bar per relative smooth error of kappa, shapes (n,).
+
+    An error dk of kappa turns frames by dw = int_0^s R dk (world axes), so that dt = dw x t, dM = gamma int_s^1
+    (1 - u) dt x e_g and d(kappa_bar) = dk - K^{-1} R^T (dM - dw x M).
+    """
+    points = kappa.shape[1]
+    s = np.linspace(0.0, 1.0, points)
+    modes = np.polynomial.legendre.legvander(2 * s - 1, ERROR_MODES - 1) * np.sqrt(2 * np.arange(ERROR_MODES) + 1)
+    weights = np.full(points, 1.0 / (points - 1))
+    weights[[0, -1]] *= 0.5
+    squares = np.empty((len(kappa), 3 * ERROR_MODES, 3 * ERROR_MODES))
+    for rod in range(len(kappa)):  # one rod at a time: the responses of all would be large
+        dk = np.einsum("pb,ci->bcpi", modes, np.eye(3)).reshape(-1, points, 3)
+        dw = _running_integral(np.einsum("pij,apj->api", R[rod], dk))
+        dt = (1.0 - s)[:, None] * np.cross(dw, R[rod, :, :, 0])
+        total = _running_integral(dt)
+        dM = gamma[rod] * np.cross(total[:, -1:] - total, GRAVITY)
+        dm = np.einsum("pji,apj->api", R[rod], dM - np.cross(dw, world[rod]))
+        response = dk - dm / K[rod]
+        squares[rod] = np.einsum("p,api,bpi->ab", weights, response, response)
+    size, natural_size = (np.sqrt(np.einsum("p,npi->n", weights, f**2)) for f in (kappa, natural))
+    relative = size / np.maximum(natural_size, 1e-300)
+    mean = np.sqrt(np.trace(squares, axis1=1, axis2=2) / (3 * ERROR_MODES))
+    largest = np.sqrt(np.maximum(np.linalg.eigvalsh(squares)[:, -1], 0.0)) if len(squares) else np.empty(0)
+    return relative * mean, relative * largest
+
+
+def _running_integral(f: Floats) -> Floats:
+    """int_0^s f by the trapezoidal rule over axis 1: enough for an estimate."""
+    sums = np.zeros_like(f)
+    np.cumsum(0.5 * (f[:, :-1] + f[:, 1:]) / (f.shape[1] - 1), axis=1, out=sums[:, 1:])
+    return sums

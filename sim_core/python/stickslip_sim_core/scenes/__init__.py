@@ -1,0 +1,1 @@
+"""What is simulated: cloth, what holds it, what it touches, and how these move."""

@@ -1,0 +1,94 @@
+#include "bindings/cloth.hpp"
+
+#include <nanobind/eigen/dense.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <tuple>
+
+#include "cloth/intersections.hpp"
+#include "cloth/kernels/choice.hpp"
+#include "cloth/solver.hpp"
+
+namespace sim_core {
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using Table = Eigen::Matrix<double, 6, 4, Eigen::RowMajor>;
+using BodyTuple = std::tuple<int, double, Eigen::Vector3d, Eigen::Vector3d, Eigen::Matrix3d>;
+
+}  // namespace
+
+void bind_cloth(nb::module_& m) {
+  m.def(
+      "check_mesh", [](const Points2& rest, const Triangles& triangles) { ClothMesh(rest, triangles); }, "rest"_a,
+      "triangles"_a,
+      "Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.");
+  m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
+        "Internal: see stickslip_sim_core.self_intersections.");
+  m.def("cloth_kernels", &cloth_kernels, "Internal: cloth kernels this processor can run, narrowest first.");
+  nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")
+      .def_ro("converged", &StepReport::converged)
+      .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
+      .def_ro("substeps", &StepReport::substeps)
+      .def_ro("newton", &StepReport::newton)
+      .def_ro("krylov", &StepReport::krylov)
+      .def_ro("factorizations", &StepReport::factorizations)
+      .def_ro("contacts", &StepReport::contacts)
+      .def_ro("sliding", &StepReport::sliding);
+  nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
+      .def(
+          "__init__",
+          [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density,
+             const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
+             const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
+             int refactor_after, int halvings_max, const std::string& kernel) {
+            new (self) ClothSolver(rest, triangles, {density, {stretching}, rigidity}, held, clamped,
+                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, halvings_max},
+                                   kernel);
+          },
+          "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
+          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "halvings_max"_a,
+          "kernel"_a = "")
+      .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a)
+      .def(
+          "step",
+          [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
+             const std::vector<BodyTuple>& bodies, double damping) {
+            std::vector<Body> list;
+            for (const auto& [shape, mu, size, origin, rotation] : bodies)
+              list.push_back({shape, mu, size, origin, rotation});
+            nb::gil_scoped_release release;
+            return self.step(dt, gravity, held, slopes, list, damping);
+          },
+          "dt"_a, "gravity"_a, "held"_a, "slopes"_a, "bodies"_a, "damping"_a)
+      .def("positions", &ClothSolver::positions)
+      .def("velocities", &ClothSolver::velocities)
+      .def("reactions", &ClothSolver::reactions)
+      .def("contacts", &ClothSolver::contacts)
+      .def("sliding", &ClothSolver::sliding)
+      .def("masses", &ClothSolver::masses)
+      .def(
+          "energies",
+          [](ClothSolver& self, const Points3& positions, const Points3& slopes) {
+            const ClothSolver::Energies e = self.energies(positions, slopes);
+            return std::make_tuple(e.membrane, e.bending, e.gradient);
+          },
+          "positions"_a, "slopes"_a)
+      .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "slopes"_a, "v"_a)
+      .def("factor_error", &ClothSolver::factor_error, "positions"_a, "slopes"_a, "dt"_a)
+      .def("phases",
+           [](const ClothSolver& self) {
+             const ClothPhases p = self.phases();
+             return std::make_tuple(p.assembly, p.factorization, p.krylov, p.contact);
+           })
+      .def("factor_flops", &ClothSolver::factor_flops)
+      .def("factor_floats", &ClothSolver::factor_floats)
+      .def("kernel", &ClothSolver::kernel);
+}
+
+}  // namespace sim_core

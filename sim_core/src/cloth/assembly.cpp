@@ -1,0 +1,101 @@
+#include "cloth/assembly.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace sim_core {
+namespace {
+
+// A matrix of bending is assembled again when its stiffening has changed by more.
+constexpr float stiffening_change = 0.03f;
+
+}  // namespace
+
+Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const ClothProperties& properties,
+                   const std::vector<std::int32_t>& held, const Edges& clamped)
+    : kernel(kernel_in),
+      stencils(bending_stencils(mesh, properties.rigidity, clamped)),
+      compact_stencils(bending_stencils(mesh, properties.rigidity, clamped, true)),
+      numbering(mesh, stencils, compact_stencils, held, static_cast<int>(clamped.rows())),
+      mass_of_vertex(Eigen::VectorXd::Zero(mesh.rest.rows())),
+      mass(numbering.nodes, 0.0),
+      gradient(4L * numbering.nodes, 0.0),
+      membrane_(mesh, numbering, properties.stretching),
+      bending_(mesh, stencils, properties.rigidity, numbering, numbering.bending),
+      compact_bending_(mesh, compact_stencils, properties.rigidity, numbering, numbering.compact_bending),
+      rigidity_size_(properties.rigidity.cwiseAbs().maxCoeff()),
+      scalars_(numbering.bending.node.size(), 0.0f),
+      compact_scalars_(numbering.compact_bending.node.size(), 0.0f),
+      blocks_(12 * numbering.membrane.node.size(), 0.0f),
+      definite_blocks_(blocks_),
+      diagonal_(numbering.free_nodes, 0.0f),
+      stiffening_(2 * mesh.triangles.rows(), 0.0f),
+      assembled_stiffening_(2 * mesh.triangles.rows(), -1.0f),
+      unused_(4L * numbering.nodes, 0.0) {
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    for (int c = 0; c < 3; ++c) mass_of_vertex[mesh.triangles(t, c)] += properties.density * mesh.area[t] / 3.0;
+  }
+  for (int i = 0; i < numbering.vertices; ++i) mass[numbering.node[i]] = mass_of_vertex[i];
+  for (int i = 0; i < numbering.free_nodes; ++i) {
+    bending_diagonal_.push_back(numbering.bending.slot(i, i));
+    membrane_diagonal_.push_back(numbering.membrane.slot(i, i));
+  }
+  matrix = {numbering.free_nodes,
+            numbering.bending.begin.data(),
+            numbering.bending.node.data(),
+            scalars_.data(),
+            numbering.membrane.begin.data(),
+            numbering.membrane.node.data(),
+            blocks_.data(),
+            diagonal_.data()};
+}
+
+void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
+  std::fill(gradient.begin(), gradient.end(), 0.0);
+  if (with_matrix) std::fill(blocks_.begin(), blocks_.end(), 0.0f);
+  membrane_energy =
+      kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, definite);
+  bending_energy = kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data());
+  if (with_matrix) assemble_bending();
+}
+
+void Assembly::assemble_bending() {
+  float change_max = 0.0f;
+  const float scale = static_cast<float>(1.0 / rigidity_size_);
+  for (std::size_t t = 0; t < stiffening_.size(); t += 2) {
+    change_max = std::max({change_max, std::abs(stiffening_[t] - assembled_stiffening_[t]),
+                           scale * std::abs(stiffening_[t + 1] - assembled_stiffening_[t + 1])});
+  }
+  if (!(change_max > stiffening_change)) return;
+  std::fill(scalars_.begin(), scalars_.end(), 0.0f);
+  kernel.bending_matrix(bending_.data(), stiffening_.data(), scalars_.data());
+  assembled_stiffening_ = stiffening_;
+}
+
+void Assembly::set_diagonal(double dt, double damping) {
+  for (int i = 0; i < numbering.free_nodes; ++i) {
+    diagonal_[i] = static_cast<float>(mass[i] * (1.0 / (dt * dt) + damping / dt));
+  }
+}
+
+void Assembly::clear_diagonal() { std::fill(diagonal_.begin(), diagonal_.end(), 0.0f); }
+
+double Assembly::own_stiffness(int node) const {
+  const float* block = &blocks_[12L * membrane_diagonal_[node]];
+  return diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
+}
+
+ClothMatrix Assembly::neighbour(const Buffer<double>& x) {
+  std::fill(definite_blocks_.begin(), definite_blocks_.end(), 0.0f);
+  kernel.membrane(membrane_.data(), x.data(), unused_.data(), definite_blocks_.data(), true);
+  std::fill(compact_scalars_.begin(), compact_scalars_.end(), 0.0f);
+  kernel.bending_matrix(compact_bending_.data(), stiffening_.data(), compact_scalars_.data());
+  ClothMatrix out = matrix;
+  out.membrane = definite_blocks_.data();
+  out.bending_begin = numbering.compact_bending.begin.data();
+  out.bending_node = numbering.compact_bending.node.data();
+  out.bending = compact_scalars_.data();
+  return out;
+}
+
+}  // namespace sim_core

@@ -1,0 +1,61 @@
+// Energies of a sheet, their gradient, and the matrix of Newton's method.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "cloth/bending.hpp"
+#include "cloth/membrane.hpp"
+#include "cloth/numbering.hpp"
+#include "cloth/problem.hpp"
+#include "cloth/properties.hpp"
+#include "math/buffer.hpp"
+
+namespace sim_core {
+
+class Assembly {
+ public:
+  Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const ClothProperties& properties,
+           const std::vector<std::int32_t>& held, const Edges& clamped);
+  Assembly(const Assembly&) = delete;
+
+  const ClothKernel kernel;
+  const std::vector<Stencil> stencils, compact_stencils;
+  const Numbering numbering;
+  Eigen::VectorXd mass_of_vertex;  // kg
+  Buffer<double> mass;             // (nodes), 0 for slopes
+
+  // At the positions last evaluated.
+  Buffer<double> gradient;                             // (nodes, 4), N
+  double membrane_energy = 0.0, bending_energy = 0.0;  // J
+  ClothMatrix matrix{};
+  // Whether the matrix has the positive part of the stress only: that of a convex energy.
+  bool definite = false;
+
+  void evaluate(const Buffer<double>& x, bool with_matrix);
+  // The table's stiffness at the positions x; it stays for the whole step.
+  void read_table(const Buffer<double>& x) { membrane_.read_table(x); }
+  // Inertia and damping [1/s] of a step of dt.
+  void set_diagonal(double dt, double damping);
+  void clear_diagonal();
+  // Mean of a node's block on the diagonal, N/m.
+  double own_stiffness(int node) const;
+
+  // K's neighbour that the factor is of: the positive part of the stress, and the plate element that couples six nodes
+  // in place of twelve.
+  ClothMatrix neighbour(const Buffer<double>& x);
+
+ private:
+  void assemble_bending();
+
+  Membrane membrane_;
+  Bending bending_, compact_bending_;
+  double rigidity_size_;
+  std::vector<int> bending_diagonal_, membrane_diagonal_;  // slots
+  Buffer<float> scalars_, compact_scalars_, blocks_, definite_blocks_, diagonal_;
+  Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)
+  Buffer<double> unused_;
+};
+
+}  // namespace sim_core

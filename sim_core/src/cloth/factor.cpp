@@ -1,0 +1,55 @@
+#include "cloth/factor.hpp"
+
+#include <algorithm>
+
+namespace sim_core {
+namespace {
+
+// Contact stiffness in the factor over a node's own.
+constexpr float factor_share = 100.0f;
+
+}  // namespace
+
+StaleFactor::StaleFactor(const Numbering& numbering)
+    : storage_(numbering.compact_bending, numbering.membrane, numbering.dissection),
+      view_(storage_.view()),
+      added_(6L * numbering.free_nodes, 0.0f) {}
+
+bool StaleFactor::stale(int excess_max, int krylov_max) const {
+  return !made_ || excess_ > excess_max || last_ >= krylov_max;
+}
+
+// Contact as a penalty: k n n^T where a node slips, and against a turn of friction; k in all directions where it
+// sticks.
+void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt) {
+  const int free_nodes = assembly.numbering.free_nodes;
+  for (int i = 0; i < free_nodes; ++i) {
+    float* own = &added_[6L * i];
+    std::fill(own, own + 6, 0.0f);
+    if (contact.mode[i] == contact_open) continue;
+    const float k = factor_share * static_cast<float>(assembly.own_stiffness(i));
+    const float* n = &contact.normal[4L * i];
+    const float* t = &contact.direction[4L * i];
+    const float side = contact.mode[i] == contact_stick ? k : std::min(contact.turning[i], k);
+    const float along = contact.mode[i] == contact_stick ? k : 0.0f;
+    // k n n^T + along t t^T + side (1 - n n^T - t t^T)
+    int e = 0;
+    for (int r = 0; r < 3; ++r) {
+      for (int c = r; c < 3; ++c) {
+        own[e++] = (k - side) * n[r] * n[c] + (along - side) * t[r] * t[c] + (r == c ? side : 0.0f);
+      }
+    }
+  }
+  assembly.kernel.factor(view_, assembly.neighbour(x), {added_.data()});
+  made_ = true;
+  dt_ = dt;
+  excess_ = fresh_ = -1;
+}
+
+void StaleFactor::spent(int iterations) {
+  last_ = iterations;
+  if (fresh_ < 0) fresh_ = last_, excess_ = 0;
+  excess_ += std::max(0, last_ - fresh_);
+}
+
+}  // namespace sim_core

@@ -1,0 +1,19 @@
+// The arithmetic of cloth: energies, matrix, Cholesky factor, Krylov method. Compiled once per instruction set with
+// CLOTH_FLOATS floats in a vector; see math/lanes.hpp on why all names are in an unnamed namespace.
+//
+// Sums are taken in an order that depends on CLOTH_FLOATS alone: equal machines give equal bits.
+#pragma once
+
+#include "cloth/kernels/bending.hpp"
+#include "cloth/kernels/krylov.hpp"
+#include "cloth/kernels/membrane.hpp"
+
+namespace sim_core {
+namespace {
+
+constexpr ClothKernel kernel_named(const char* name) {
+  return {name, membrane, bending, bending_matrix, apply, factor, solve, krylov};
+}
+
+}  // namespace
+}  // namespace sim_core

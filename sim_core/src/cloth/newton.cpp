@@ -1,0 +1,148 @@
+#include "cloth/newton.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "math/stopwatch.hpp"
+
+namespace sim_core {
+namespace {
+
+using Eigen::Vector3d;
+
+// Contact stiffness of the law over a node's own.
+constexpr double contact_share = 0.1;
+// GMRES may stop earlier by this factor while nodes still change between open, stick and slip.
+constexpr double coarse = 6.0;
+
+}  // namespace
+
+Newton::Newton(Assembly& assembly, const ClothSettings& settings)
+    : contact(assembly.numbering.free_nodes),
+      factor(assembly.numbering),
+      residual(4L * assembly.numbering.nodes, 0.0),
+      assembly_(assembly),
+      settings_(settings),
+      trial_(residual),
+      best_(residual),
+      change_(4L * assembly.numbering.free_nodes + 64, 0.0f),
+      work_((2 * krylov_max + 1) * 4L * assembly.numbering.free_nodes + 64, 0.0f),
+      image_(change_) {}
+
+void Newton::evaluate(const Buffer<double>& x, bool with_matrix) {
+  const Stopwatch watch(phases.assembly);
+  assembly_.evaluate(x, with_matrix);
+}
+
+// R = M ((x - x_inertial)/dt^2 + c (x - x_start)/dt) + grad E, and the branch of each contact's law.
+Norms Newton::look(const StepProblem& problem, const Buffer<double>& x) {
+  const Stopwatch watch(phases.contact);
+  const double inertia = 1.0 / (problem.dt * problem.dt), viscous = problem.damping / problem.dt;
+  for (int i = 0; i < assembly_.numbering.nodes; ++i) {
+    at_node(residual, i) = assembly_.mass[i] * (inertia * (at_node(x, i) - at_node(problem.inertial, i)) +
+                                                viscous * (at_node(x, i) - at_node(problem.start, i))) +
+                           at_node(assembly_.gradient, i);
+  }
+  return contact.sort(x, problem.start, residual, problem.at_start, problem.at_end);
+}
+
+void Newton::predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const {
+  for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+    Vector3d p = at_node(problem.start, i);
+    if (!from_rest) p += problem.dt * at_node(problem.velocity, i);
+    for (const Body& body : problem.at_end) {
+      const Gap gap = gap_of(body, p);
+      if (gap.distance < 0.0) p -= gap.distance * gap.normal;
+    }
+    at_node(x, i) = p;
+  }
+}
+
+StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations,
+                          StepReport& report) {
+  const int free_nodes = assembly_.numbering.free_nodes;
+  predict(problem, x, from_rest);
+  assembly_.set_diagonal(problem.dt, problem.damping);
+  factor.expect(problem.dt);
+  evaluate(x, true);
+  for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
+  Norms norms = look(problem, x);
+  bool changed = true;
+  std::vector<int> modes = contact.mode;
+  double window[4];
+  std::fill(window, window + 4, norms.squared);
+  trial_ = best_ = x;
+  double least = norms.squared;
+  for (int iteration = 0; iteration < iterations; ++iteration) {
+    if (norms.largest <= settings_.tolerance) break;
+    if (!std::isfinite(norms.squared)) break;
+    ++report.newton;
+    correct(problem, x, changed, report);
+    // Along the line, non-monotone [Grippo et al. 1986].
+    const double limit = *std::max_element(window, window + 4);
+    double share = 1.0;
+    Norms next;
+    for (int cut = 0;; ++cut) {
+      trial_ = x;
+      for (int i = 0; i < 4 * free_nodes; ++i) trial_[i] += share * change_[i];
+      evaluate(trial_, true);
+      next = look(problem, trial_);
+      if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5) break;
+      share *= 0.5;
+    }
+    changed = contact.mode != modes;
+    modes = contact.mode;
+    std::swap(x, trial_);
+    norms = next;
+    window[iteration % 4] = norms.squared;
+    if (norms.squared < least) least = norms.squared, best_ = x;
+  }
+  if (!(norms.largest <= settings_.tolerance)) {
+    x = best_;
+    evaluate(x, true);
+    norms = look(problem, x);
+  }
+  return {norms.largest <= settings_.tolerance, norms.largest};
+}
+
+// Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
+void Newton::correct(const StepProblem& problem, const Buffer<double>& x, bool changed, StepReport& report) {
+  if (factor.stale(settings_.refactor_after, settings_.krylov_max)) {
+    const Stopwatch watch(phases.factorization);
+    factor.make(assembly_, x, contact, problem.dt);
+    ++report.factorizations;
+  }
+  const Stopwatch watch(phases.krylov);
+  subtract_corrections();
+  double size = 0.0;
+  for (float f : contact.force) size += static_cast<double>(f) * f;
+  size = std::sqrt(size);
+  const double tolerance = std::max((changed ? coarse : 1.0) * settings_.krylov_tolerance,
+                                    0.3 * settings_.tolerance / std::max(size, 1e-300));
+  const KrylovResult solved =
+      assembly_.kernel.krylov(assembly_.matrix, factor.view(), contact.rows(), contact.force.data(), change_.data(),
+                              work_.data(), settings_.krylov_max, std::min(tolerance, 0.5));
+  factor.spent(solved.iterations);
+  report.krylov += solved.iterations;
+  for (int i = 0; i < 4 * assembly_.numbering.free_nodes; ++i) change_[i] += contact.correction[i];
+}
+
+// What contact prescribes, `correction`, goes to the right-hand side.
+void Newton::subtract_corrections() {
+  const Buffer<float>& correction = contact.correction;
+  if (std::all_of(correction.begin(), correction.end(), [](float c) { return c == 0.0f; })) return;
+  assembly_.kernel.apply(assembly_.matrix, correction.data(), image_.data());
+  for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+    if (contact.mode[i] == contact_stick) continue;
+    auto force = at_node(contact.force, i), pulled = at_node(image_, i);
+    if (contact.mode[i] == contact_open) {
+      force -= pulled;
+      continue;
+    }
+    const auto n = at_node(contact.normal, i), t = at_node(contact.direction, i);
+    const float pressing = n.dot(pulled);
+    force -= pulled - pressing * n - contact.mu[i] * pressing * t;
+  }
+}
+
+}  // namespace sim_core

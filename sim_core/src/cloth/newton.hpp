@@ -1,0 +1,55 @@
+// One implicit step: M (x - x0 - dt v0)/dt^2 + c M (x - x0)/dt + grad E(x) = M g + contact, by Newton's method.
+#pragma once
+
+#include <vector>
+
+#include "cloth/assembly.hpp"
+#include "cloth/factor.hpp"
+#include "cloth/settings.hpp"
+#include "contact/state.hpp"
+
+namespace sim_core {
+
+// What a step starts from and is driven by.
+struct StepProblem {
+  double dt, damping;              // s, 1/s
+  const Buffer<double>& start;     // (nodes, 4): positions at its start, m
+  const Buffer<double>& inertial;  // (nodes, 4): where inertia and gravity alone lead, x0 + dt v0 + dt^2 g
+  const Buffer<double>& velocity;  // (nodes, 4): at its start, m/s
+  const std::vector<Body>&at_start, &at_end;
+};
+
+struct StepOutcome {
+  bool converged;
+  double residual;  // N
+};
+
+class Newton {
+ public:
+  Newton(Assembly& assembly, const ClothSettings& settings);
+  Newton(const Newton&) = delete;
+
+  ContactState contact;
+  StaleFactor factor;
+  Buffer<double> residual;  // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
+  ClothPhases phases;
+
+  // Solves for the free nodes of x, or leaves the best found in it; its held nodes are at their ends. `from_rest`:
+  // begins at the start of the step, not where the velocity leads.
+  StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report);
+
+  void evaluate(const Buffer<double>& x, bool with_matrix);
+
+ private:
+  Norms look(const StepProblem& problem, const Buffer<double>& x);
+  void predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const;
+  void correct(const StepProblem& problem, const Buffer<double>& x, bool changed, StepReport& report);
+  void subtract_corrections();
+
+  Assembly& assembly_;
+  ClothSettings settings_;
+  Buffer<double> trial_, best_;
+  Buffer<float> change_, work_, image_;
+};
+
+}  // namespace sim_core

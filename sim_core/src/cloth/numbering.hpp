@@ -1,0 +1,24 @@
+// Numbers of nodes: free vertices in the order of elimination, then held vertices, then the slopes at clamped edges.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "cloth/ordering.hpp"
+#include "cloth/plate.hpp"
+
+namespace sim_core {
+
+struct Numbering {
+  int vertices, slopes, nodes, free_nodes;
+  std::vector<int> node, vertex;  // of a vertex or slope, and back
+  std::vector<int> held;          // nodes of the held vertices, in the caller's order
+  Dissection dissection;
+  Pattern bending, compact_bending, membrane;  // of the free nodes
+
+  // Throws std::invalid_argument, naming `held`.
+  Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
+            const std::vector<std::int32_t>& held, int slopes);
+};
+
+}  // namespace sim_core

@@ -1,0 +1,32 @@
+// Order of elimination by nested dissection.
+#pragma once
+
+#include <vector>
+
+#include "cloth/mesh.hpp"
+
+namespace sim_core {
+
+using Graph = std::vector<std::vector<int>>;  // neighbours of each node, sorted, itself included
+
+struct Dissection {
+  std::vector<int> order;        // nodes of the graph in the order of elimination
+  std::vector<int> pivot_begin;  // (fronts + 1): pieces of `order`, children before parents
+  std::vector<int> parent;       // (fronts): -1 at the root
+};
+
+// Bisects along the longer side of what is left, by the coordinates of the mesh at rest [George 1973].
+Dissection nested_dissection(const Graph& graph, const Points2& points);
+
+// Which nodes each row of a matrix has entries for, in compressed rows: those of row i are node[begin[i]] ... ,
+// ascending.
+struct Pattern {
+  std::vector<int> begin{0}, node;
+
+  void add_row(const std::vector<int>& nodes);
+  int rows() const { return static_cast<int>(begin.size()) - 1; }
+  // Place of (i, j) in `node`; -1 where there is none, as for held nodes.
+  int slot(int i, int j) const;
+};
+
+}  // namespace sim_core

@@ -1,0 +1,110 @@
+// What the cloth kernels work on: plain arrays, owned by ClothSolver. Nothing here may pull in a template of the
+// standard library: kernels/kernel.hpp is compiled once per instruction set, and the linker must never merge their
+// instances.
+//
+// Nodes are numbered in the order of elimination: free nodes first, held ones after. Vectors over nodes have four
+// components a node, the fourth is zero, so that a node is one vector register.
+#pragma once
+
+namespace sim_core {
+
+// Triangles go through the membrane in groups of this many.
+constexpr int membrane_lanes = 8;
+
+// Rows and pivots of a front are padded to this many floats.
+constexpr int front_padding = 16;
+
+// Krylov vectors that one linear solve may use.
+constexpr int krylov_max = 40;
+
+struct MembraneData {
+  int groups;
+  const int* nodes;         // (groups, 3, lanes)
+  const double* shape;      // (groups, 4, lanes): gradients of the shape functions of nodes 1 and 2, 1/m
+  const double* area;       // (groups, lanes), 0 in the lanes that pad the last group
+  const double* stiffness;  // (groups, 4, lanes): k0 ... k3, N/m
+  const int* slots;         // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for held nodes
+};
+
+// Of each triangle the second derivatives (H11, H22, 2 H12) are linear in the positions of the nodes of its stencil.
+struct BendingData {
+  int triangles;
+  const int* begin;        // (triangles + 1)
+  const int* nodes;        // by stencil entry
+  const double* weights;   // (entries, 4): of H11, H22, 2 H12, and 0; 1/m^2
+  const double* area;      // (triangles), m^2
+  const double* spacing2;  // (triangles), m^2: square of the length over which a fold turns
+  double rigidity[6];      // 11 12 16 22 26 66, N m
+  const int* slot_begin;   // (triangles): first slot of the lower pairs (i, j <= i) of the stencil, in order
+  const int* slots;        // scalar slots of (i, j) and (j, i), -1 for held nodes
+};
+
+// K = mass + bending (x) 1 + membrane, over the free nodes.
+struct ClothMatrix {
+  int nodes;
+  const int* bending_begin;  // (nodes + 1)
+  const int* bending_node;
+  float* bending;
+  const int* membrane_begin;  // (nodes + 1)
+  const int* membrane_node;
+  float* membrane;  // (blocks, 3, 4): columns
+  float* diagonal;  // (nodes): mass / dt^2 and damping, N/m
+};
+
+// State of a node in the linear problem of contact.
+enum ContactMode : int { contact_open = 0, contact_slip = 1, contact_stick = 2 };
+
+struct ContactRows {
+  const int* mode;         // (nodes)
+  const float* normal;     // (nodes, 4)
+  const float* direction;  // (nodes, 4): of friction, in the plane
+  const float* mu;         // (nodes): 0 where the normal force is not positive
+  const float* turning;    // (nodes): stiffness against a turn of friction, N/m
+};
+
+// A Cholesky factor in single precision by fronts (multifrontal). Front f eliminates nodes pivot_begin[f] ...
+// pivot_begin[f + 1]; its other rows are rows[row_begin[f]] ... . Children come before parents, in postorder.
+struct Factor {
+  int fronts;
+  const int* pivot_begin;   // (fronts + 1)
+  const int* row_begin;     // (fronts + 1)
+  const int* rows;          // nodes
+  const int* parent_row;    // by row: its place in the parent's front, in nodes: pivots first
+  const int* children;      // (fronts): number of children
+  const long* panel_begin;  // (fronts): offset of the panel, floats
+  const long* entry_begin;  // (fronts + 1): entries of K that go into the front
+  const int* entry_slot;    // of a bending scalar
+  const int* entry_block;   // of a membrane block or -1
+  const int* entry_row;     // place in the front, nodes
+  const int* entry_column;
+  float* panels;
+  float* stack;  // updates of fronts that wait for their parents
+  int* waiting;  // those fronts
+  long* starts;  // and where their updates begin
+  float* local;  // one front's right-hand side
+};
+
+// A node keeps its own stiffness, and in contact some more: the factor need not be exact.
+struct FactorDiagonal {
+  const float* added;  // (nodes, 6): xx xy xz yy yz zz, N/m
+};
+
+struct KrylovResult {
+  int iterations;
+  double residual;  // over that of the right-hand side
+};
+
+struct ClothKernel {
+  const char* name;
+  // Adds gradients and returns the energy. `blocks` may be null.
+  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, bool project);
+  double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening);
+  void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
+  void (*apply)(const ClothMatrix&, const float* x, float* y);
+  void (*factor)(const Factor&, const ClothMatrix&, const FactorDiagonal&);
+  void (*solve)(const Factor&, int nodes, const float* b, float* x);
+  KrylovResult (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x, float* work,
+                         int iterations, double tolerance);
+};
+
+}  // namespace sim_core

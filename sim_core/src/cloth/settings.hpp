@@ -1,0 +1,26 @@
+// Numbers by which the solver steps, and what a step reports.
+#pragma once
+
+namespace sim_core {
+
+struct ClothSettings {
+  double tolerance;  // N: largest residual force of a node
+  int newton_max;    // iterations of Newton's method in a step
+  int krylov_max;    // of GMRES in one of those
+  double krylov_tolerance;
+  int refactor_after;  // GMRES iterations that a stale factor may cost
+  int halvings_max;    // of a step that does not converge
+};
+
+struct StepReport {
+  bool converged = true;
+  double residual = 0.0;  // N: worst over the substeps
+  int substeps = 0, newton = 0, krylov = 0, factorizations = 0, contacts = 0, sliding = 0;
+};
+
+// CPU seconds by phase, since construction.
+struct ClothPhases {
+  double assembly = 0.0, factorization = 0.0, krylov = 0.0, contact = 0.0;
+};
+
+}  // namespace sim_core

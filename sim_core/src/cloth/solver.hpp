@@ -1,0 +1,62 @@
+// Dynamics of a piece of cloth in contact with moving bodies: implicit Euler, exact Coulomb friction.
+#pragma once
+
+#include <Eigen/Core>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "cloth/properties.hpp"
+#include "cloth/settings.hpp"
+#include "contact/bodies.hpp"
+
+namespace sim_core {
+
+class ClothSolver {
+ public:
+  // `kernel`: level of the kernels, "" for the widest that this processor runs. `held`: vertices whose positions are
+  // prescribed; `clamped`: boundary edges whose outward slope is prescribed.
+  ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
+              const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
+              const std::string& kernel = "");
+  ~ClothSolver();
+
+  void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes);
+
+  // `gravity`: acceleration of each vertex; `held` and `slopes`: at the end of the step; bodies keep their number and
+  // order from step to step. `damping`: mass-proportional, 1/s.
+  StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
+                  const std::vector<Body>& bodies, double damping);
+
+  Points3 positions() const;
+  Points3 velocities() const;
+  // Force of bodies on each free vertex, of holders on each held one, at the end of the last step, N.
+  Points3 reactions() const;
+  // Which body each vertex touches (-1: none), and whether it slides.
+  std::vector<std::int32_t> contacts() const;
+  std::vector<std::int32_t> sliding() const;
+
+  struct Energies {
+    double membrane, bending;
+    Points3 gradient;
+  };
+  Energies energies(const Points3& positions, const Points3& slopes);
+  // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
+  Points3 stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v);
+  // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
+  double factor_error(const Points3& positions, const Points3& slopes, double dt);
+
+  const Eigen::VectorXd& masses() const;
+  ClothPhases phases() const;
+  double factor_flops() const;
+  std::size_t factor_floats() const;
+  std::string kernel() const;
+
+ private:
+  struct Impl;
+  std::unique_ptr<Impl> impl_;
+};
+
+}  // namespace sim_core

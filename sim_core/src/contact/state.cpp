@@ -1,0 +1,80 @@
+#include "contact/state.hpp"
+
+#include <cmath>
+#include <limits>
+
+namespace sim_core {
+
+using Eigen::Vector3d;
+
+void Norms::count(double force_squared) {
+  squared += force_squared;
+  if (!(force_squared <= largest * largest)) largest = std::sqrt(force_squared);  // a NaN stays
+}
+
+ContactState::ContactState(int free_nodes)
+    : mode(free_nodes, contact_open),
+      touched(free_nodes, -1),
+      stiffness(free_nodes, 0.0),
+      normal(4 * free_nodes + 64, 0.0f),
+      direction(4 * free_nodes + 64, 0.0f),
+      mu(free_nodes, 0.0f),
+      turning(free_nodes, 0.0f),
+      force(4 * free_nodes + 64, 0.0f),
+      correction(4 * free_nodes + 64, 0.0f) {}
+
+ContactRows ContactState::rows() const {
+  return {mode.data(), normal.data(), direction.data(), mu.data(), turning.data()};
+}
+
+Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
+                         const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
+  Norms norms;
+  const int free_nodes = static_cast<int>(mode.size());
+  for (int i = 0; i < free_nodes; ++i) {
+    const Vector3d p = at_node(x, i);
+    Gap gap{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()};
+    int which = -1;
+    for (std::size_t b = 0; b < at_end.size(); ++b) {
+      const Gap one = gap_of(at_end[b], p);
+      if (one.distance < gap.distance) gap = one, which = static_cast<int>(b);
+    }
+    const Vector3d r = at_node(residual, i);
+    if (which < 0 || !(r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0)) {
+      touched[i] = -1;
+      const ContactRow row = open_row(r);
+      mode[i] = contact_open;
+      at_node(force, i) = row.force.cast<float>();
+      at_node(correction, i).setZero();
+      norms.count(row.error_squared);
+      continue;
+    }
+    touched[i] = which;
+    const ContactSight seen = sight(i, which, gap, x, start, residual, at_start, at_end);
+    const ContactRow row = closed_row(seen);
+    at_node(normal, i) = gap.normal.cast<float>();
+    write(i, row);
+    norms.count(row.error_squared);
+  }
+  return norms;
+}
+
+ContactSight ContactState::sight(int node, int body, const Gap& gap, const Buffer<double>& x,
+                                 const Buffer<double>& start, const Buffer<double>& residual,
+                                 const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {
+  const Vector3d before = at_node(start, node), p = at_node(x, node);
+  Vector3d u = p - carried(at_start[body], at_end[body], before);
+  u -= u.dot(gap.normal) * gap.normal;
+  return {gap.distance, gap.normal, u, at_node(residual, node), at_end[body].mu, stiffness[node]};
+}
+
+void ContactState::write(int node, const ContactRow& row) {
+  mode[node] = row.mode;
+  at_node(direction, node) = row.direction.cast<float>();
+  at_node(force, node) = row.force.cast<float>();
+  at_node(correction, node) = row.correction.cast<float>();
+  mu[node] = static_cast<float>(row.coupling);
+  turning[node] = static_cast<float>(row.turning);
+}
+
+}  // namespace sim_core

@@ -1,0 +1,42 @@
+// Contacts of the nodes with bodies: modes, rows of Newton's system, and what is kept from step to step.
+#pragma once
+
+#include <Eigen/Core>
+#include <vector>
+
+#include "cloth/problem.hpp"
+#include "contact/bodies.hpp"
+#include "contact/law.hpp"
+#include "math/buffer.hpp"
+
+namespace sim_core {
+
+// How far an iterate is from the solution: the largest force that a node lacks [N], and the sum of their squares.
+struct Norms {
+  double largest = 0.0, squared = 0.0;
+  void count(double force_squared);
+};
+
+class ContactState {
+ public:
+  explicit ContactState(int free_nodes);
+
+  std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body (-1: none)
+  std::vector<double> stiffness;   // (free nodes): k of the law, N/m
+  Buffer<float> normal, direction, mu, turning;
+  Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
+
+  // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from contact.
+  Norms sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
+             const std::vector<Body>& at_start, const std::vector<Body>& at_end);
+
+  ContactRows rows() const;
+
+ private:
+  ContactSight sight(int node, int body, const Gap& gap, const Buffer<double>& x, const Buffer<double>& start,
+                     const Buffer<double>& residual, const std::vector<Body>& at_start,
+                     const std::vector<Body>& at_end) const;
+  void write(int node, const ContactRow& row);
+};
+
+}  // namespace sim_core

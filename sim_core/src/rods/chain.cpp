@@ -1,0 +1,146 @@
+#include "rods/chain.hpp"
+
+#include <Eigen/LU>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "rods/general_rod.hpp"
+#include "rods/newton.hpp"
+
+namespace sim_core {
+namespace {
+
+using T = Lanes<1>;
+
+constexpr double chain_tolerance = 1e-6;  // on the last Newton step [rad]; the error left is of the order of its square
+
+Vec3<T> lanes(const Eigen::Vector3d& a) { return {a.x(), a.y(), a.z()}; }
+
+Eigen::Vector3d dense(Vec3<T> a) { return {a.x.v[0], a.y.v[0], a.z.v[0]}; }
+
+Eigen::Matrix3d dense(Sym3<T> a) {
+  Eigen::Matrix3d m;
+  m << a.xx.v[0], a.xy.v[0], a.xz.v[0], a.xy.v[0], a.yy.v[0], a.yz.v[0], a.xz.v[0], a.yz.v[0], a.zz.v[0];
+  return m;
+}
+
+Eigen::Matrix3d cross_matrix(const Eigen::Vector3d& a) {
+  Eigen::Matrix3d m;
+  m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;
+  return m;
+}
+
+Quat<T> frame(const Rows4& q, Eigen::Index i) { return {q(i, 0), {q(i, 1), q(i, 2), q(i, 3)}}; }
+
+void set_frame(Rows4& rows, Eigen::Index i, Quat<T> q) { rows.row(i) << q.w.v[0], q.v.x.v[0], q.v.y.v[0], q.v.z.v[0]; }
+
+void check_rows(const char* name, Eigen::Index rows, Eigen::Index asked) {
+  if (rows != asked || asked < 1) {
+    throw std::invalid_argument(std::string(name) + ": must have " + std::to_string(asked) + " rows, got " +
+                                std::to_string(rows));
+  }
+}
+
+}  // namespace
+
+ChainEquilibrium relax_chain(const RodChain& chain, const Rows4& quaternions) {
+  const int n = static_cast<int>(chain.natural.rows());
+  check_rows("quaternions", quaternions.rows(), n + 1);
+  // A chain reads the middles of its elements only: every second value of the grid.
+  std::vector<Vec3<T>> natural(2 * n + 1, Vec3<T>{T(0.0), T(0.0), T(0.0)});
+  for (int i = 0; i < n; ++i) natural[2 * i + 1] = lanes(chain.natural.row(i));
+  Level<1> level{n, std::vector<Quat<T>>(n + 1), std::vector<Vec3<T>>(n + 1)};
+  for (int i = 0; i <= n; ++i) level.frame[i] = frame(quaternions, i);
+  const GeneralRod<T> rod{chain.gamma, lanes(chain.stiffness), level.frame[0], 2 * n, natural.data(), nullptr, nullptr,
+                          nullptr};
+  NewtonWorkspace<1> work(n);
+  minimise(rod, level, work, chain_tolerance);
+  balance(rod, level);
+  ChainEquilibrium result{Rows4(n + 1, 4), level.energy.v[0], level.converged.v[0] != 0, level.stable.v[0] != 0};
+  for (int i = 0; i <= n; ++i) set_frame(result.quaternions, i, level.frame[i]);
+  return result;
+}
+
+Rows4 chain_frames(const Rows3& curvature, const Eigen::Vector4d& clamp) {
+  const Eigen::Index n = curvature.rows();
+  Rows4 rows(n + 1, 4);
+  rows.row(0) = clamp;
+  for (Eigen::Index i = 0; i < n; ++i) {
+    const Vec3<T> turn = lanes(curvature.row(i) / static_cast<double>(n));
+    set_frame(rows, i + 1, renormalized(frame(rows, i) * exponential(turn)));
+  }
+  return rows;
+}
+
+Rows3 chain_centerline(const Rows4& quaternions) {
+  const Eigen::Index n = quaternions.rows() - 1;
+  Rows3 r(n + 1, 3);
+  r.row(0).setZero();
+  Eigen::Vector3d before = dense(direction1(frame(quaternions, 0)));
+  for (Eigen::Index i = 1; i <= n; ++i) {
+    const Eigen::Vector3d here = dense(direction1(frame(quaternions, i)));
+    r.row(i) = r.row(i - 1) + (0.5 / n) * (before + here).transpose();
+    before = here;
+  }
+  return r;
+}
+
+RowMajor chain_jacobian(const RodChain& chain, const Rows4& quaternions, const RowMajor& basis, int stride) {
+  const int n = static_cast<int>(chain.natural.rows());
+  check_rows("quaternions", quaternions.rows(), n + 1);
+  check_rows("basis", basis.rows(), n);
+  const Eigen::Index columns = 1 + 3 * basis.cols();
+  const double h = 1.0 / n;
+  std::vector<Eigen::Matrix3d> diagonal(n + 1, Eigen::Matrix3d::Zero()), upper(n);
+  RowMajor turn = RowMajor::Zero(3 * (n + 1), columns);  // -dg/dp, then omega'; the clamp's rows are dropped
+  for (int i = 0; i < n; ++i) {
+    const Quat<T> a = frame(quaternions, i), b = frame(quaternions, i + 1);
+    const GeneralSection<T> here{lanes(chain.natural.row(i)), lanes(chain.stiffness), {}};
+    const auto moment = element_moment(here, a, b, T(h), T(double(n)));
+    const Element<T> e = element(here, moment, T(double(n)));
+    const Vec3<T> t = direction1(a);
+    const T load((1.0 - i * h) * h);
+    const Eigen::Matrix3d S = dense(e.stiffness);
+    diagonal[i] += S + dense(weight_stiffness(T(chain.gamma) * load, t));
+    diagonal[i + 1] += S;
+    upper[i] = -S + 0.5 * cross_matrix(dense(e.force));
+    turn.block<3, 1>(3 * i, 0) -= dense(weight_torque(load, t));
+    // f = J^T R K (theta / h - kappa_bar): its derivative by component c is -K_c J^T d_c.
+    const Vec3<T> directions[3] = {direction1(b), direction2(b), direction3(b)};
+    for (int c = 0; c < 3; ++c) {
+      const Eigen::Vector3d f = chain.stiffness[c] * dense(jacobian_transposed(moment.log, directions[c]));
+      const auto part = f * basis.row(i);
+      turn.block(3 * i, 1 + c * basis.cols(), 3, basis.cols()) -= part;
+      turn.block(3 * i + 3, 1 + c * basis.cols(), 3, basis.cols()) += part;
+    }
+  }
+  turn.topRows<3>().setZero();
+  std::vector<Eigen::Matrix3d> inverse(n + 1);
+  for (int i = 1; i <= n; ++i) {
+    if (i > 1) {
+      const Eigen::Matrix3d ratio = upper[i - 1].transpose() * inverse[i - 1];
+      diagonal[i] -= ratio * upper[i - 1];
+      turn.middleRows<3>(3 * i).noalias() -= ratio * turn.middleRows<3>(3 * i - 3);
+    }
+    inverse[i] = diagonal[i].inverse();
+  }
+  for (int i = n; i >= 1; --i) {
+    if (i < n) turn.middleRows<3>(3 * i).noalias() -= upper[i] * turn.middleRows<3>(3 * i + 3);
+    turn.middleRows<3>(3 * i) = (inverse[i] * turn.middleRows<3>(3 * i)).eval();
+  }
+
+  RowMajor jacobian(3 * (n / stride + 1), columns);
+  RowMajor position = RowMajor::Zero(3, columns), before = RowMajor::Zero(3, columns);
+  jacobian.topRows<3>().setZero();
+  for (int i = 1; i <= n; ++i) {
+    // t' = omega' x t
+    const RowMajor here = -cross_matrix(dense(direction1(frame(quaternions, i)))) * turn.middleRows<3>(3 * i);
+    position += (0.5 * h) * (before + here);
+    before = here;
+    if (i % stride == 0) jacobian.middleRows<3>(3 * (i / stride)) = position;
+  }
+  return jacobian;
+}
+
+}  // namespace sim_core

@@ -1,0 +1,53 @@
+"""The command `stickslip-train info`."""
+
+from collections import Counter
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from stickslip_schemas.samples import SPLITS
+
+from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.data.reader import DatasetReader
+
+
+def info(
+    dataset: DatasetArgument,
+    verify: Annotated[bool, typer.Option("--verify", help="check the SHA-256 of every file first")] = False,
+) -> None:
+    """Say what is in a dataset."""
+    with errors_told(), DatasetReader(dataset, verify=verify) as reader:
+        console = Console()
+        manifest = reader.manifest
+        facts = Table.grid(padding=(0, 2))
+        facts.add_row("dataset", f"{manifest.dataset}, version {manifest.version}, {reader.kind}")
+        facts.add_row("spec", f"{manifest.spec_digest}")
+        facts.add_row("certificate", manifest.certificate or "none: the physics of this build is not vouched for")
+        counts = ", ".join(f"{manifest.split_counts.get(split, 0)} {split}" for split in SPLITS)
+        facts.add_row("samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {counts}")
+        reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
+        told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {told}" if told else ""))
+        facts.add_row("files", f"{len(manifest.files)}, {_megabytes(manifest.size)}" + (", verified" if verify else ""))
+        console.print(facts)
+        sizes: Counter[str] = Counter()
+        for file in manifest.files:
+            sizes[file.path.split("/")[0]] += file.size
+        arrays = Table(box=None, pad_edge=False, header_style="bold")
+        for title in ("array", "type", "shape", "raw", "on disk", "what"):
+            arrays.add_column(title, justify="right" if title in ("raw", "on disk") else "left")
+        for array in reader.arrays.values():
+            arrays.add_row(
+                array.name,
+                array.dtype,
+                " × ".join(map(str, (len(reader), *array.shape))),
+                _megabytes(len(reader) * array.sample_bytes),
+                _megabytes(sizes[array.name]),
+                array.description,
+            )
+        console.print(arrays)
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB" if count >= 1e5 else f"{count / 1e3:,.1f} kB"

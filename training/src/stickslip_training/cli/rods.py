@@ -1,0 +1,159 @@
+"""The commands `stickslip-train curvature` and `stickslip-train local-global`."""
+
+import importlib.util
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.data.reader import DatasetReader
+
+if TYPE_CHECKING:
+    from stickslip_training.rods.curvature import TrainingReport
+    from stickslip_training.rods.evaluation import MethodReport
+
+_SECONDS_BETWEEN_LINES = 5.0  # epochs of a small dataset take less
+_EVALUATED_RODS = 1000  # at most
+
+
+def curvature(
+    dataset: DatasetArgument,
+    out: Annotated[Path, typer.Option(help="directory for the model, the report and the picture")],
+    minutes: Annotated[float | None, typer.Option(help="time for training [min]; 1 if --epochs is not given")] = None,
+    epochs: Annotated[int | None, typer.Option(help="passes over the training rods, instead of a time")] = None,
+    noise: Annotated[float, typer.Option(help="noise on every coordinate, standard deviation over L")] = 0.005,
+    seed: Annotated[int, typer.Option()] = 0,
+    batch_size: Annotated[int, typer.Option()] = 16,
+    threads: Annotated[int, typer.Option(help="of torch")] = 2,
+    device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
+) -> None:
+    """Train the network that estimates curvature from a noisy centreline, and compare it with no learning."""
+    from stickslip_training.engine.fit import EpochReport
+    from stickslip_training.rods.curvature import CurvatureTraining, train_curvature
+
+    console = Console()
+    told = -math.inf
+
+    def tell(epoch: EpochReport) -> None:
+        nonlocal told
+        if epoch.seconds < told + _SECONDS_BETWEEN_LINES:
+            return
+        told = epoch.seconds
+        validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
+        console.print(f"epoch {epoch.epoch}: loss {epoch.train_loss:.3f}{validation} rad, {epoch.seconds:.0f} s")
+
+    with errors_told():
+        config = CurvatureTraining(
+            dataset=dataset,
+            out=out,
+            minutes=1.0 if minutes is None and epochs is None else minutes,
+            epochs=epochs,
+            noise=noise,
+            seed=seed,
+            batch_size=batch_size,
+            threads=threads,
+            device=device,
+        )
+        report = train_curvature(config, resume=resume, on_epoch=tell)
+        console.print(_results(report))
+        for note in report.notes:
+            console.print(f"Note: {note}")
+        written = ["report.json", "model.pt", "checkpoint.pt"]
+        if importlib.util.find_spec("matplotlib") is None:
+            console.print("No picture: pip install 'stickslip-training[plots]' for one.")
+        else:
+            from stickslip_training.rods.plots import plot_curvature
+
+            plot_curvature(config, report, out / "curvature.png")
+            written.append("curvature.png")
+        console.print(f"{out}: {', '.join(written)}", soft_wrap=True)
+
+
+def local_global(
+    dataset: DatasetArgument,
+    out: Annotated[Path, typer.Option(help="directory for the network and the report")],
+    steps: Annotated[int, typer.Option(help="of training; 1000 take 40 CPU seconds")] = 12_000,
+    noise: Annotated[tuple[float, float], typer.Option(help="least and largest white noise, over L")] = (2e-4, 1e-2),
+    reconstruction: Annotated[
+        Path | None,
+        typer.Option(help="npz of `benchmarks/reconstruction.py --save`: a fifth of the rods get its noise"),
+    ] = None,
+    judged_at: Annotated[float, typer.Option(help="white noise on the test rods, over L")] = 0.005,
+    seed: Annotated[int, typer.Option()] = 0,
+    threads: Annotated[int, typer.Option(help="of torch")] = 1,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
+) -> None:
+    """Train the network that pools local and global features, with fresh noise at every step."""
+    from stickslip_training.engine.fit import EpochReport
+    from stickslip_training.rods.dataset import load_splits
+    from stickslip_training.rods.evaluation import evaluate, noisy_test_centerline
+    from stickslip_training.rods.local_global import LocalGlobalTraining, save_local_global, train_local_global
+    from stickslip_training.rods.noise import ReconstructionNoise
+
+    console = Console()
+
+    def tell(report: EpochReport) -> None:
+        console.print(f"step {report.step}: loss {report.train_loss:.3f}, {report.seconds:.0f} s")
+
+    with errors_told():
+        settings = LocalGlobalTraining(steps=steps, noise=noise, seed=seed, threads=threads)
+        measured = None if reconstruction is None else ReconstructionNoise.load(reconstruction)
+        with DatasetReader(dataset) as reader:
+            rods, notes = load_splits(reader, _EVALUATED_RODS)
+        train, test = rods["train"], rods["test"]
+        net = train_local_global(
+            train.centerline,
+            train.strains,
+            settings,
+            reconstruction=measured,
+            out=out,
+            resume=resume,
+            on_epoch=tell,
+        )
+        methods, loss = evaluate(net, test, noisy_test_centerline(test, judged_at, seed))
+        save_local_global(out / "local-global.pt", net, settings)
+        report = {
+            "settings": asdict(settings),
+            "noise_of_test_rods": judged_at,
+            "rods": {name: len(part) for name, part in rods.items()},
+            "test_loss": loss,
+            "methods": [asdict(method) for method in methods],
+            "notes": notes,
+        }
+        (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    console.print(_methods(f"|κ| of {len(test)} test rods at {judged_at:.2%} noise", "", methods))
+    for note in notes:
+        console.print(f"Note: {note}")
+    console.print(f"{out}: local-global.pt, report.json, checkpoint.pt", soft_wrap=True)
+
+
+def _results(report: "TrainingReport") -> Table:
+    return _methods(
+        f"|κ| of {report.rods['test']} test rods at {report.config['noise']:.2%} noise",
+        f"The network's loss over all three strains is {report.test_loss:.3f} rad. "
+        f"It was trained for {report.seconds:.0f} s on {report.rods['train']} rods.",
+        report.methods,
+    )
+
+
+def _methods(title: str, caption: str, methods: "tuple[MethodReport, ...]") -> Table:
+    table = Table(title=title, caption=caption, caption_justify="left")
+    table.add_column("method")
+    for title in ("RMS of |κ| L", "error, median", "error, 90 %", "ms a rod"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for method in methods:
+        table.add_row(
+            method.method,
+            f"{method.rms:,.2f} rad",
+            f"{method.relative_median:,.1%}",
+            f"{method.relative_p90:,.1%}",
+            f"{1e3 * method.seconds_per_rod:,.2f}",
+        )
+    return table

@@ -1,0 +1,335 @@
+"""Read a dataset version, from a directory or over HTTP, into NumPy arrays.
+
+One read of bytes per clip, mesh or set of views: shard indexes are kept, a chunk's crc32c is checked, and it is
+decoded straight into its place in the caller's buffer. There are no threads and nothing asynchronous, so a reader may
+be used before and after a fork, and it can be pickled. Zeros are never made up: what cannot be read raises.
+"""
+
+import os
+from collections import Counter, OrderedDict
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.chunks import (
+    MISSING,
+    CorruptChunkError,
+    decode_chunk,
+    decode_shard_index,
+    decode_trajectory,
+    shard_index_size,
+)
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.samples import SPLITS
+from stickslip_schemas.tasks import FileEntry
+
+from stickslip_training.arrays import Array
+from stickslip_training.data.errors import (
+    CorruptDataError,
+    InvalidDatasetError,
+    MissingFileError,
+    RejectedSampleError,
+)
+from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
+from stickslip_training.data.sources import open_source
+
+Split = Literal["train", "validation", "test"]
+Slots = Sequence[int] | npt.NDArray[np.integer[Any]]
+
+
+class DatasetReader:
+    """One version of a dataset. Samples are named by their slot, 0 to `len(reader)` - 1."""
+
+    def __init__(
+        self,
+        source: str | os.PathLike[str],
+        *,
+        api_key: str | None = None,
+        verify: bool = False,
+        cache_bytes: int = 256 * 2**20,
+    ) -> None:
+        """Open `source`: the directory of a version, or its URL (see `sources.HttpSource`).
+
+        `verify` checks the SHA-256 of every file first. Curves and labels come many samples to a chunk; decoded
+        chunks of curves are kept up to `cache_bytes`.
+        """
+        self.source = open_source(source, api_key=api_key)
+        try:
+            self._open(cache_bytes, verify)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, cache_bytes: int, verify: bool) -> None:
+        manifest = self.source.read_manifest()
+        self.manifest = _parse_manifest(manifest)
+        self.manifest_digest = sha256(manifest)
+        self.arrays: dict[str, ArrayLayout] = {array.name: array for array in layout(self.spec)}
+        self._files = {file.path: file for file in self.manifest.files}
+        self._shard_size = self.spec.samples_per_shard
+        self._indexes: dict[tuple[str, int], Array] = {}
+        self._labels: dict[str, Array] = {}
+        self._chunks: OrderedDict[tuple[str, int], Array] = OrderedDict()
+        self._chunk_bytes = 0
+        self._cache_bytes = cache_bytes
+        if verify:
+            self.verify()
+        self._check_metadata()
+        self._check_slots()
+        self._check_manifested()
+
+    @property
+    def spec(self) -> JobSpec:
+        """What was asked for when the dataset was made."""
+        return self.manifest.spec
+
+    @property
+    def kind(self) -> str:
+        """The kind of the dataset, `rod_hang` for example."""
+        return str(self.spec.kind)
+
+    @property
+    def valid(self) -> Array:
+        """True where there is a sample, bool (slots,)."""
+        return self.label("valid")
+
+    def __len__(self) -> int:
+        """Return the number of slots, those of rejected samples included."""
+        return self.manifest.sample_count
+
+    def __enter__(self) -> "DatasetReader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The types of a spec's axes are made at run time, and pickle cannot find them by name.
+        return self.__dict__ | {"manifest": self.manifest.model_dump_json()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, manifest=Manifest.model_validate_json(state["manifest"]))
+
+    def close(self) -> None:
+        """Let go of connections."""
+        self.source.close()
+
+    # --- what there is ----------------------------------------------------------------------------------------
+
+    def slots(self, split: Split | None = None, *, rejected: bool = False) -> npt.NDArray[np.int64]:
+        """Return the slots of `split`, or of all splits, in increasing order.
+
+        Rejected samples are left out. With `rejected` they are in; they have their parameters as labels, and reading
+        anything else of them raises.
+        """
+        chosen = np.ones(len(self), dtype=bool) if rejected else self.valid.copy()
+        if split is not None:
+            if split not in SPLITS:
+                raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {split!r}")
+            chosen &= self.label("split") == SPLITS.index(split)
+        return np.flatnonzero(chosen).astype(np.int64)
+
+    def label(self, name: str) -> Array:
+        """Return a label of all slots, (slots,), or (slots, n) for one that is a small vector; read-only."""
+        if name not in self._labels:
+            array = self._array(name)
+            if array.per_sample or len(array.shape) > 1:
+                raise ValueError(f"{name} is no label; the labels are {', '.join(self.label_names)}")
+            shards = range(-(-len(self) // self._shard_size))
+            values = np.concatenate([self._read_group_chunk(array, shard) for shard in shards])[: len(self)]
+            if name == "sample_key":
+                self._check_sample_keys(values)
+            values.flags.writeable = False
+            self._labels[name] = values
+        return self._labels[name]
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of the labels."""
+        return tuple(array.name for array in self.arrays.values() if not array.per_sample and len(array.shape) < 2)
+
+    def categories(self, name: str) -> tuple[str, ...]:
+        """Return the names of the codes 0, 1, ... of a categorical label; none where it is no such label."""
+        return tuple(map(str, self._array(name).categories))
+
+    # --- samples ----------------------------------------------------------------------------------------------
+
+    def read(self, name: str, slots: Slots) -> Array:
+        """Return array `name` of the samples in `slots`, (len(slots), *sample shape)."""
+        array = self._array(name)
+        out = np.empty((len(slots), *array.shape), dtype=array.dtype)
+        self.read_into(name, slots, out)
+        return out
+
+    def read_into(self, name: str, slots: Slots, out: Array) -> None:
+        """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample shape)."""
+        array = self._array(name)
+        shape = (len(slots), *array.shape)
+        if out.shape != shape or out.dtype != np.dtype(array.dtype) or not out.flags.c_contiguous:
+            raise ValueError(
+                f"out must be C-ordered {array.dtype} of shape {shape} for {name}, and is {out.dtype} of {out.shape}"
+            )
+        for place, slot in enumerate(map(int, slots)):
+            self._check_slot(slot)
+            shard, position = divmod(slot, self._shard_size)
+            if array.per_sample:
+                self._read_sample(array, shard, position, slot, out[place])
+            else:
+                out[place] = self._group_chunk(array, shard)[position]
+
+    def verify(self) -> None:
+        """Check the size and the SHA-256 of every file of the manifest."""
+        for file in self.manifest.files:
+            if ".." in file.path.split("/"):
+                raise InvalidDatasetError(f"the manifest names {file.path}, which is not inside the dataset")
+            self._check_digest(file, self.source.read(file))
+
+    # --- chunks -----------------------------------------------------------------------------------------------
+
+    def _read_sample(self, array: ArrayLayout, shard: int, position: int, slot: int, out: Array) -> None:
+        file = self._file(array.shard_path(shard), f"array {array.name}, sample {slot}")
+        offset, length = map(int, self._shard_index(array, shard, file)[position])
+        if offset == MISSING and length == MISSING:
+            raise CorruptDataError(f"array {array.name}, sample {slot}: its chunk is missing in {self._at(file)}")
+        if offset + length > file.size:
+            raise CorruptDataError(
+                f"array {array.name}, sample {slot}: its chunk reaches beyond the end of {self._at(file)}"
+            )
+        chunk = self.source.read(file, offset, length)
+        _decode(chunk, out, f"array {array.name}, sample {slot}, {self._at(file)}", trajectory=array.is_trajectory)
+
+    def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
+        key = array.name, shard
+        if key not in self._indexes:
+            size = shard_index_size(self._shard_size)
+            if size > file.size:
+                raise CorruptDataError(f"array {array.name}: {self._at(file)} is too short for a shard index")
+            try:
+                index = decode_shard_index(self.source.read(file, file.size - size, size), self._shard_size)
+            except CorruptChunkError as error:
+                raise CorruptDataError(f"array {array.name}, {self._at(file)}: {error}") from error
+            self._indexes[key] = index
+        return self._indexes[key]
+
+    def _group_chunk(self, array: ArrayLayout, shard: int) -> Array:
+        key = array.name, shard
+        chunk = self._chunks.get(key)
+        if chunk is None:
+            chunk = self._chunks[key] = self._read_group_chunk(array, shard)
+            self._chunk_bytes += chunk.nbytes
+            while self._chunk_bytes > self._cache_bytes and len(self._chunks) > 1:
+                self._chunk_bytes -= self._chunks.popitem(last=False)[1].nbytes
+        else:
+            self._chunks.move_to_end(key)
+        return chunk
+
+    def _read_group_chunk(self, array: ArrayLayout, shard: int) -> Array:
+        """Return the chunk that is all of a shard group, (samples per shard, *sample shape)."""
+        first, end = shard * self._shard_size, min((shard + 1) * self._shard_size, len(self))
+        file = self._file(array.shard_path(shard), f"array {array.name}, samples {first} to {end - 1}")
+        out = np.empty((self._shard_size, *array.shape), dtype=array.dtype)
+        _decode(self.source.read(file), out, f"array {array.name}, samples {first} to {end - 1}, {self._at(file)}")
+        return out
+
+    def _at(self, file: FileEntry) -> str:
+        return f"{self.source}/{file.path}"
+
+    def _file(self, path: str, what: str) -> FileEntry:
+        try:
+            return self._files[path]
+        except KeyError:
+            raise MissingFileError(f"{what}: {path} is not in the manifest of {self.source}") from None
+
+    def _array(self, name: str) -> ArrayLayout:
+        try:
+            return self.arrays[name]
+        except KeyError:
+            raise ValueError(f"array must be one of {', '.join(self.arrays)}, and is {name!r}") from None
+
+    def _check_slot(self, slot: int) -> None:
+        if not 0 <= slot < len(self):
+            raise IndexError(f"slot must be from 0 to {len(self) - 1}, and is {slot}")
+        if not self.valid[slot]:
+            reasons = [item for item in self.manifest.rejections if item.slot == slot]
+            raise RejectedSampleError(f"sample {slot} was rejected: {reasons[0].reason}, {reasons[0].message}")
+
+    # --- checks at open ---------------------------------------------------------------------------------------
+
+    def _check_metadata(self) -> None:
+        """Check the Zarr metadata against the layout, and their digests against the manifest."""
+        group = self._read_metadata(GROUP_METADATA)
+        inline = consolidated(group)
+        for name, array in self.arrays.items():
+            found = self._read_metadata(f"{name}/{GROUP_METADATA}") if inline is None else inline.get(name)
+            check_array(found, array, sample_count=len(self), samples_per_shard=self._shard_size)
+
+    def _read_metadata(self, path: str) -> dict[str, Any]:
+        file = self._file(path, "metadata")
+        data = self.source.read(file)
+        self._check_digest(file, data)
+        return parse_metadata(data, self._at(file))
+
+    def _check_digest(self, file: FileEntry, data: bytes) -> None:
+        digest = sha256(data)
+        if digest != file.sha256:
+            raise CorruptDataError(f"{self._at(file)} has SHA-256 {digest}, and the manifest says {file.sha256}")
+
+    def _check_slots(self) -> None:
+        """Check that the manifest and the arrays `valid`, `split` and `sample_key` tell one story."""
+        rejected = sorted(item.slot for item in self.manifest.rejections)
+        if np.flatnonzero(~self.valid).tolist() != rejected:
+            raise InvalidDatasetError(f"array valid must be false at the manifest's rejections, which are {rejected}")
+        split = self.label("split")
+        if split.max() >= len(SPLITS):
+            raise InvalidDatasetError(f"array split must be less than {len(SPLITS)}, and there is a {split.max()}")
+        counts = Counter(SPLITS[code] for code in split[self.valid].tolist())
+        stated = {name: count for name, count in self.manifest.split_counts.items() if count}
+        if stated != dict(counts):
+            raise InvalidDatasetError(f"split_counts of the manifest are {stated}, and those of the arrays {counts}")
+
+    def _check_sample_keys(self, keys: Array) -> None:
+        listed = np.frombuffer(bytes.fromhex("".join(self.manifest.sample_keys)), dtype=np.uint8).reshape(keys.shape)
+        wrong = np.flatnonzero(self.valid & (keys != listed).any(axis=1))
+        if wrong.size:
+            raise InvalidDatasetError(f"array sample_key is not what the manifest says of samples {wrong.tolist()}")
+
+    def _check_manifested(self) -> None:
+        """Check that the manifest lists every shard that holds a valid sample, before an epoch is half over."""
+        for shard in np.unique(np.flatnonzero(self.valid) // self._shard_size).tolist():
+            for array in self.arrays.values():
+                self._file(array.shard_path(shard), f"array {array.name}, shard {shard}")
+
+
+def _parse_manifest(data: bytes) -> Manifest:
+    try:
+        manifest = Manifest.model_validate_json(data)
+    except ValidationError as error:
+        raise InvalidDatasetError(f"the manifest does not hold to the contract: {error}") from None
+    if len(manifest.sample_keys) != manifest.sample_count or manifest.spec.sample_count != manifest.sample_count:
+        raise InvalidDatasetError(
+            f"sample_count of the manifest is {manifest.sample_count}, its spec asks for {manifest.spec.sample_count} "
+            f"and it lists {len(manifest.sample_keys)} sample keys"
+        )
+    if manifest.valid_count != manifest.sample_count - len(manifest.rejections):
+        raise InvalidDatasetError(
+            f"valid_count of the manifest is {manifest.valid_count}, and {manifest.sample_count} samples less "
+            f"{len(manifest.rejections)} rejections is another number"
+        )
+    return manifest
+
+
+def _decode(chunk: bytes, out: Array, what: str, *, trajectory: bool = False) -> None:
+    """Decode a chunk into all of `out`, or raise."""
+    try:
+        if trajectory:
+            decode_trajectory(chunk, out)
+        else:
+            decode_chunk(chunk, out)
+    except (CorruptChunkError, RuntimeError, ValueError) as error:
+        raise CorruptDataError(f"{what}: {error}") from error

@@ -1,0 +1,162 @@
+"""What the torch datasets of all kinds have in common; `stickslip_training.kinds` says what the samples of a kind hold.
+
+They are map-style, and read a whole batch at a time (`__getitems__`) into one buffer, so that `collate` has nothing to
+do: give it to a DataLoader as `collate_fn`, or let `loader()` do that.
+
+A buffer that is used again costs less than a new one, which the kernel has to map and clear: clips read into reused
+buffers cost about a third (benchmarks/reader.py). With `ring=n`, n buffers are used in turn, and **a batch is valid
+until n further batches have been drawn**: use it or copy it before. In the workers of a DataLoader every batch has a
+buffer of its own whatever `ring` says, for a worker reads ahead and hands its batches over by reference.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
+from torch.utils.data import DataLoader, Dataset, get_worker_info
+
+from stickslip_training.arrays import Array
+from stickslip_training.data.reader import DatasetReader, Split
+
+
+class Item(dict[str, torch.Tensor]):
+    """Tensors by name, of one sample; `name("material")` says what the code of a categorical label means."""
+
+    def __init__(self, tensors: Mapping[str, torch.Tensor], categories: Mapping[str, tuple[str, ...]]) -> None:
+        super().__init__(tensors)
+        self.categories = categories
+        """Names of the codes 0, 1, ... of each categorical label."""
+
+    def name(self, label: str) -> str:
+        """Return the name of this sample's category."""
+        return self._names(label)[int(self[label])]
+
+    def _names(self, label: str) -> tuple[str, ...]:
+        try:
+            return self.categories[label]
+        except KeyError:
+            raise ValueError(f"label must be one of {', '.join(self.categories)}, and is {label!r}") from None
+
+
+class Batch(Item):
+    """Tensors by name, the first dimension of each is the sample; `names("material")` says what the codes mean."""
+
+    def names(self, label: str) -> list[str]:
+        """Return the name of each sample's category."""
+        names = self._names(label)
+        return [names[code] for code in self[label].tolist()]
+
+    def __missing__(self, key: Any) -> torch.Tensor:
+        if isinstance(key, int):  # torch's own collate function takes a list of items, and asks for its first
+            raise TypeError("a batch comes whole from the dataset: make the DataLoader with collate_fn=collate")
+        raise KeyError(key)
+
+
+def collate(batch: Any) -> Batch:
+    """Return `batch`: the dataset has made it whole."""
+    assert isinstance(batch, Batch)  # torch declares a list of items
+    return batch
+
+
+class SampleDataset(Dataset[Item]):
+    """Samples of one split: `arrays` are read sample by sample, `labels` are in memory."""
+
+    kind: ClassVar[str]
+    """The kind of dataset that the class reads."""
+
+    def __init__(
+        self,
+        source: str | os.PathLike[str] | DatasetReader,
+        split: Split | None,
+        *,
+        arrays: Sequence[str],
+        labels: Sequence[str],
+        ring: int,
+    ) -> None:
+        if ring < 0:
+            raise ValueError(f"ring must be a number of buffers, 0 for a new one each time, and is {ring}")
+        self.reader = source if isinstance(source, DatasetReader) else DatasetReader(source)
+        if self.reader.kind != self.kind:
+            raise ValueError(
+                f"kind of the dataset must be {self.kind} for a {type(self).__name__}: it is {self.reader.kind}"
+            )
+        for name in arrays:
+            if name not in self.reader.arrays:
+                raise ValueError(f"the dataset has no array {name}; it has {', '.join(self.reader.arrays)}")
+        self.split = split
+        self.slots = self.reader.slots(split)
+        """Slot in the dataset of each item, int64 (items,)."""
+        self._arrays = tuple(arrays)
+        self._labels = {name: _for_torch(self.reader.label(name)[self.slots]) for name in labels}
+        self.categories = {name: self.reader.categories(name) for name in labels if self.reader.categories(name)}
+        """Names of the codes 0, 1, ... of each categorical label."""
+        self._ring_length = ring
+        self._ring: list[dict[str, torch.Tensor]] = []
+        self._drawn = 0
+
+    def __len__(self) -> int:
+        """Return the number of valid samples of the split."""
+        return len(self.slots)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_ring": [], "_drawn": 0}  # buffers belong to one process
+
+    def __getitem__(self, index: int) -> Item:
+        """Return one sample: tensors without a sample dimension, in memory of its own."""
+        slot = self.slots[[index]]
+        item = {name: torch.from_numpy(self.reader.read(name, slot)[0]) for name in self._arrays}
+        item |= {name: torch.from_numpy(values[index : index + 1].copy())[0] for name, values in self._labels.items()}
+        item |= {"slot": torch.tensor(int(slot[0])), "sample_key": self._sample_keys(slot)[0]}
+        return Item(item, self.categories)
+
+    def __getitems__(self, indices: Sequence[int]) -> Batch:
+        """Return a batch of samples, read into one buffer for each array; see the module on `ring`."""
+        chosen = np.asarray(indices, dtype=np.int64)
+        slots = self.slots[chosen]
+        batch = Batch(self._buffers(len(slots)), self.categories)
+        for name in self._arrays:
+            self.reader.read_into(name, slots, batch[name].numpy())
+        for name, values in self._labels.items():
+            batch[name] = torch.from_numpy(values[chosen])
+        batch["slot"] = torch.from_numpy(slots)
+        batch["sample_key"] = self._sample_keys(slots)
+        return batch
+
+    def loader(self, batch_size: int, *, shuffle: bool = False, **options: Any) -> "DataLoader[Item]":
+        """Return a DataLoader over this dataset; `options` are those of DataLoader, but for `collate_fn`."""
+        return DataLoader(self, batch_size=batch_size, shuffle=shuffle, collate_fn=collate, **options)
+
+    def close(self) -> None:
+        """Let go of connections."""
+        self.reader.close()
+
+    def _sample_keys(self, slots: Array) -> torch.Tensor:
+        keys = b"".join(bytes.fromhex(self.reader.manifest.sample_keys[slot]) for slot in slots.tolist())
+        return torch.frombuffer(bytearray(keys), dtype=torch.uint8).reshape(len(slots), SAMPLE_KEY_BYTES)
+
+    def _buffers(self, count: int) -> dict[str, torch.Tensor]:
+        """Return a tensor (count, *sample shape) for each array, new or of the ring."""
+        if self._ring_length == 0 or get_worker_info() is not None:
+            return self._new_buffers(count)
+        place = self._drawn % self._ring_length
+        self._drawn += 1
+        if place == len(self._ring):
+            self._ring.append(self._new_buffers(count))
+        elif any(len(tensor) < count for tensor in self._ring[place].values()):
+            self._ring[place] = self._new_buffers(count)
+        return {name: tensor[:count] for name, tensor in self._ring[place].items()}
+
+    def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
+        buffers = {}
+        for name in self._arrays:
+            array = self.reader.arrays[name]
+            buffers[name] = torch.from_numpy(np.empty((count, *array.shape), dtype=array.dtype))
+        return buffers
+
+
+def _for_torch(values: Array) -> Array:
+    """Return labels in the types that models are made for: float32, and int64 for codes."""
+    return values.astype(np.float32 if values.dtype.kind == "f" else np.int64)

@@ -1,0 +1,177 @@
+"""Where a dataset's bytes come from: a directory, or an HTTP server that answers range requests.
+
+A source keeps nothing open that two processes could fight over: a directory is read with one open and one pread per
+read, and an HTTP client belongs to the process that made it. So a source can be pickled and survives a fork.
+"""
+
+import os
+import re
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.tasks import FileEntry
+
+from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
+
+API_KEY_VARIABLE = "STICKSLIP_API_KEY"
+"""Environment variable with the key that is sent to a server where none is given."""
+
+
+class Source(Protocol):
+    """The files of one dataset version."""
+
+    def read_manifest(self) -> bytes:
+        """Return the manifest's bytes."""
+        ...
+
+    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
+        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
+        ...
+
+    def close(self) -> None:
+        """Let go of connections; the source can be read again afterwards."""
+        ...
+
+
+def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -> "Source":
+    """Return the source that a path or a URL means."""
+    text = os.fspath(source)
+    if re.match(r"https?://", text):
+        return HttpSource(text, api_key=api_key if api_key is not None else os.environ.get(API_KEY_VARIABLE))
+    return DirectorySource(Path(text))
+
+
+class DirectorySource:
+    """A dataset version in a directory."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = str(root)
+
+    def __str__(self) -> str:
+        return self._root
+
+    def read_manifest(self) -> bytes:
+        """Return the manifest's bytes."""
+        path = Path(self._root, MANIFEST_NAME)
+        try:
+            return path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError):
+            raise MissingFileError(f"{path} is not there: this is no committed dataset version") from None
+
+    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
+        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
+        length = file.size - offset if length is None else length
+        path = f"{self._root}/{file.path}"
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except (FileNotFoundError, NotADirectoryError):
+            raise MissingFileError(f"{path} is not there, and the manifest says it is") from None
+        try:
+            size = os.fstat(descriptor).st_size
+            if size != file.size:
+                raise CorruptDataError(f"{path} has {size} bytes, and the manifest says {file.size}")
+            data = os.pread(descriptor, length, offset)
+            while len(data) < length:  # a signal, or more than 2 GiB
+                more = os.pread(descriptor, length - len(data), offset + len(data))
+                if not more:
+                    raise CorruptDataError(f"{path} ends before byte {offset + length}")
+                data += more
+        finally:
+            os.close(descriptor)
+        return data
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
+
+
+class HttpSource:
+    """A dataset version behind a URL.
+
+    Either a version of the service, `.../v1/datasets/<id>/versions/<n>` (with or without `/files` or `/manifest`), or
+    any URL below which the dataset's files lie, `manifest.json` among them.
+    """
+
+    TRIES = 4
+    _RETRIED_STATUSES = frozenset({429, 500, 502, 503, 504})
+
+    def __init__(self, url: str, *, api_key: str | None = None, timeout: float = 30.0) -> None:
+        url = url.rstrip("/")
+        version = re.match(r"(.*/versions/\d+)(/files|/manifest)?$", url)
+        self._files = f"{version[1]}/files" if version else url
+        self._manifests = ([f"{version[1]}/manifest"] if version else []) + [f"{self._files}/{MANIFEST_NAME}"]
+        self._api_key = api_key
+        self._timeout = timeout
+        self._client: Any = None
+        self._client_pid = 0
+
+    def __str__(self) -> str:
+        return self._files
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_client": None, "_client_pid": 0}
+
+    def read_manifest(self) -> bytes:
+        """Return the manifest's bytes."""
+        for url in self._manifests:
+            response = self._get(url, {})
+            if response.status_code == 200:
+                return bytes(response.content)
+            if response.status_code != 404:
+                raise SourceError(f"{url} answered {response.status_code}, and 200 was expected")
+        raise MissingFileError(f"{' and '.join(self._manifests)} answered 404: this is no committed dataset version")
+
+    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
+        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
+        length = file.size - offset if length is None else length
+        whole = offset == 0 and length == file.size
+        url = f"{self._files}/{file.path}"
+        response = self._get(url, {} if whole else {"Range": f"bytes={offset}-{offset + length - 1}"})
+        if response.status_code == 404:
+            raise MissingFileError(f"{url} is not there, and the manifest says it is")
+        if response.status_code == 416:
+            raise CorruptDataError(f"{url} ends before byte {offset + length}")
+        if response.status_code != (200 if whole else 206):
+            hint = ": it does not serve ranges" if response.status_code == 200 else ""
+            raise SourceError(f"{url} answered {response.status_code}, and {200 if whole else 206} was expected{hint}")
+        if not whole:
+            expected = f"bytes {offset}-{offset + length - 1}/{file.size}"
+            content_range = response.headers.get("Content-Range", "")
+            if content_range != expected:
+                raise CorruptDataError(f"{url} sent {content_range!r}, and {expected!r} was expected")
+        data = bytes(response.content)
+        if len(data) != length:
+            raise CorruptDataError(f"{url} sent {len(data)} bytes, and {length} were expected")
+        return data
+
+    def close(self) -> None:
+        """Close this process's connections."""
+        if self._client is not None and self._client_pid == os.getpid():
+            self._client.close()
+        self._client = None
+
+    def _get(self, url: str, headers: dict[str, str]) -> Any:
+        """GET with a few tries: a server that restarts or is busy is no reason to lose an epoch."""
+        import httpx  # only who reads over HTTP needs it
+
+        if self._client is None or self._client_pid != os.getpid():
+            # A fork shares the parent's sockets: the child must not use them, nor close them.
+            own = {"Accept-Encoding": "identity"}  # ranges are of the file, not of a compressed form of it
+            if self._api_key:
+                own["Authorization"] = f"Bearer {self._api_key}"
+            self._client = httpx.Client(headers=own, timeout=self._timeout, follow_redirects=True)
+            self._client_pid = os.getpid()
+        for attempt in range(self.TRIES):
+            try:
+                response = self._client.get(url, headers=headers)
+            except httpx.TransportError as error:
+                if attempt == self.TRIES - 1:
+                    raise SourceError(f"{url} does not answer: {error!r}") from error
+            except httpx.InvalidURL as error:
+                raise SourceError(f"{url} is no URL: {error}") from error
+            else:
+                if response.status_code not in self._RETRIED_STATUSES or attempt == self.TRIES - 1:
+                    return response
+            time.sleep(0.1 * 4**attempt)
+        raise AssertionError("unreachable")

@@ -1,0 +1,1 @@
+"""One way to train a network, whatever it learns."""

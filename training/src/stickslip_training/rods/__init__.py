@@ -1,0 +1,1 @@
+"""Curvature of hanging rods: networks that estimate it from a centreline, and what needs no learning."""

@@ -1,0 +1,84 @@
+import json
+import re
+
+import numpy as np
+import pytest
+from stickslip_training.cli import app
+from stickslip_training.rods.curvature import CurvatureTraining, read_test_rods
+from stickslip_training.rods.evaluation import estimate_strains
+from stickslip_training.rods.local_global import load_local_global
+from typer.testing import CliRunner
+
+runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
+
+
+def test_info_says_what_is_in_a_dataset(clips):
+    result = runner.invoke(app, ["info", str(clips.root), "--verify"])
+    assert result.exit_code == 0, result.output
+    counts = clips.manifest.split_counts
+    assert f"10 of 12 valid: {counts['train']} train, {counts['validation']} validation" in result.output
+    assert "83.3%; rejected: 2 out_of_frame" in result.output
+    assert clips.manifest.certificate in result.output
+    assert "verified" in result.output
+    assert re.search(r"video +uint8 +12 × 2 × 224 × 224 × 3 +3\.6 MB", result.output)
+
+
+def test_curvature_trains_and_writes(rods, tmp_path):
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "out"
+    options = ["--epochs", "1", "--noise", "0.01", "--threads", "1", "--batch-size", "20"]
+    result = runner.invoke(app, ["curvature", str(rods.root), "--out", str(out), *options])
+    assert result.exit_code == 0, result.output
+    for line in (
+        "network",
+        "quintic spline",
+        "cubic spline",
+        "finite differences",
+        "at 1.00% noise",
+        "Note: There are",
+    ):
+        assert line in result.output
+    assert json.loads((out / "report.json").read_text())["config"]["noise"] == 0.01
+    assert (out / "curvature.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "model.pt").is_file()
+    more = runner.invoke(
+        app, ["curvature", str(rods.root), "--out", str(out), "--resume", *options[2:], "--epochs", "2"]
+    )
+    assert more.exit_code == 0, more.output
+    assert len(json.loads((out / "report.json").read_text())["history"]) == 2
+
+
+def test_local_global_trains_and_writes(rods, tmp_path):
+    out, measured = tmp_path / "out", tmp_path / "reconstructed.npz"
+    true = np.zeros((4, 150, 3))
+    np.savez(measured, true=true, reconstructed=true + 1e-3, verdict=np.full(4, "good"))
+    options = ["--steps", "3", "--noise", "0.001", "0.01", "--judged-at", "0.02", "--reconstruction", str(measured)]
+    result = runner.invoke(app, ["local-global", str(rods.root), "--out", str(out), *options])
+    assert result.exit_code == 0, result.output
+    for line in ("step 3: loss", "network", "quintic spline", "at 2.00% noise", "Note: There are"):
+        assert line in result.output
+    report = json.loads((out / "report.json").read_text())
+    assert report["settings"]["noise"] == [0.001, 0.01]
+    assert report["methods"][0]["method"] == "network"
+    test, noisy = read_test_rods(CurvatureTraining(dataset=str(rods.root), out=out, epochs=1, noise=0.02))
+    strains = estimate_strains(load_local_global(out / "local-global.pt"), noisy)
+    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
+
+
+@pytest.mark.parametrize("command", [["info"], ["curvature", "--out", "out"], ["local-global", "--out", "out"]])
+def test_a_mistake_is_one_line_and_status_1(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = runner.invoke(app, [command[0], "nowhere", *command[1:]])
+    assert result.exit_code == 1
+    assert (
+        result.stderr == "stickslip-train: nowhere/manifest.json is not there: this is no committed dataset version\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_both_a_time_and_epochs_is_a_mistake(rods, tmp_path):
+    result = runner.invoke(
+        app, ["curvature", str(rods.root), "--out", str(tmp_path), "--epochs", "1", "--minutes", "1"]
+    )
+    assert result.exit_code == 1
+    assert "exactly one of minutes and epochs must be given" in result.stderr

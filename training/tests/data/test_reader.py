@@ -1,0 +1,293 @@
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from stickslip_training.data.errors import (
+    CorruptDataError,
+    InvalidDatasetError,
+    MissingFileError,
+    RejectedSampleError,
+)
+from stickslip_training.data.reader import DatasetReader
+
+
+@pytest.mark.parametrize("name", ["clips", "rods", "seen_rods"])
+def test_reads_bit_for_bit_what_zarr_python_wrote_and_reads(name, request):
+    made = request.getfixturevalue(name)
+    reader = DatasetReader(made.root, verify=True)
+    group = zarr.open_group(str(made.root), mode="r")
+    assert set(group.array_keys()) == set(reader.arrays)
+    slots = reader.slots()
+    shuffled = np.random.default_rng(0).permutation(slots)
+    for array in reader.arrays:
+        values = reader.read(array, shuffled)
+        assert values.dtype == made.arrays[array].dtype
+        assert values.tobytes() == made.arrays[array][shuffled].tobytes()
+        assert values.tobytes() == group[array][:][shuffled].tobytes()
+
+
+def test_rejected_samples_are_skipped_and_cannot_be_read(clips):
+    reader = DatasetReader(clips.root)
+    assert len(reader) == 12
+    assert reader.slots().tolist() == [slot for slot in range(12) if slot not in (3, 9)]
+    assert reader.slots(rejected=True).tolist() == list(range(12))
+    with pytest.raises(RejectedSampleError, match="sample 9 was rejected: out_of_frame, leaves view 2"):
+        reader.read("video", [9])
+    with pytest.raises(RejectedSampleError):
+        reader.read("mu", [3])
+
+
+def test_splits_part_the_valid_samples(rods):
+    reader = DatasetReader(rods.root)
+    parts = [reader.slots(split) for split in ("train", "validation", "test")]
+    assert sorted(np.concatenate(parts).tolist()) == reader.slots().tolist()
+    assert [len(part) for part in parts] == list(rods.manifest.split_counts.values())
+    assert all(len(part) for part in parts)
+    with pytest.raises(ValueError, match="split must be one of train, validation, test, and is 'all'"):
+        reader.slots("all")
+
+
+def test_reads_into_the_given_buffer_and_no_other(clips):
+    reader = DatasetReader(clips.root)
+    buffer = np.zeros((4, *clips.arrays["video"].shape[1:]), dtype=np.uint8)
+    reader.read_into("video", [7, 0], buffer[1:3])
+    assert np.array_equal(buffer[1:3], clips.arrays["video"][[7, 0]])
+    assert not buffer[[0, 3]].any()
+    for bad in (buffer[:3], buffer[:2].astype(np.int8), buffer[::2]):
+        with pytest.raises(ValueError, match="out must be C-ordered uint8 of shape"):
+            reader.read_into("video", [7, 0], bad)
+
+
+def test_names_and_slots_are_checked(clips):
+    reader = DatasetReader(clips.root)
+    with pytest.raises(ValueError, match="array must be one of video, material"):
+        reader.read("vdieo", [0])
+    with pytest.raises(IndexError, match="slot must be from 0 to 11, and is 12"):
+        reader.read("video", [12])
+    with pytest.raises(IndexError):
+        reader.read("video", [-1])
+    with pytest.raises(ValueError, match="video is no label; the labels are material"):
+        reader.label("video")
+
+
+def test_curves_are_the_same_with_the_smallest_cache(rods):
+    reader = DatasetReader(rods.root, cache_bytes=0)
+    slots = np.random.default_rng(0).permutation(reader.slots())
+    assert np.array_equal(reader.read("centerline", slots), rods.arrays["centerline"][slots])
+    assert len(reader._chunks) == 1
+
+
+def test_pickles(clips):
+    reader = DatasetReader(clips.root)
+    reader.read("video", [0])
+    again = pickle.loads(pickle.dumps(reader))
+    assert np.array_equal(again.read("video", [8]), clips.arrays["video"][[8]])
+
+
+def test_works_in_a_forked_child_after_use_in_the_parent(clips):
+    reader = DatasetReader(clips.root)
+    reader.read("video", [0])
+    child = os.fork()
+    if child == 0:
+        same = np.array_equal(reader.read("video", [8]), clips.arrays["video"][[8]])
+        os._exit(0 if same else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert np.array_equal(reader.read("video", [7]), clips.arrays["video"][[7]])
+
+
+# --- damage ---------------------------------------------------------------------------------------------------
+
+
+def test_no_flipped_bit_is_silent(clips, tmp_path):
+    """300 single flips, anywhere in the files of shards and labels, 6 at least in each file."""
+    made = clips.copy(tmp_path / "v1")
+    shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
+    sizes = np.array([path.stat().st_size for path in shards])
+    generator = np.random.default_rng(3)
+    even = len(shards) * 6
+    targets = np.concatenate([np.repeat(np.arange(len(shards)), 6), generator.choice(len(shards), 300 - even)])
+    silent = []
+    for target in targets:
+        path = shards[target]
+        intact = path.read_bytes()
+        bit = int(generator.integers(8 * sizes[target]))
+        damaged = bytearray(intact)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        try:
+            reader = DatasetReader(made.root)
+            for name in reader.arrays:
+                reader.read(name, reader.slots())
+                if name in reader.label_names:
+                    reader.label(name)
+        except CorruptDataError:
+            pass
+        else:
+            silent.append((path.name, bit))
+        path.write_bytes(intact)
+    assert silent == []
+
+
+def test_the_message_about_a_corrupt_chunk_names_array_sample_and_file(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    path = made.root / "video/c/0/0/0/0/0"
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(data)
+    reader = DatasetReader(made.root)
+    with pytest.raises(CorruptDataError, match=r"array video, sample 0, .*video/c/0/0/0/0/0: the crc32c of the chunk"):
+        reader.read("video", [0])
+    assert np.array_equal(reader.read("video", [1]), made.arrays["video"][[1]])
+    with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"):
+        DatasetReader(made.root, verify=True)
+
+
+@pytest.mark.parametrize("kept", [0, 3, 1000, -1])
+def test_a_truncated_shard_raises(clips, tmp_path, kept):
+    made = clips.copy(tmp_path / "v1")
+    path = made.root / "video/c/1/0/0/0/0"
+    path.write_bytes(path.read_bytes()[:kept])
+    reader = DatasetReader(made.root)
+    with pytest.raises(CorruptDataError, match=r"has \d+ bytes, and the manifest says"):
+        reader.read("video", [8])
+
+
+@pytest.mark.parametrize("kept", [0, 3, 1000, -1])
+def test_a_truncated_shard_raises_where_the_manifest_agrees_with_it(clips, tmp_path, kept):
+    made = clips.copy(tmp_path / "v1")
+    path = "video/c/1/0/0/0/0"
+    made.rewrite(path, (made.root / path).read_bytes()[:kept])
+    reader = DatasetReader(made.root)
+    with pytest.raises(CorruptDataError, match=r"array video.*(too short for a shard index|crc32c of the shard index)"):
+        reader.read("video", [8])
+
+
+def test_a_missing_shard_raises(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    (made.root / "video/c/1/0/0/0/0").unlink()
+    reader = DatasetReader(made.root)
+    reader.read("video", [0])
+    with pytest.raises(MissingFileError, match=r"video/c/1/0/0/0/0 is not there, and the manifest says it is"):
+        reader.read("video", [8])
+    (made.root / "valid/c/0").unlink()
+    with pytest.raises(MissingFileError):
+        DatasetReader(made.root)
+
+
+def test_a_shard_that_is_not_in_the_manifest_raises_although_it_is_there(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    files = made.manifest.files
+    made.edit_manifest(files=tuple(file for file in files if file.path != "video/c/1/0/0/0/0"))
+    with pytest.raises(MissingFileError, match=r"array video, shard 1: video/c/1/0/0/0/0 is not in the manifest"):
+        DatasetReader(made.root)
+
+
+def test_a_valid_sample_without_a_chunk_raises(clips, tmp_path):
+    """Another writer took the chunk to be all fill value, and left it out: zarr-python reads zeros."""
+    made = clips.copy(tmp_path / "v1")
+    group = zarr.open_group(str(made.root), mode="r+")
+    group["video"][8] = 0
+    made.rewrite("video/c/1/0/0/0/0", (made.root / "video/c/1/0/0/0/0").read_bytes())
+    with pytest.raises(CorruptDataError, match="array video, sample 8: its chunk is missing in"):
+        DatasetReader(made.root).read("video", [8])
+
+
+def test_a_chunk_of_another_size_raises(clips, tmp_path):
+    """A smaller chunk with a good checksum would leave a part of the buffer as it was."""
+    from stickslip_schemas.chunks import encode_chunk, encode_shard
+
+    made = clips.copy(tmp_path / "v1")
+    shape = made.arrays["video"].shape[1:]
+    chunks = [encode_chunk(np.ones(shape, np.uint8)[: 1 + (slot == 4)]) for slot in range(8)]
+    made.rewrite("video/c/0/0/0/0/0", encode_shard(chunks))
+    reader = DatasetReader(made.root)
+    assert reader.read("video", [4]).all()
+    with pytest.raises(CorruptDataError, match=r"sample 2, .*the chunk decodes to 150528 bytes, and 301056"):
+        reader.read("video", [2])
+
+
+def test_an_uncommitted_directory_is_no_dataset(tmp_path):
+    with pytest.raises(MissingFileError, match="this is no committed dataset version"):
+        DatasetReader(tmp_path)
+    with pytest.raises(MissingFileError):
+        DatasetReader(tmp_path / "nothing")
+
+
+# --- contradictions -------------------------------------------------------------------------------------------
+
+
+def test_the_manifest_must_be_one(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    (made.root / "manifest.json").write_text("{}")
+    with pytest.raises(InvalidDatasetError, match="the manifest does not hold to the contract"):
+        DatasetReader(made.root)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sample_count": 13}, "sample_count of the manifest is 13, its spec asks for 12"),
+        ({"valid_count": 11}, "valid_count of the manifest is 11"),
+        ({"rejections": (), "valid_count": 12}, "array valid must be false at the manifest's rejections"),
+        ({"split_counts": {"train": 1}}, "split_counts of the manifest"),
+    ],
+)
+def test_the_manifest_must_not_contradict_itself_or_the_arrays(clips, tmp_path, changes, message):
+    made = clips.copy(tmp_path / "v1")
+    made.edit_manifest(**changes)
+    with pytest.raises(InvalidDatasetError, match=message):
+        DatasetReader(made.root)
+
+
+def test_the_manifest_of_another_dataset_is_refused(clips, rods, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    (made.root / "manifest.json").write_text(rods.manifest.model_dump_json())
+    with pytest.raises(CorruptDataError, match=r"zarr.json has \d+ bytes, and the manifest says"):
+        DatasetReader(made.root)
+
+
+def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    keys = made.manifest.sample_keys
+    made.edit_manifest(sample_keys=(keys[1], keys[0], *keys[2:]))
+    with pytest.raises(InvalidDatasetError, match=r"sample_key is not what the manifest says of samples \[0, 1\]"):
+        DatasetReader(made.root).label("sample_key")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"zstd"', '"gzip"', "array video: codecs must be"),
+        ('"order": [', '"order": [3, ', "array mesh: codecs must be"),
+        ('"data_type": "int16"', '"data_type": "int32"', "array material: data_type must be"),
+        ('"fill_value": -1', '"fill_value": 0', "array material: fill_value must be -1, and is 0"),
+        ('"separator": "/"', '"separator": "."', "array video: chunk_key_encoding must be"),
+        ('"viewpoint": {', '"view": {', "array viewpoint: there must be metadata, and there are none"),
+        ('"node_type": "group"', '"node_type": "array"', "zarr.json must be of a Zarr v3 group"),
+    ],
+)
+def test_metadata_must_be_those_of_the_contract(clips, tmp_path, old, new, message):
+    made = clips.copy(tmp_path / "v1")
+    text = (made.root / "zarr.json").read_text()
+    assert old in text
+    made.rewrite("zarr.json", text.replace(old, new).encode())
+    with pytest.raises(InvalidDatasetError, match=message):
+        DatasetReader(made.root)
+
+
+def test_metadata_need_not_be_consolidated(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    made.rewrite("zarr.json", b'{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    assert np.array_equal(DatasetReader(made.root).read("video", [4]), made.arrays["video"][[4]])
+
+
+def test_a_manifest_cannot_lead_out_of_the_dataset(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    entry = made.manifest.files[0].model_copy(update={"path": "video/../../secret"})
+    made.edit_manifest(files=(*made.manifest.files, entry))
+    Path(tmp_path, "secret").write_bytes(b"")
+    with pytest.raises(InvalidDatasetError, match="which is not inside the dataset"):
+        DatasetReader(made.root, verify=True)

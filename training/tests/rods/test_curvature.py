@@ -1,0 +1,194 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.engine import fit as engine
+from stickslip_training.rods.curvature import (
+    CurvatureTraining,
+    load_model,
+    read_test_rods,
+    train_curvature,
+    train_on_rods,
+)
+from stickslip_training.rods.dataset import read_rods
+from stickslip_training.rods.evaluation import estimate_strains
+
+
+@pytest.fixture
+def config(rods, tmp_path):
+    """36 rods or so, in three steps an epoch."""
+    return CurvatureTraining(dataset=str(rods.root), out=tmp_path / "out", epochs=2, batch_size=15, threads=1)
+
+
+@pytest.fixture(scope="module")
+def trained(rods, tmp_path_factory):
+    """One run that is long enough to learn something."""
+    out = tmp_path_factory.mktemp("run")
+    config = CurvatureTraining(dataset=str(rods.root), out=out, epochs=12, batch_size=8, noise=0.001, threads=1)
+    return config, train_curvature(config)
+
+
+def weights(report_or_config):
+    return torch.load(report_or_config.out / "model.pt", weights_only=True)["net"]
+
+
+def test_the_loss_falls(trained):
+    _, report = trained
+    validation = {epoch.step: epoch.validation_loss for epoch in report.history}
+    assert len(validation) == 12
+    assert validation[report.best_step] == min(validation.values())
+    assert min(validation.values()) < 0.85 * report.history[0].validation_loss
+
+
+def test_the_report_measures_the_model_that_is_saved(trained, rods):
+    config, report = trained
+    assert [method.method for method in report.methods] == [
+        "network",
+        "quintic spline",
+        "cubic spline",
+        "finite differences",
+    ]
+    assert json.loads((config.out / "report.json").read_text())["test_loss"] == report.test_loss
+    test, noisy = read_test_rods(config)
+    assert np.array_equal(test.centerline, rods.arrays["centerline"][test.slots])
+    assert 0.0009 < (noisy - test.centerline).std() < 0.0011
+    strains = estimate_strains(load_model(config.out / "model.pt"), noisy)
+    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report.test_loss, rel=1e-5)
+    estimate, truth = (np.hypot(values[..., 1], values[..., 2]) for values in (strains, test.strains))
+    errors = np.linalg.norm(estimate - truth, axis=1) / np.linalg.norm(truth, axis=1)
+    assert report.methods[0].relative_median == pytest.approx(np.median(errors), rel=1e-5)
+    assert report.rods == dict(rods.manifest.split_counts)
+    assert report.certificate == rods.manifest.certificate
+    assert report.parameters == 9_985_154
+
+
+def test_few_test_rods_are_told(trained):
+    assert len(trained[1].notes) == 1
+    assert trained[1].notes[0].startswith(f"There are only {trained[1].rods['test']} test rods")
+
+
+def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, tmp_path):
+    first = train_curvature(config)
+    again = replace(config, out=tmp_path / "again")
+    second = train_curvature(again)
+    other = replace(config, out=tmp_path / "other", seed=1)
+    train_curvature(other)
+    assert [epoch.train_loss for epoch in first.history] == [epoch.train_loss for epoch in second.history]
+    for name, tensor in weights(config).items():
+        assert torch.equal(tensor, weights(again)[name])
+    assert not torch.equal(weights(config)["head.3.weight"], weights(other)["head.3.weight"])
+
+
+def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path, monkeypatch):
+    straight = train_curvature(config)
+    stopped = replace(config, out=tmp_path / "stopped", epochs=None, minutes=1000.0)
+    monkeypatch.setattr(engine, "_is_over", lambda settings, state: state.step == 4)
+    halfway = train_curvature(stopped)  # as if the time was up within the second epoch
+    assert halfway.steps == 4
+    monkeypatch.undo()
+    resumed = train_curvature(replace(config, out=stopped.out), resume=True)
+    assert [(epoch.step, epoch.train_loss, epoch.validation_loss) for epoch in resumed.history] == [
+        (epoch.step, epoch.train_loss, epoch.validation_loss) for epoch in straight.history
+    ]
+    for name, tensor in weights(config).items():
+        assert torch.equal(tensor, weights(stopped)[name])
+    with pytest.raises(ValueError, match=r"noise must be that of the run that is resumed, 0\.005, and is 0\.1"):
+        train_curvature(replace(stopped, noise=0.1), resume=True)
+    with pytest.raises(ValueError, match="there is nothing to resume"):
+        train_curvature(replace(config, out=tmp_path / "nothing"), resume=True)
+
+
+def test_the_model_is_the_average_of_the_weights_or_the_last_ones(config, tmp_path):
+    def net_of(file):
+        return torch.load(file, weights_only=True)["net"]["head.3.weight"]
+
+    config = replace(config, epochs=1)
+    train_curvature(config)
+    last = replace(config, out=tmp_path / "last", averaging=0.0)
+    train_curvature(last)
+    weights = [net_of(each.out / "checkpoint.pt") for each in (config, last)]
+    assert torch.equal(*weights)  # averaging changes nothing about the training itself
+    assert torch.equal(net_of(last.out / "model.pt"), weights[1])
+    assert not torch.equal(net_of(config.out / "model.pt"), weights[0])
+
+
+def test_a_time_budget_is_kept_also_within_an_epoch(config, monkeypatch):
+    clock = iter(np.arange(0.0, 1e6, 10.0))  # ten seconds pass whenever someone looks
+    monkeypatch.setattr(engine.time, "perf_counter", lambda: float(next(clock)))
+    report = train_curvature(replace(config, epochs=None, minutes=0.5))
+    assert 0 < report.steps < 36
+    assert len(report.history) >= 1
+    assert report.best_step > 0
+
+
+def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
+    axes = {"gamma": [200.0, 400.0, 800.0], "phi0": [1.0, 3.0], "phi1": 8.0}
+
+    def run(name, **splits):
+        made = make_rods(axes=axes, splits={"train": 0.0, "validation": 0.0, "test": 0.0} | splits)
+        return train_curvature(CurvatureTraining(dataset=str(made.root), out=tmp_path / name, epochs=1, threads=1))
+
+    only_train = run("train", train=1.0)
+    assert only_train.rods == {"train": 6, "validation": 0, "test": 6}
+    assert only_train.history[0].validation_loss is None
+    assert [note.split(":")[0] for note in only_train.notes] == [
+        "The validation split is empty",
+        "The test split is empty",
+        "Test rods were trained on",
+        "There are only 6 test rods",
+    ]
+    only_test = run("test", test=1.0)
+    assert only_test.rods == {"train": 6, "validation": 0, "test": 6}
+    assert only_test.notes[0] == "The train split is empty: the network was trained on the test split."
+
+
+def test_evaluation_of_a_part_is_told(config):
+    report = train_curvature(replace(config, epochs=1, evaluation_rods=3))
+    assert report.rods["test"] == 3
+    assert report.notes[0].startswith("Evaluated on 3 of ")
+
+
+def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
+    with pytest.raises(ValueError, match="kind of the dataset must be rod_hang to train on curvature"):
+        train_curvature(replace(config, dataset=str(clips.root)))
+    nothing = make_rods(rejected=tuple(range(60)))
+    with pytest.raises(ValueError, match="has no valid sample to train on"):
+        train_curvature(replace(config, dataset=str(nothing.root)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"minutes": 1.0}, "exactly one of minutes and epochs must be given"),
+        ({"epochs": None}, "exactly one of minutes and epochs must be given"),
+        ({"epochs": 0}, "epochs must be more than 0 and finite, and is 0"),
+        ({"batch_size": -1}, "batch_size must be more than 0"),
+        ({"noise": 1.0}, "noise must be a share of L"),
+        ({"decay": 1.0}, "decay must be between 0 and 1"),
+        ({"averaging": 1.0}, "averaging must be from 0"),
+        ({"seed": -1}, "seed must be from 0"),
+        ({"learning_rate": float("nan")}, "learning_rate must be more than 0 and finite, and is nan"),
+    ],
+)
+def test_a_config_is_checked_where_it_is_built(config, changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(config, **changes)
+
+
+def test_the_number_of_threads_is_put_back(config):
+    before = torch.get_num_threads()
+    train_curvature(replace(config, epochs=1))
+    assert torch.get_num_threads() == before
+
+
+def test_rods_in_memory_train_as_those_of_a_dataset(config, rods, tmp_path):
+    with DatasetReader(rods.root) as reader:
+        parts = [read_rods(reader, reader.slots(split)) for split in ("train", "validation")]
+    net = train_on_rods(replace(config, dataset="none", out=tmp_path / "memory"), *parts)
+    train_curvature(config)
+    expected = weights(config)
+    assert all(torch.equal(value, expected[name]) for name, value in net.state_dict().items())
+    assert not net.training

@@ -1,0 +1,28 @@
+"""How each kind of dataset is rendered. A kind is one module here, of the name of the kind; nothing lists them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from stickslip_schemas.kinds import KINDS, kind_named
+from stickslip_schemas.tasks import RenderTask, TaskResult
+
+from stickslip_blender.workshop import Workshop
+
+
+def renders(kind: str) -> Callable[[Any, RenderTask, Workshop], TaskResult]:
+    """Return the function that renders a kind, from its render document, the task of it and a workshop to a result.
+
+    Raises:
+        UnknownKindError: The contract does not have the kind.
+    """
+    kind_named(kind)
+    render: Callable[[Any, RenderTask, Workshop], TaskResult] = import_module(f"{__name__}.{kind}").render
+    return render
+
+
+def kind_names() -> tuple[str, ...]:
+    """Return the names of all kinds."""
+    return tuple(KINDS)

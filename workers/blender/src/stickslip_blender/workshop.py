@@ -1,0 +1,106 @@
+"""What the scenes of all kinds work with: records of the store, one renderer at a time, and where pictures go."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.cameras import Camera, rig_digest
+from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.states import Reason
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
+
+from stickslip_blender.preview import side_by_side
+
+if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
+    from stickslip_schemas.jobs import Render
+
+FRAME_MARGIN = 1.0
+"""How far inside the frame a rod or a cloth has to stay [px]."""
+
+Array = npt.NDArray[Any]
+
+
+class Renderer(Protocol):
+    """What holds a Blender scene."""
+
+    def close(self) -> None:
+        """Let go of what it holds outside Blender."""
+
+
+R = TypeVar("R", bound=Renderer)
+
+
+class Workshop:
+    """Reads records and publishes pictures.
+
+    It keeps the last record and the last renderer, for several tasks share them. Blender is one scene per process, so
+    there is one renderer at a time.
+    """
+
+    def __init__(self, store_root: str, scratch: str | None = None) -> None:
+        self._store = Store(store_root)
+        self.scratch = scratch
+        """Folder for frames on their way out of Blender; None: memory."""
+        self._renderer: tuple[object, Renderer] | None = None
+        self._records: tuple[str, dict[str, Array]] = ("", {})
+
+    def close(self) -> None:
+        """Let go of the renderer."""
+        if self._renderer is not None:
+            self._renderer[1].close()
+            self._renderer = None
+
+    def record(self, record: RecordRef, *names: str) -> list[Array]:
+        """Return one row of arrays of an artifact."""
+        digest, arrays = self._records
+        if digest != record.digest:
+            with np.load(io.BytesIO(self._store.read(record.digest)), allow_pickle=False) as file:
+                arrays = {name: file[name] for name in names}
+            self._records = record.digest, arrays
+        rows = len(arrays[names[0]])
+        if record.row >= rows:
+            raise ValueError(f"record.row must be below {rows}, the rows of {record.digest}; got {record.row}")
+        return [arrays[name][record.row] for name in names]
+
+    def renderer(self, scene: object, build: Callable[[], R]) -> R:
+        """Return the renderer of a scene: the last one, or else another in its place."""
+        if self._renderer is None or self._renderer[0] != scene:
+            self.close()
+            self._renderer = scene, build()
+        return self._renderer[1]  # type: ignore[return-value]  # `scene` names what `build` makes
+
+    def rendered(self, name: str, pictures: Array, preview: Array | None, labels: dict[str, Any]) -> TaskResult:
+        """Publish pictures (n, height, width, 3), and some of them as a preview, and return the result."""
+        chunk = encode_chunk(pictures[None])
+        output = RenderOutput(
+            chunks={name: ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
+            preview=None if preview is None else self._store.publish(side_by_side(preview)),
+            labels=labels,
+        )
+        return TaskResult(outcome="succeeded", output=output)
+
+
+def check_rig(render: Render) -> None:
+    """Refuse a render document whose cameras are not those of this installation."""
+    if render.rig_digest != rig_digest(render.rig):
+        raise ValueError(
+            f"render.rig_digest must be that of {render.rig} here, {rig_digest(render.rig)}; got {render.rig_digest}"
+        )
+
+
+def why_unfit(what: str, points: Array, radius: float, cameras: tuple[Camera, ...]) -> TaskResult | None:
+    """Reject points (..., 3) that are not finite, or that leave the frame of a camera; None where nothing is wrong."""
+    if not np.isfinite(points).all():
+        return _rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
+    overflow = {camera.name: camera.overflow(points, radius, FRAME_MARGIN) for camera in cameras}
+    outside = [f"the {what} leaves view {name} by {excess:.1f} px" for name, excess in overflow.items() if excess > 0.0]
+    return _rejected(Reason.out_of_frame, "; ".join(outside)) if outside else None
+
+
+def _rejected(reason: Reason, message: str) -> TaskResult:
+    return TaskResult(outcome="rejected", reason=reason, message=message)

@@ -1,0 +1,95 @@
+"""The coordinator as the dispatcher sees it: four questions over HTTP."""
+
+from typing import TypeVar
+
+import httpx
+from pydantic import BaseModel
+from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.worker_api import (
+    Heartbeat,
+    HeartbeatAnswer,
+    LeaseBatch,
+    LeaseRequest,
+    ReportAnswer,
+    ReportBatch,
+    WorkerRegistration,
+    WorkerSession,
+)
+
+Answer = TypeVar("Answer", bound=BaseModel)
+
+
+class CoordinatorError(Exception):
+    """The coordinator did not do what it was asked."""
+
+
+class UnreachableError(CoordinatorError):
+    """No answer, or one that says: later."""
+
+
+class UnknownWorkerError(CoordinatorError):
+    """The coordinator does not know the session (any more): register again."""
+
+
+class SupersededError(CoordinatorError):
+    """A newer dispatcher has registered under the same name: this one has to go."""
+
+
+class RefusedError(CoordinatorError):
+    """A request that will be refused every time."""
+
+
+class CoordinatorClient:
+    """A client, for any number of threads."""
+
+    def __init__(self, url: str) -> None:
+        # A proxy of the environment is for the world outside, not for a service beside this one.
+        timeout = httpx.Timeout(30, connect=5)
+        self._http = httpx.Client(base_url=url.rstrip("/"), timeout=timeout, trust_env=False)
+
+    def register(self, registration: WorkerRegistration) -> WorkerSession:
+        """Present the dispatcher."""
+        return self._post("/v1/workers", registration, WorkerSession)
+
+    def lease(self, request: LeaseRequest) -> LeaseBatch:
+        """Ask for tasks."""
+        return self._post("/v1/worker/lease", request, LeaseBatch)
+
+    def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
+        """Renew leases."""
+        return self._post("/v1/worker/heartbeat", heartbeat, HeartbeatAnswer)
+
+    def report(self, reports: ReportBatch) -> ReportAnswer:
+        """Report results."""
+        return self._post("/v1/worker/report", reports, ReportAnswer)
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def _post(self, path: str, document: BaseModel, answer: type[Answer]) -> Answer:
+        try:
+            response = self._http.post(
+                path, content=document.model_dump_json(), headers={"Content-Type": "application/json"}
+            )
+        except httpx.TransportError as error:
+            raise UnreachableError(f"{path}: {type(error).__name__}: {error}") from error
+        if response.status_code >= 500 or response.status_code == 429:
+            raise UnreachableError(f"{path}: {response.status_code} {response.text[:500]}")
+        if response.is_success:
+            return answer.model_validate_json(response.content)
+        kind = _ERRORS.get(_problem_code(response), RefusedError)
+        raise kind(f"{path}: {response.status_code} {response.text[:500]}")
+
+
+_ERRORS: dict[str | None, type[CoordinatorError]] = {
+    ProblemCode.unknown_worker: UnknownWorkerError,
+    ProblemCode.conflict: SupersededError,
+}
+
+
+def _problem_code(response: httpx.Response) -> str | None:
+    try:
+        return str(response.json()["code"])
+    except (ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,42 @@
+"""Dragged cloth: from parameters to the artifact of one trajectory."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import TaskResult
+
+from stickslip_workers.cloth import fabric_of, result_of
+from stickslip_workers.kinds import Kind
+
+if TYPE_CHECKING:
+    from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
+
+
+def _simulate(simulations: Sequence["ClothDragSimulation"], store: Store) -> list[TaskResult]:
+    """Simulate one after the other: each takes minutes, and gets an artifact of its own."""
+    return [_simulate_one(simulation, store) for simulation in simulations]
+
+
+def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult:
+    from stickslip_sim_core.scenes.cloth_drag import drop_and_drag  # here, so that packing needs no compiled core
+
+    fabric = fabric_of(simulation)
+    run = drop_and_drag(
+        fabric,
+        simulation.mu,
+        preset=simulation.preset.value,
+        vertices=simulation.mesh,
+        frames=simulation.frames,
+        seed=simulation.seed,
+    )
+    forces = {
+        "contact_force": np.asarray(run.contact_force, dtype=np.float32),
+        "holder_force": np.asarray(run.holder_force, dtype=np.float32),
+    }
+    labels = {"side": int(run.side), "bias": float(run.bias)}
+    return result_of(simulation, fabric, run, store, record=forces, labels=labels)
+
+
+KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.scenes.cloth_drag")
