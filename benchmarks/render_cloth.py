@@ -23,24 +23,27 @@ import numpy.typing as npt
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.build import build_digest
 from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
-from stickslip_blender.geometry import FLOOR, DragGeometry
+from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.geometry import FLOOR
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import grained, look_of
 from stickslip_blender.multiplexed import encode
-from stickslip_blender.raster import Textures, Window
-from stickslip_blender.stage import ClothStage
+from stickslip_blender.raster import Textures, Window, projected, see
+from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import Quality, Texture
 
 MATERIAL = "gray-interlock"
+TEXTURES = tuple(Texture)[:8]
 COMPARED = (Texture.checker, Texture.houndstooth, Texture.floral)
 CREASES = 0.5
 
 
 @dataclass(frozen=True)
-class Shot:
+class View:
     """One instant, seen by one camera."""
 
     frame: int
@@ -58,66 +61,67 @@ class Bench:
     def __init__(self, trajectory: Path, references: Path | None) -> None:
         with np.load(trajectory) as file:
             self.track = file["track"].astype(np.float64)
-            triangles, rest = file["triangles"], file["rest"]
-        look = look_of(MATERIAL)
-        self.pictures = {texture: grained(texture_image(texture), look) for texture in Texture}
+            self.renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
+        self.look = look_of(MATERIAL)
+        self.pictures = {texture: grained(texture_image(texture), self.look) for texture in TEXTURES}
         self.textures = Textures(list(self.pictures.values()))
-        self.geometry = DragGeometry(triangles, rest, hem=1e-3 * look.hem, creases=CREASES, seed=1)
-        self.stage = ClothStage(self.geometry, look)
-        self.rig = load_rig("drag-3")
-        build = hashlib.sha256((build_digest() + str(trajectory)).encode()).hexdigest()[:12]
+        self.geometry, self.stage = self.renderer.geometry, self.renderer.stage
+        self.geometry.surface.dress(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)
+        self.rig = load_rig("drag")[:3]
+        build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[:12]
         self.references = references and references / build
 
-    def set_up(self, shot: Shot) -> npt.NDArray[np.float32]:
-        """Return the floor's factor."""
+    def set_up(self, shot: View) -> tuple[Shot, npt.NDArray[np.float32]]:
+        """Return where everything is, and the floor's factor."""
         camera = self.rig[shot.view]
-        self.stage.set_up(camera, drawn_light("drawn", shot.view), shot.substrate)
-        return floor_factor(shot.substrate, camera, FLOOR)
+        self.stage.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look)
+        return self.stage.shot(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
 
-    def reference(self, shot: Shot, texture: Texture) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def reference(self, view: View, texture: Texture) -> tuple[Window, npt.NDArray[np.uint8]]:
         """Return the window and what it should look like."""
-        floor, positions = self.set_up(shot), self.track[shot.frame]
-        points = self.geometry.points(positions)
-        window = self.stage.window(points)
-        kept = self.references and self.references / f"{shot.name}-{texture}.npy"
+        shot, floor = self.set_up(view)
+        window = self.stage.window(shot)
+        kept = self.references and self.references / f"{view.name}-{texture}.npy"
         if kept is not None and kept.exists():
             return window, np.load(kept)
-        camera = self.rig[shot.view]
+        camera = self.rig[view.view]
         light = np.zeros((camera.height, camera.width, 3), dtype=np.float16)
-        _, light[window.slices] = self.stage.direct_window(positions, self.pictures[texture], REFERENCE)
-        picture = encode(self.stage.composer.on_floor(light, points, camera, floor))[window.slices]
+        light[window.slices] = self.stage.direct(shot, self.pictures[texture], REFERENCE, window)
+        picture = encode(self.stage.composer.on_floor(light, shot.points, camera, floor))[window.slices]
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             np.save(kept, picture)
         return window, picture
 
-    def composed(self, shot: Shot, sampling: ClothSampling) -> tuple[npt.NDArray[np.uint8], float, float]:
+    def composed(self, view: View, sampling: ClothSampling) -> tuple[npt.NDArray[np.uint8], float, float]:
         """Return the pictures of all textures, the seconds of Cycles and those of all the rest."""
-        floor, positions = self.set_up(shot), self.track[shot.frame]
-        start = time.process_time()
-        trace = self.stage.trace(positions, sampling, seed=7)
+        shot, floor = self.set_up(view)
+        placed = time.process_time()
+        trace = self.stage.trace(shot, sampling, seed=7)
         traced = time.process_time()
-        points = self.geometry.points(positions)
-        pictures = self.stage.composer.compose(
-            trace, points, self.rig[shot.view], shot.substrate, floor, self.textures
-        )
-        return pictures, traced - start, time.process_time() - traced
+        camera = self.rig[view.view]
+        made = self.stage.composer.compose(trace, shot.points, camera, view.substrate, floor, self.textures)
+        ended = time.process_time()
+        return made.pictures, traced - placed, ended - traced + self._per_frame(view)
 
-    def direct(self, shot: Shot, texture: Texture, sampling: Sampling) -> tuple[npt.NDArray[np.uint8], float]:
-        """Return a picture rendered directly, and its seconds."""
-        floor, positions = self.set_up(shot), self.track[shot.frame]
+    def _per_frame(self, view: View) -> float:
+        """Return the seconds that it takes to place everything: once a frame, the rest of `set_up` once a clip."""
         start = time.process_time()
-        light = self.stage.direct(positions, self.pictures[texture], sampling)
-        points = self.geometry.points(positions)
-        picture = encode(self.stage.composer.on_floor(light, points, self.rig[shot.view], floor))
-        return picture, time.process_time() - start
+        self.stage.shot(self.track[view.frame], view.frame)
+        return time.process_time() - start
 
-    def cloth(self, shot: Shot, window: Window) -> npt.NDArray[np.bool_]:
+    def direct(self, view: View, texture: Texture, sampling: Sampling) -> tuple[npt.NDArray[np.uint8], float]:
+        """Return a picture rendered directly, and its seconds."""
+        shot, floor = self.set_up(view)
+        start = time.process_time()
+        light = self.stage.direct(shot, self.pictures[texture], sampling)
+        spent = time.process_time() - start
+        return encode(self.stage.composer.on_floor(light, shot.points, self.rig[view.view], floor)), spent
+
+    def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
         """Return which pixels of a window the cloth covers by half or more."""
-        from stickslip_blender.raster import projected, see
-
-        points = self.geometry.points(self.track[shot.frame])
-        seen = see(projected(self.rig[shot.view], points), self.geometry.triangles, window)
+        points = self.geometry.points(self.track[view.frame], view.frame)
+        seen = see(projected(self.rig[view.view], points), self.geometry.triangles, window)
         share: npt.NDArray[np.bool_] = seen.share_below(self.geometry.cloth_triangles) >= 0.5
         return share
 
@@ -131,15 +135,15 @@ def squared(a: npt.NDArray[np.uint8], b: npt.NDArray[np.uint8]) -> npt.NDArray[n
     return (a.astype(np.float64) - b) ** 2
 
 
-def shots(track: npt.NDArray[np.float64], count: int, names: tuple[str, ...]) -> Iterator[Shot]:
+def shots(track: npt.NDArray[np.float64], count: int, names: tuple[str, ...]) -> Iterator[View]:
     """Yield `count` instants in each of three views, of each substrate."""
     for name in names:
         for frame in np.linspace(8, len(track) - 1, count).astype(int).tolist():
             for view in range(3):
-                yield Shot(frame, view, drawn_substrate(name, 5))
+                yield View(frame, view, drawn_substrate(name, 5))
 
 
-def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Shot]) -> None:
+def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[View]) -> None:
     """Print what a quality costs and how good it is."""
     by_texture: dict[Texture, list[npt.NDArray[np.float64]]] = {texture: [] for texture in COMPARED}
     by_view: dict[int, list[npt.NDArray[np.float64]]] = {view: [] for view in range(3)}

@@ -36,13 +36,17 @@ class ClothSampling:
 
 # Frozen: a change makes other pictures, and the build digest says so. benchmarks/render_rods.py measures them.
 SAMPLING = {
+    Quality.preview: Sampling(samples=4),
     Quality.draft: Sampling(samples=8),
     Quality.standard: Sampling(samples=32),
+    Quality.high: Sampling(samples=128),
 }
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
 CLOTH_SAMPLING = {
+    Quality.preview: ClothSampling(frame=1, window=3),
     Quality.draft: ClothSampling(frame=2, window=8),
     Quality.standard: ClothSampling(frame=2, window=16),
+    Quality.high: ClothSampling(frame=8, window=64),
 }
 REFERENCE = Sampling(samples=256, seed=1)
 """What pictures are compared with; its seed is another, so that it shares no noise with them."""

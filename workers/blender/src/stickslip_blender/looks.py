@@ -46,11 +46,13 @@ def looks() -> dict[str, Look]:
     return {material: Look(**numbers) for material, numbers in data.items()}
 
 
+PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.6, grain="plain", contrast=0.05)
+"""Of a fabric that is not in fabrics.toml: a user's own."""
+
+
 def look_of(material: str) -> Look:
-    """Return the look of a material."""
-    if material not in looks():
-        raise ValueError(f"material must be one of {', '.join(looks())}; got {material!r}")
-    return looks()[material]
+    """Return the look of a material, `PLAIN` where it is none of ours."""
+    return looks().get(material, PLAIN)
 
 
 def grained(picture: npt.NDArray[np.uint8], look: Look) -> npt.NDArray[np.uint8]:

@@ -16,11 +16,13 @@ a floor that mirrors shows of the cloth, blurred as much as its roughness does.
 from __future__ import annotations
 
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
-from stickslip_blender.geometry import FLOOR, DragGeometry, mirrored
+from stickslip_blender.geometry import FLOOR, Geometry, mirrored
 from stickslip_blender.raster import Albedo, Seen, Textures, Window, projected, see, see_albedo, window_about
 from stickslip_blender.substrates import Substrate
 
@@ -61,10 +63,22 @@ def separate(trace: npt.NDArray[np.float16]) -> tuple[Floats, Floats, Floats]:
     return at_0, to_a - a * twice, twice
 
 
+@dataclass(frozen=True)
+class Composed:
+    """One frame of all textures."""
+
+    pictures: npt.NDArray[np.uint8]
+    """8-bit sRGB, shape (textures, height, width, 3)."""
+    frame_share: float
+    """Share of the frame that is cloth."""
+    visible_share: float
+    """Share of the cloth, its area taken as it is turned to the camera, that nothing hides."""
+
+
 class Composer:
     """Makes pictures of textures from traces of one cloth."""
 
-    def __init__(self, geometry: DragGeometry) -> None:
+    def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
 
     def compose(
@@ -75,8 +89,8 @@ class Composer:
         substrate: Substrate,
         floor: Floats,
         textures: Textures,
-    ) -> npt.NDArray[np.uint8]:
-        """Compose one frame's trace (height, width, 3) with all textures: 8-bit sRGB (textures, height, width, 3).
+    ) -> Composed:
+        """Compose one frame's trace (height, width, 3) with all textures.
 
         Points: all vertices of the stage at that instant (V, 3) [m]; floor: as `floor_factor` returns it.
         """
@@ -96,7 +110,18 @@ class Composer:
         light = (D[..., None, None] + I[..., None, None] * mean) * albedo
         light += S[..., None, None]
         light *= factor[:, :, None]
-        return np.moveaxis(encode(light), 2, 0)
+        share = self._in_sight(seen, sight)
+        return Composed(np.moveaxis(encode(light), 2, 0), float(weight) / S.size, share)
+
+    def _in_sight(self, seen: Seen, sight: Albedo) -> float:
+        """Return the share of the cloth's area, as the camera would see it without anything in its way, that is seen.
+
+        A triangle's own area in the image is what its samples are compared with.
+        """
+        corners = seen.points[self._geometry.surface.triangles][..., :2]
+        a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        return float(min(sight.hits.sum() / seen.grid**2 / max(area.sum(), 1e-9), 1.0))
 
     def on_floor(
         self, light: npt.NDArray[np.float16], points: npt.NDArray[np.float64], camera: Camera, floor: Floats
@@ -110,7 +135,7 @@ class Composer:
         return marked
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
-        return window_about(projected(camera, points[: len(self._geometry.surface.uv)]), camera)
+        return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
 
     def _mirror(
         self,
@@ -123,7 +148,7 @@ class Composer:
         """Write into `albedo` what the floor shows of the cloth where it mirrors it."""
         cloth = self._geometry.cloth_triangles
         below = projected(camera, mirrored(points))
-        window = window_about(below[: len(self._geometry.surface.uv)], camera, margin=12)
+        window = window_about(below[: self._geometry.cloth_vertices], camera, margin=12)
         if window.is_empty:
             return
         seen = see(below, self._geometry.triangles, window, _MIRROR_GRID)

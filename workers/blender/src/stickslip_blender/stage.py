@@ -1,11 +1,13 @@
-"""The drop-and-drag scene in Blender: a square of cloth between two holders over a floor, under one lamp, before black.
+"""The stage of all scenes of cloth, in Blender: a cloth over a floor, under one lamp, before black.
 
-The cloth is the solver's, refined so that no facet shows. The lamp follows it along the stage [thesis, 4.2.3].
+The cloth is the solver's, refined so that no facet shows. The lamp follows it along the stage [thesis, 4.2.3]. What else
+stands there is the scene's: see `stickslip_blender.scenes`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,7 +18,7 @@ from stickslip_schemas.cameras import Camera
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.engine import ClothSampling, Sampling, new_scene, set_sampling
-from stickslip_blender.geometry import FLOOR, DragGeometry, holder_mesh, mirrored
+from stickslip_blender.geometry import FLOOR, Geometry, Prop, mirrored
 from stickslip_blender.lights import Light
 from stickslip_blender.looks import Look
 from stickslip_blender.multiplexed import ALBEDOS, Composer
@@ -25,7 +27,6 @@ from stickslip_blender.raster import projected, window_about
 from stickslip_blender.substrates import Substrate
 from stickslip_blender.view import new_view, set_view
 
-_AIM = 0.05  # [m], the height that the lamp points to, under the holders
 _LAMP_DISTANCE = 1.2  # [m]
 _LAMP_SIZE = 0.5  # [m], diameter
 _LAMP_POWER = 24.0  # [W]
@@ -37,13 +38,25 @@ _MIRRORING = 0.3  # roughness below which a floor's mirror image is in the windo
 Clip = npt.NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class Shot:
+    """Where everything is at one instant."""
+
+    points: npt.NDArray[np.float64]
+    """All vertices, shape (V, 3) [m]."""
+    poses: npt.NDArray[np.float64]
+    """Of the props, shape (props, 4, 4)."""
+    aim: npt.NDArray[np.float64]
+    """What the lamp points to, shape (3,) [m]."""
+
+
 class ClothStage:
     """A stage with one cloth, built once; only vertices, textures, camera, floor and lamp change between frames.
 
     Blender is one scene per process: a second stage in the same process would empty the first.
     """
 
-    def __init__(self, geometry: DragGeometry, look: Look, *, scratch: str | Path | None = None) -> None:
+    def __init__(self, geometry: Geometry, *, scratch: str | Path | None = None) -> None:
         self._geometry = geometry
         self.composer = Composer(geometry)
         self._scene = new_scene()
@@ -55,8 +68,8 @@ class ClothStage:
         self._lamp = _add_lamp(self._scene)
         self._floor = _Floor(self._scene)
         self._mesh = _add_cloth(self._scene, geometry)
-        self._fabric = _Fabric(self._mesh, look)
-        self._holders = [_add_holder(self._scene, name) for name in ("holder-1", "holder-2")]
+        self._fabric = _Fabric(self._mesh)
+        self._props = [_add_prop(self._scene, prop) for prop in geometry.stage.props]
         new_view(self._scene)
         self._reader = FrameReader(self._scene, scratch)
 
@@ -72,70 +85,64 @@ class ClothStage:
         """Let go of what it holds outside Blender."""
         self._reader.close()
 
-    def set_up(self, camera: Camera, light: Light, substrate: Substrate) -> None:
-        """Set the camera, the lamp and the floor of the clips to come."""
+    def set_up(self, camera: Camera, light: Light, substrate: Substrate, look: Look) -> None:
+        """Set the camera, the lamp, the floor and the fabric of the clips to come."""
         set_view(self._scene, camera)
-        self._camera, self._light, self._substrate = camera, light, substrate
+        self._camera, self._light, self.substrate = camera, light, substrate
+        self._fabric.set_look(look)
         self._lamp.data.energy = _LAMP_POWER * light.power
         self._floor.set(substrate)
 
-    def trace(
-        self, positions: npt.NDArray[np.float64], sampling: ClothSampling, seed: int
-    ) -> npt.NDArray[np.float16]:
-        """Trace one instant (V', 3) [m] for all textures: linear light at ALBEDOS, shape (height, width, 3).
+    def trace(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
+        """Trace one instant for all textures: linear light at ALBEDOS, shape (height, width, 3).
 
         Seed: of the noise; the same in all frames of a clip, so that what is left of it does not flicker.
         """
         self._fabric.set_color(ALBEDOS)
-        points = self._place(positions)
+        self._place(shot)
         set_sampling(self._scene, Sampling(sampling.frame, "fast", seed))
         light = self._reader.read_light()
-        part = self.window(points)
+        part = self.window(shot)
         set_sampling(self._scene, Sampling(sampling.window, "fast", seed))
         light[part.slices] = self._reader.read_light(part)
         return light
 
-    def window(self, points: npt.NDArray[np.float64]) -> Window:
+    def direct(
+        self, shot: Shot, picture: npt.NDArray[np.uint8], sampling: Sampling, window: Window | None = None
+    ) -> npt.NDArray[np.float16]:
+        """Render one instant, or a window of it, with a texture on the cloth, the slow way: linear light (h, w, 3)."""
+        self._fabric.set_picture(picture)
+        self._place(shot)
+        set_sampling(self._scene, sampling)
+        return self._reader.read_light(window)
+
+    def window(self, shot: Shot) -> Window:
         """Return the part of the frame that the cloth is in, and its image in a floor that mirrors it."""
-        cloth = points[: len(self._geometry.surface.uv)]
-        if self._substrate.roughness < _MIRRORING:
+        cloth = shot.points[: self._geometry.cloth_vertices]
+        if self.substrate.roughness < _MIRRORING:
             cloth = np.concatenate([cloth, mirrored(cloth)])
         return window_about(projected(self._camera, cloth), self._camera, _WINDOW_MARGIN)
 
-    def direct(
-        self, positions: npt.NDArray[np.float64], picture: npt.NDArray[np.uint8], sampling: Sampling
-    ) -> npt.NDArray[np.float16]:
-        """Render one instant (V', 3) [m] with a texture, the slow way: linear light, shape (height, width, 3)."""
-        self._fabric.set_picture(picture)
-        self._place(positions)
-        set_sampling(self._scene, sampling)
-        return self._reader.read_light()
+    def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
+        """Return where everything is at an instant of the motion, the solver's vertices at positions (V', 3) [m]."""
+        stage = self._geometry.stage
+        return Shot(
+            self._geometry.points(positions, instant), stage.poses(instant, positions), stage.aim(instant, positions)
+        )
 
-    def direct_window(
-        self, positions: npt.NDArray[np.float64], picture: npt.NDArray[np.uint8], sampling: Sampling
-    ) -> tuple[Window, npt.NDArray[np.float16]]:
-        """Render, as `direct` does, the window that the cloth is in."""
-        self._fabric.set_picture(picture)
-        part = self.window(self._place(positions))
-        set_sampling(self._scene, sampling)
-        return part, self._reader.read_light(part)
+    def _place(self, shot: Shot) -> None:
+        """Move everything to where it is."""
+        from mathutils import Matrix, Vector
 
-    def _place(self, positions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Move everything to where it is at an instant; return all vertices."""
-        from mathutils import Vector
-
-        points = self._geometry.points(positions)
-        middles = self._geometry.holders(positions)
-        for holder, middle in zip(self._holders, middles, strict=True):
-            holder.location = middle
-        cloth = points[: len(self._geometry.surface.uv)]
+        for prop, pose in zip(self._props, shot.poses, strict=True):
+            prop.matrix_world = Matrix(pose.tolist())
+        cloth = shot.points[: self._geometry.cloth_vertices]
         self._mesh.attributes["position"].data.foreach_set("vector", cloth.astype(np.float32).ravel())
         self._mesh.update()
         a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        self._lamp.location = np.array([middles[:, 0].mean(), 0.0, _AIM]) + _LAMP_DISTANCE * outward
+        self._lamp.location = shot.aim + _LAMP_DISTANCE * outward
         self._lamp.rotation_euler = Vector(outward.tolist()).to_track_quat("Z", "Y").to_euler()
-        return points
 
 
 def _set_curtains(scene: Any) -> None:
@@ -208,7 +215,7 @@ class _Floor:
         self._shader.inputs["Specular IOR Level"].default_value = substrate.specular
 
 
-def _add_cloth(scene: Any, geometry: DragGeometry) -> Any:
+def _add_cloth(scene: Any, geometry: Geometry) -> Any:
     faces, uv = geometry.surface.triangles, geometry.surface.uv
     mesh = _add_mesh(scene, "cloth", np.column_stack([uv, np.zeros(len(uv))]), faces.tolist()).data
     mesh.shade_smooth()
@@ -219,31 +226,30 @@ def _add_cloth(scene: Any, geometry: DragGeometry) -> Any:
 class _Fabric:
     """The cloth's shader, of one even colour or with a picture."""
 
-    def __init__(self, mesh: Any, look: Look) -> None:
-        material = _new_material(
-            "fabric",
-            Roughness=look.roughness,
-            Specular_IOR_Level=look.specular,
-            Sheen_Weight=look.sheen,
-            Sheen_Roughness=0.5,
-        )
+    def __init__(self, mesh: Any) -> None:
+        material = _new_material("fabric", Sheen_Roughness=0.5)
         self._tree = tree = material.node_tree
-        shader = tree.nodes["Principled BSDF"]
+        self._shader = tree.nodes["Principled BSDF"]
         self._picture = tree.nodes.new("ShaderNodeTexImage")
         self._picture.extension = "EXTEND"
         self._even = tree.nodes.new("ShaderNodeRGB")
         self._color = tree.nodes.new("NodeReroute")
-        tree.links.new(self._color.outputs[0], shader.inputs["Base Color"])
-        if look.translucency > 0.0:
-            through = tree.nodes.new("ShaderNodeBsdfTranslucent")
-            tree.links.new(self._color.outputs[0], through.inputs["Color"])
-            both = tree.nodes.new("ShaderNodeMixShader")
-            both.inputs["Fac"].default_value = look.translucency
-            tree.links.new(shader.outputs["BSDF"], both.inputs[1])
-            tree.links.new(through.outputs["BSDF"], both.inputs[2])
-            tree.links.new(both.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"])
+        through = tree.nodes.new("ShaderNodeBsdfTranslucent")
+        self._both = tree.nodes.new("ShaderNodeMixShader")
+        tree.links.new(self._color.outputs[0], self._shader.inputs["Base Color"])
+        tree.links.new(self._color.outputs[0], through.inputs["Color"])
+        tree.links.new(self._shader.outputs["BSDF"], self._both.inputs[1])
+        tree.links.new(through.outputs["BSDF"], self._both.inputs[2])
+        tree.links.new(self._both.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"])
         mesh.materials.append(material)
         self._from: Any = None
+
+    def set_look(self, look: Look) -> None:
+        """Make it one fabric."""
+        self._shader.inputs["Roughness"].default_value = look.roughness
+        self._shader.inputs["Specular IOR Level"].default_value = look.specular
+        self._shader.inputs["Sheen Weight"].default_value = look.sheen
+        self._both.inputs["Fac"].default_value = look.translucency
 
     def set_color(self, color: tuple[float, float, float]) -> None:
         """Give the cloth one linear colour."""
@@ -269,11 +275,7 @@ class _Fabric:
             self._from = node
 
 
-def _add_holder(scene: Any, name: str) -> Any:
-    """Add a clip of one centimetre and the rod it hangs on; it holds a square at a corner of the cloth."""
-    metal = import_bpy().data.materials.get("metal") or _new_material(
-        "metal", Base_Color=(0.05, 0.05, 0.052, 1.0), Roughness=0.45, Metallic=0.0
-    )
-    holder = _add_mesh(scene, name, *holder_mesh())
-    holder.data.materials.append(metal)
-    return holder
+def _add_prop(scene: Any, prop: Prop) -> Any:
+    made = _add_mesh(scene, prop.name, prop.vertices, prop.faces)
+    made.data.materials.append(_new_material(prop.name, Base_Color=(*prop.color, 1.0), Roughness=prop.roughness))
+    return made

@@ -38,10 +38,8 @@ class Surface:
     uv: Array
     """Texture coordinates in [0, 1], shape (V, 2)."""
 
-    def __init__(
-        self, triangles: npt.ArrayLike, rest: npt.ArrayLike, *, hem: float, creases: float = 0.0, seed: int = 0
-    ) -> None:
-        """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]; hem: half its thickness [m]."""
+    def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike) -> None:
+        """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]."""
         faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
         low, high = flat.min(axis=0), flat.max(axis=0)
         self._levels: list[Subdivision] = []
@@ -50,14 +48,19 @@ class Surface:
             faces, flat = self._levels[-1].triangles, self._levels[-1](flat)
         self._sheet = faces
         self._count = len(flat)
-        self._height = creases * CREASE * _creases((flat - low) / (high - low), seed) if creases > 0.0 else None
         rim = _rim(faces)
-        self._hem = hem * np.repeat(_PROFILE[:, 1], len(rim))[:, None]
+        self._profile = np.repeat(_PROFILE[:, 1], len(rim))[:, None]
         inside = np.concatenate([flat[rim] + offset * _inward(flat[rim]) for offset in _PROFILE[:, 0]])
         self._corners, self._weights = _located(inside, flat, faces)
         self.triangles = np.ascontiguousarray(np.concatenate([faces, _ring_faces(len(rim), self._count)]))
         uv = (np.concatenate([flat, inside]) - low) / (high - low)
         self.uv = np.ascontiguousarray(np.clip(uv, 0.0, 1.0))
+        self.dress(hem=0.0)
+
+    def dress(self, *, hem: float, creases: float = 0.0, seed: int = 0) -> None:
+        """Set half the thickness of the hem [m], and the strength (0 to 1) and seed of the creases."""
+        self._hem = hem * self._profile
+        self._height = creases * CREASE * _creases(self.uv[: self._count], seed) if creases > 0.0 else None
 
     def __call__(self, positions: npt.ArrayLike) -> Array:
         """Return the vertices (V, 3) that are seen of the solver's positions (V', 3) [m]."""
