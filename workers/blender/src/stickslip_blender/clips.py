@@ -147,9 +147,7 @@ class ClipRenderer:
         return np.stack(frames, axis=1), labels
 
     def _composed(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures) -> Any:
-        return self.stage.composer.compose(
-            light, shot.points, self.camera, self.stage.substrate, self.floor, textures
-        )
+        return self.stage.composer.compose(light, shot.points, self.camera, self.stage.substrate, self.floor, textures)
 
     def _direct(self, shot: Shot, pictures: Sequence[Clip]) -> Iterator[Clip]:
         for picture in pictures:

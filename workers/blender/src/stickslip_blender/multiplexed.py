@@ -15,7 +15,6 @@ a floor that mirrors shows of the cloth, blurred as much as its roughness does.
 
 from __future__ import annotations
 
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -213,5 +212,3 @@ class _Blur:
         total = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
         mean: npt.NDArray[np.float64] = total / ((2 * radius + 1) ** 2)[..., None]
         return mean
-
-
