@@ -164,7 +164,7 @@ def test_other_builds_make_another_version(coordinator: Coordinator, worker: Pre
     submit(coordinator)
     worker.work()
     other = PretendWorker(
-        coordinator, coordinator.store, name="new", builds=BUILDS.model_copy(update={"blender": "e" * 64})
+        coordinator, coordinator.store, name="new", builds=BUILDS.model_copy(update={"render": "e" * 64})
     ).register()
     job_id = submit(coordinator)
     other.work()
@@ -470,7 +470,7 @@ def test_a_stranded_job_says_so(coordinator: Coordinator, worker: PretendWorker,
 
 def test_tasks_go_only_to_their_builds(coordinator: Coordinator, worker: PretendWorker) -> None:
     submit(coordinator)
-    other = BUILDS.model_copy(update={"blender": "f" * 64})
+    other = BUILDS.model_copy(update={"render": "f" * 64})
     foreign = PretendWorker(coordinator, coordinator.store, name="foreign", builds=other).register()
     leases = foreign.lease()
     assert {lease.task.stage for lease in leases} == {"simulate"}  # the simulator is the same
@@ -554,7 +554,7 @@ def test_a_task_can_be_read_for_a_replay(coordinator: Coordinator, worker: Prete
 
 def test_versions_of_two_builds_at_once_do_not_share_a_number(coordinator: Coordinator, worker: PretendWorker) -> None:
     submit(coordinator)
-    builds = Builds(sim_core="1" * 64, blender="2" * 64, packer="3" * 64)
+    builds = Builds(**{stage: str(n) * 64 for n, stage in enumerate(Builds.model_fields)})
     other = PretendWorker(coordinator, coordinator.store, name="other", builds=builds).register()
     submit(coordinator)
     publishes = []

@@ -3,6 +3,7 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Response
+from stickslip_schemas.responses import WorkerEntry
 from stickslip_schemas.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
