@@ -91,7 +91,9 @@ Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& sl
   Buffer<double> at = impl_->stepper.x;
   impl_->load(positions, slopes, at);
   assembly.definite = false;
+  assembly.exact = true;
   impl_->newton.evaluate(at, true);
+  assembly.exact = false;
   assembly.clear_diagonal();
   Buffer<float> in(4 * numbering.free_nodes), out(4 * numbering.free_nodes);
   for (int i = 0; i < numbering.free_nodes; ++i) {
