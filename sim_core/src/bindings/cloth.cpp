@@ -38,6 +38,8 @@ void bind_cloth(nb::module_& m) {
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
+      .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
+      .def_ro("halvings", &StepReport::halvings)
       .def_ro("contacts", &StepReport::contacts)
       .def_ro("sliding", &StepReport::sliding);
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
@@ -46,14 +48,15 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density,
              const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
              const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
-             int refactor_after, int halvings_max, const std::string& kernel) {
+             int refactor_after, int flips_max, int patience, int halvings_max, const std::string& kernel) {
             new (self) ClothSolver(rest, triangles, {density, {stretching}, rigidity}, held, clamped,
-                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, halvings_max},
+                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, flips_max,
+                                    patience, halvings_max},
                                    kernel);
           },
           "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
-          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "halvings_max"_a,
-          "kernel"_a = "")
+          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "flips_max"_a,
+          "patience"_a, "halvings_max"_a, "kernel"_a = "")
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a)
       .def(
           "step",

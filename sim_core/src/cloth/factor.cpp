@@ -15,8 +15,11 @@ StaleFactor::StaleFactor(const Numbering& numbering)
       view_(storage_.view()),
       added_(6L * numbering.free_nodes, 0.0f) {}
 
-bool StaleFactor::stale(int excess_max, int krylov_max) const {
-  return !made_ || excess_ > excess_max || last_ >= krylov_max;
+bool StaleFactor::stale(const std::vector<int>& modes, const ClothSettings& settings) const {
+  if (!made_ || excess_ > settings.refactor_after || last_ >= settings.krylov_max) return true;
+  int flips = 0;
+  for (std::size_t i = 0; i < modes.size(); ++i) flips += modes[i] != modes_[i];
+  return flips > settings.flips_max;
 }
 
 // Contact as a penalty: k n n^T where a node slips, and against a turn of friction; k in all directions where it
@@ -42,6 +45,7 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
   }
   assembly.kernel.factor(view_, assembly.neighbour(x), {added_.data()});
   made_ = true;
+  modes_ = contact.mode;
   dt_ = dt;
   excess_ = fresh_ = -1;
 }

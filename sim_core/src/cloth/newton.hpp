@@ -43,7 +43,7 @@ class Newton {
  private:
   Norms look(const StepProblem& problem, const Buffer<double>& x);
   void predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const;
-  void correct(const StepProblem& problem, const Buffer<double>& x, bool changed, StepReport& report);
+  void correct(const StepProblem& problem, const Buffer<double>& x, StepReport& report);
   void subtract_corrections();
 
   Assembly& assembly_;

@@ -8,8 +8,8 @@
 namespace sim_core {
 namespace {
 
-// Iterations after which a step is halved rather than pursued, and up to which steps may grow again.
-constexpr int patience = 20, easy = 12;
+// Iterations up to which steps may grow again, of those that a step may take.
+constexpr double easy = 0.6;
 
 }  // namespace
 
@@ -21,6 +21,11 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings)
       settings_(settings),
       start_(x),
       inertial_(x) {}
+
+void Stepper::restart() {
+  started_ = false;
+  newton.contact.forget();
+}
 
 // Sets where inertia leads, and the ends of what is held, for the part from `begin` to `end` of the step.
 void Stepper::drive_nodes(double begin, double end, double part, const Drive& drive) {
@@ -58,18 +63,20 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
   StepOutcome outcome{false, 0.0};
   if (depth >= depth_hint_) {
     assembly_.definite = depth > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
-    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience, report);
+    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : settings_.patience, report);
     if (!outcome.converged && deepest) outcome = newton.solve(problem, x, true, settings_.newton_max, report);
   }
   if (!outcome.converged && !deepest) {
     if (depth >= depth_hint_) depth_hint_ = depth + 1;
     x = from;
+    ++report.halvings;
     const double middle = 0.5 * (begin + end);
     advance(begin, middle, depth + 1, dt, drive, report);
     advance(middle, end, depth + 1, dt, drive, report);
     return;
   }
   hardest_ = std::max(hardest_, report.newton - iterations);
+  newton.contact.keep(part);
   ++report.substeps;
   report.converged = report.converged && outcome.converged;
   if (!(outcome.residual <= report.residual)) report.residual = outcome.residual;  // a NaN stays
@@ -94,7 +101,7 @@ StepReport Stepper::step(double dt, const Drive& drive) {
   hardest_ = 0;
   advance(0.0, 1.0, 0, dt, drive, report);
   bodies_before_ = drive.bodies;
-  if (hardest_ <= easy && depth_hint_ > 0) --depth_hint_;
+  if (hardest_ <= easy * settings_.patience && depth_hint_ > 0) --depth_hint_;
   for (int mode : newton.contact.mode) {
     report.contacts += mode != contact_open;
     report.sliding += mode == contact_slip;

@@ -25,7 +25,7 @@ class Stepper {
   Newton newton;
 
   // Bodies are where they are in the first step from here.
-  void restart() { started_ = false; }
+  void restart();
   StepReport step(double dt, const Drive& drive);
 
  private:

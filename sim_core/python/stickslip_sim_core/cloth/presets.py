@@ -28,11 +28,17 @@ class SolverSettings:
     krylov_max: int = 40
     """Iterations of GMRES in one of those, 1 ... 40: the solver keeps a vector for each."""
 
-    krylov_tolerance: float = 0.03
+    krylov_tolerance: float = 0.005
     """Residual over right-hand side at which GMRES stops, below 1."""
 
     refactor_after: int = 15
     """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
+
+    flips_max: int = 32
+    """Contacts that may change between open, stick and slip before the factor is made anew."""
+
+    patience: int = 10
+    """Iterations of Newton's method after which a step is halved rather than pursued, 1 ... 1000."""
 
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
@@ -51,6 +57,8 @@ class SolverSettings:
             ("newton_max", 1, 1000),
             ("krylov_max", 1, 40),
             ("refactor_after", 0, 10_000),
+            ("flips_max", 0, 1_000_000),
+            ("patience", 1, 1000),
             ("halvings_max", 0, 20),
         ):
             value = getattr(self, name)

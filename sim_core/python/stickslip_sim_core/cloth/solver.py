@@ -122,6 +122,8 @@ class Cloth:
             krylov_max=preset.krylov_max,
             krylov_tolerance=preset.krylov_tolerance,
             refactor_after=preset.refactor_after,
+            flips_max=preset.flips_max,
+            patience=preset.patience,
             halvings_max=preset.halvings_max,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
         )
@@ -129,7 +131,7 @@ class Cloth:
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
-        self.newton = self.krylov = self.factorizations = 0
+        self.newton = self.krylov = self.factorizations = self.flips = self.halvings = 0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     @property
@@ -208,6 +210,8 @@ class Cloth:
         self.newton += report.newton
         self.krylov += report.krylov
         self.factorizations += report.factorizations
+        self.flips += report.flips
+        self.halvings += report.halvings
         return report
 
     def why_invalid(self, path: Floats) -> str:
