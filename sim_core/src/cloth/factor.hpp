@@ -1,6 +1,9 @@
 // A Cholesky factor that is kept while it is worth keeping: the preconditioner of every linear solve.
 #pragma once
 
+#include <memory>
+#include <vector>
+
 #include "cloth/assembly.hpp"
 #include "cloth/fronts.hpp"
 #include "cloth/settings.hpp"
@@ -16,8 +19,8 @@ class StaleFactor {
   const Factor& view() const { return view_; }
   const FactorStorage& storage() const { return storage_; }
 
-  // A factor for steps of another length is of no use.
-  void expect(double dt) { made_ = made_ && dt == dt_; }
+  // Whether it is for steps of this length.
+  bool fits(double dt) const;
   // Whether it never was made, has cost more GMRES iterations than a new one would, or is of other contacts.
   bool stale(const std::vector<int>& modes, const ClothSettings& settings) const;
   void make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt);
@@ -32,6 +35,20 @@ class StaleFactor {
   bool made_ = false;
   double dt_ = 0.0;
   int last_ = 0, fresh_ = -1, excess_ = 0;  // iterations of the last solve, of the first, and beyond that
+};
+
+// Factors for the lengths of step of late: one that is known again is not made again.
+class FactorPool {
+ public:
+  explicit FactorPool(const Numbering& numbering);
+
+  // That for steps of dt, or one to be made in place of the one that was needed least recently.
+  StaleFactor& of(double dt);
+  StaleFactor& latest() { return *factors_.front(); }
+
+ private:
+  std::vector<std::unique_ptr<StaleFactor>> factors_;  // the latest first
+  const Numbering& numbering_;
 };
 
 }  // namespace sim_core

@@ -17,7 +17,7 @@ constexpr double contact_share = 0.1;
 
 Newton::Newton(Assembly& assembly, const ClothSettings& settings)
     : contact(assembly.numbering.free_nodes),
-      factor(assembly.numbering),
+      factors(assembly.numbering),
       residual(4L * assembly.numbering.nodes, 0.0),
       assembly_(assembly),
       settings_(settings),
@@ -61,7 +61,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   const int free_nodes = assembly_.numbering.free_nodes;
   predict(problem, x, from_rest);
   assembly_.set_diagonal(problem.dt, problem.damping);
-  factor.expect(problem.dt);
+  factors.of(problem.dt);
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
   Norms norms = look(problem, x);
@@ -107,6 +107,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
 
 // Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
 void Newton::correct(const StepProblem& problem, const Buffer<double>& x, StepReport& report) {
+  StaleFactor& factor = factors.latest();
   if (factor.stale(contact.mode, settings_)) {
     const Stopwatch watch(phases.factorization);
     factor.make(assembly_, x, contact, problem.dt);

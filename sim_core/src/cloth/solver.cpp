@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "cloth/control.hpp"
 #include "cloth/kernels/choice.hpp"
 #include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
@@ -12,14 +13,16 @@ namespace sim_core {
 struct ClothSolver::Impl {
   Assembly assembly;
   Stepper stepper;
+  StepController controller;
   Newton& newton;
   const Numbering& numbering;
 
   Impl(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
        const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-       const std::string& kernel)
+       const StepControl& control, const std::string& kernel)
       : assembly(cloth_kernel_named(kernel), ClothMesh(rest, triangles), properties, held, clamped),
         stepper(assembly, settings),
+        controller(stepper, control),
         newton(stepper.newton),
         numbering(assembly.numbering) {}
 
@@ -42,20 +45,28 @@ struct ClothSolver::Impl {
 
 ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
                          const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-                         const std::string& kernel)
-    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, kernel)) {}
+                         const StepControl& control, const std::string& kernel)
+    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, control, kernel)) {}
 ClothSolver::~ClothSolver() = default;
 
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes) {
   impl_->load(positions, slopes, impl_->stepper.x);
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
   impl_->stepper.restart();
+  impl_->controller.restart();
 }
 
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
                              const std::vector<Body>& bodies, double damping) {
   return impl_->stepper.step(dt, {gravity, held, slopes, bodies, damping});
 }
+
+StepReport ClothSolver::advance(double begin, double end, const Motion& motion) {
+  return impl_->controller.advance(begin, end, motion);
+}
+
+double ClothSolver::last_dt() const { return impl_->stepper.last_dt(); }
+Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
 
 Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x); }
 Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.v); }
@@ -116,8 +127,9 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
   assembly.set_diagonal(dt, 0.0);
   newton.evaluate(at, true);
   std::fill(newton.contact.mode.begin(), newton.contact.mode.end(), static_cast<int>(contact_open));
-  newton.factor.make(assembly, at, newton.contact, dt);
-  newton.factor.forget();
+  StaleFactor& factor = newton.factors.latest();
+  factor.make(assembly, at, newton.contact, dt);
+  factor.forget();
   Buffer<float> v(4 * free_nodes), b(4 * free_nodes);
   unsigned state = 1;
   for (int i = 0; i < free_nodes; ++i) {
@@ -127,7 +139,7 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
     }
   }
   assembly.kernel.apply(assembly.neighbour(at), v.data(), b.data());
-  assembly.kernel.solve(newton.factor.view(), free_nodes, b.data(), b.data());
+  assembly.kernel.solve(factor.view(), free_nodes, b.data(), b.data());
   double wrong = 0.0, size = 0.0;
   for (std::size_t i = 0; i < v.size(); ++i) {
     wrong += (v[i] - b[i]) * (v[i] - b[i]);
@@ -138,8 +150,8 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
 
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }
 ClothPhases ClothSolver::phases() const { return impl_->newton.phases; }
-double ClothSolver::factor_flops() const { return impl_->newton.factor.storage().flops; }
-std::size_t ClothSolver::factor_floats() const { return impl_->newton.factor.storage().panels.size(); }
+double ClothSolver::factor_flops() const { return impl_->newton.factors.latest().storage().flops; }
+std::size_t ClothSolver::factor_floats() const { return impl_->newton.factors.latest().storage().panels.size(); }
 std::string ClothSolver::kernel() const { return impl_->assembly.kernel.name; }
 
 }  // namespace sim_core

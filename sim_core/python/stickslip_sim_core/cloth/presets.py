@@ -43,14 +43,25 @@ class SolverSettings:
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
 
+    step_error: float | None = 1e-4
+    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: steps of `time_step`."""
+
+    coarsest: int = 4
+    """Steps that a frame of a scene takes at least, a power of two up to 1024."""
+
+    finest: int = 128
+    """Steps that a frame takes at most, before one that does not converge is halved: a power of two."""
+
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
 
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("name: must not be empty")
-        for name, high in (("time_step", 1.0), ("tolerance", 1.0), ("krylov_tolerance", 1.0)):
+        for name, high in (("time_step", 1.0), ("tolerance", 1.0), ("krylov_tolerance", 1.0), ("step_error", 1.0)):
             value = getattr(self, name)
+            if name == "step_error" and value is None:
+                continue
             if not (np.isfinite(value) and 0.0 < value <= high):
                 raise ValueError(f"{name}: must be above 0 and at most {high:g}, got {value}")
         for name, low, high in (
@@ -64,6 +75,12 @@ class SolverSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise ValueError(f"{name}: must be an integer, {low} ... {high}, got {value}")
+        for name in ("coarsest", "finest"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or value not in [2**power for power in range(11)]:
+                raise ValueError(f"{name}: must be a power of two, 1 ... 1024, got {value}")
+        if self.coarsest > self.finest:
+            raise ValueError(f"finest: must be at least coarsest, {self.coarsest}, got {self.finest}")
         if not 0.0 <= self.unconverged_share_max <= 1.0:
             raise ValueError(f"unconverged_share_max: must be 0 ... 1, got {self.unconverged_share_max}")
 
@@ -75,9 +92,9 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
             SolverSettings("certified", 0.02),
             SolverSettings("fast", 0.04, tolerance=2e-4),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
-            SolverSettings("thesis-high", 0.0005),
-            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, unconverged_share_max=1.0),
-            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, unconverged_share_max=1.0),
+            SolverSettings("thesis-high", 0.0005, step_error=None),
+            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, step_error=None, unconverged_share_max=1.0),
+            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, step_error=None, unconverged_share_max=1.0),
         )
     }
 )

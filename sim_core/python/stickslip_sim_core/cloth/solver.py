@@ -1,7 +1,7 @@
 """Pieces of cloth that move in contact with bodies: the thin face of the C++ solver."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -72,6 +72,10 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
     return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
 
 
+Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
+"""What drives a cloth at a time [s]: gravity (V, 3), positions of held vertices (K, 3), bodies."""
+
+
 class Cloth:
     """A piece of cloth, its state, and the settings by which it is stepped.
 
@@ -125,6 +129,9 @@ class Cloth:
             flips_max=preset.flips_max,
             patience=preset.patience,
             halvings_max=preset.halvings_max,
+            step_error=preset.step_error or 1.0,
+            coarsest=preset.coarsest,
+            finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
         )
         self.time = 0.0
@@ -202,8 +209,44 @@ class Cloth:
             dt, self.gravity, ends, self.slopes, [body.as_tuple() for body in bodies], damping + self.fabric.damping
         )
         self.time += dt
-        self.steps += 1
-        self.unconverged_steps += not report.converged
+        return self._count(report)
+
+    def advance(self, end: float, motion: Motion, *, damping: float = 0.0) -> StepReport:
+        """Advance to `end` [s] by steps that share the interval and end with it: the controller's, or the preset's.
+
+        All intervals must be equally long. `motion` takes a time [s] and returns what holds at it: gravity (V, 3)
+        [m/s^2], positions of the held vertices (K, 3) [m], and the bodies.
+        """
+
+        def drive(time: float) -> tuple[Floats, Floats, Floats, list[tuple[int, float, Floats, Floats, Floats]]]:
+            gravity, held, bodies = motion(time)
+            return gravity, np.asarray(held, float).reshape(-1, 3), self.slopes, [body.as_tuple() for body in bodies]
+
+        if self.preset.step_error is None:
+            report = self._advance_evenly(end, motion, damping)
+        else:
+            report = self._count(self._solver.advance(self.time, end, drive, damping + self.fabric.damping))
+            self.gravity = motion(end)[0]
+        self.time = end
+        return report
+
+    def _advance_evenly(self, end: float, motion: Motion, damping: float) -> StepReport:
+        begin = self.time
+        steps = max(1, int(np.ceil((end - begin) / self.preset.time_step * (1.0 - 1e-9))))
+        for step in range(1, steps + 1):
+            self.gravity, held, bodies = motion(begin + (end - begin) * step / steps)
+            report = self.step((end - begin) / steps, held=held, bodies=bodies, damping=damping)
+        return report
+
+    def contact_force(self) -> Floats:
+        """Return the force of bodies on the cloth [N] in the last step: change of momentum less weight and holders."""
+        holders = self.reactions[self.held].sum(axis=0)
+        weight = (self.masses[:, None] * self.gravity).sum(axis=0)
+        return np.asarray(self._solver.momentum_rate()) - weight - holders
+
+    def _count(self, report: StepReport) -> StepReport:
+        self.steps += report.steps
+        self.unconverged_steps += report.unconverged
         residual = report.residual / self.force_scale
         if not residual <= self.worst_residual:  # a NaN stays
             self.worst_residual = residual

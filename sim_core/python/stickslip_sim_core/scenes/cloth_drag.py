@@ -10,7 +10,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, plane
+from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, Motion, plane
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -141,15 +141,21 @@ def hang(cloth: Cloth, floor: list[Body], *, seed: int) -> tuple[Floats, Tilt]:
     for _ in range(SETTLING_STEPS):
         cloth.step(0.05, held=hung[cloth.held], bodies=floor, damping=5.0)
     cloth.set_state(cloth.positions)
+    cloth.time = 0.0
     return hung[cloth.held], tilt
 
 
-def drag(cloth: Cloth, floor: list[Body], hung: Floats, tilt: Tilt, time: float, dt: float) -> None:
-    """Step the cloth to `time` after the holders have started; gravity is upright one second after the drop."""
-    upright = min(max(time - duration_of(DROP), 0.0), 1.0)
-    cloth.gravity[:, 0] = tilt.of_vertices * GRAVITY * (1.0 - upright)
-    x, z = holder_path(time)
-    cloth.step(dt, held=hung + np.array([x, 0.0, z]), bodies=floor)
+def motion_of(cloth: Cloth, floor: list[Body], hung: Floats, tilt: Tilt) -> Motion:
+    """Return what drives the cloth after the holders have started; gravity is upright one second after the drop."""
+
+    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+        upright = min(max(time - duration_of(DROP), 0.0), 1.0)
+        gravity = np.tile([0.0, 0.0, -GRAVITY], (len(cloth.mesh.rest), 1))
+        gravity[:, 0] = tilt.of_vertices * GRAVITY * (1.0 - upright)
+        x, z = holder_path(time)
+        return gravity, hung + np.array([x, 0.0, z]), floor
+
+    return motion
 
 
 def drop_and_drag(
@@ -190,20 +196,13 @@ def drop_and_drag(
     floor = [plane(mu)]
     cloth = Cloth(mesh, fabric_of(fabric), settings, held=held)
     hung, tilt = hang(cloth, floor, seed=seed)
-    per_frame = int(np.ceil(1.0 / (FRAME_RATE * settings.time_step)))
-    dt = 1.0 / (FRAME_RATE * per_frame)
-    masses = cloth.masses[:, None]
+    motion = motion_of(cloth, floor, hung, tilt)
     weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
     positions, contact, holders = [cloth.positions], [np.zeros(3)], [-weight]
     for frame in range(1, frames):
-        for step in range(1, per_frame + 1):
-            before = (masses * cloth.velocities).sum(axis=0) if step == per_frame else None
-            drag(cloth, floor, hung, tilt, (frame - 1) / FRAME_RATE + step * dt, dt)
-            if before is not None:
-                pushed = ((masses * cloth.velocities).sum(axis=0) - before) / dt
-                pulled = cloth.reactions[held].sum(axis=0)
-                contact.append(pushed - (masses * cloth.gravity).sum(axis=0) - pulled)
-                holders.append(pulled)
+        cloth.advance(frame / FRAME_RATE, motion)
+        contact.append(cloth.contact_force())
+        holders.append(cloth.reactions[held].sum(axis=0))
         positions.append(cloth.positions)
         if not np.isfinite(positions[-1]).all():
             break
