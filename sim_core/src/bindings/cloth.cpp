@@ -69,8 +69,8 @@ void bind_cloth(nb::module_& m) {
              int finest, const std::string& kernel) {
             new (self) ClothSolver(rest, triangles, {density, {stretching}, rigidity}, held, clamped,
                                    {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, flips_max,
-                                    patience, halvings_max}, {step_error, coarsest, finest},
-                                   kernel);
+                                    patience, halvings_max},
+                                   {step_error, coarsest, finest}, kernel);
           },
           "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
           "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "flips_max"_a,
@@ -114,6 +114,7 @@ void bind_cloth(nb::module_& m) {
           },
           "positions"_a, "slopes"_a)
       .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "slopes"_a, "v"_a)
+      .def("softest", &ClothSolver::softest, "positions"_a, "slopes"_a)
       .def("factor_error", &ClothSolver::factor_error, "positions"_a, "slopes"_a, "dt"_a)
       .def("phases",
            [](const ClothSolver& self) {

@@ -52,6 +52,8 @@ class ClothSolver {
   Energies energies(const Points3& positions, const Points3& slopes);
   // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
   Points3 stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v);
+  // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.
+  double softest(const Points3& positions, const Points3& slopes);
   // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
   double factor_error(const Points3& positions, const Points3& slopes, double dt);
 

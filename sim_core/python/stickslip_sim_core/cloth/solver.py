@@ -16,6 +16,12 @@ from stickslip_sim_core.cloth.presets import SolverSettings
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that names the level of the kernels."""
 
+MU_MAX = 10.0
+"""Largest coefficient of friction."""
+
+RESIDUAL_PATCH = 0.005**2
+"""Area whose weight residuals are measured in, whatever the mesh [m^2]."""
+
 GRAVITY = 9.81
 """[m/s^2]"""
 
@@ -31,8 +37,8 @@ class Body:
     rotation: Floats = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.mu) and self.mu >= 0.0):
-            raise ValueError(f"mu: must be finite and >= 0, got {self.mu}")
+        if not 0.0 <= self.mu <= MU_MAX:
+            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {self.mu}")
 
     def as_tuple(self) -> tuple[int, float, Floats, Floats, Floats]:
         """Return what the C++ core takes."""
@@ -86,7 +92,7 @@ class Cloth:
         held: (K,) vertices whose positions are prescribed.
         clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
             outward normal of the rest plane.
-        force_scale: Force that residuals are measured in [N]; None is the weight of a node.
+        force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the cloth.
         kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
             that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
 
@@ -110,9 +116,9 @@ class Cloth:
         edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
         self.slopes = np.zeros((len(edges), 3))
         check_mesh(mesh.rest, mesh.triangles)
-        node_weight = fabric.density * mesh.spacing**2 * GRAVITY
-        self.force_scale = node_weight if force_scale is None else force_scale
-        """Force that residuals are measured in [N]: the weight of a node, unless another is given."""
+        patch_weight = fabric.density * RESIDUAL_PATCH * GRAVITY
+        self.force_scale = patch_weight if force_scale is None else force_scale
+        """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given."""
         self._solver = ClothSolver(
             mesh.rest,
             mesh.triangles,
@@ -256,6 +262,10 @@ class Cloth:
         self.flips += report.flips
         self.halvings += report.halvings
         return report
+
+    def softest(self) -> float:
+        """Return the smallest eigenvalue of stiffness over mass here, without contact [1/s^2]; > 0 means stable."""
+        return float(self._solver.softest(self.positions, self.slopes))
 
     def why_invalid(self, path: Floats) -> str:
         """Return why a simulation with these positions (frames, V, 3) is not valid, or an empty text."""
