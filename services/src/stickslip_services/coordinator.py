@@ -21,6 +21,7 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
+from starlette.staticfiles import StaticFiles
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
@@ -28,10 +29,11 @@ from stickslip_services.api import problems
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
-from stickslip_services.api.routes import certificates, datasets, health, jobs, tasks, workers
+from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, workers
 from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
+from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 
@@ -65,14 +67,15 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         version=__version__,
         description="Physically verified synthetic datasets of slender things.",
         lifespan=lifespan,
-        docs_url="/docs",
+        docs_url=None,
         redoc_url=None,
         openapi_url="/openapi.json",
     )
     app.state.coordinator = coordinator
     app.state.metrics = metrics
-    for module in (jobs, datasets, certificates, tasks, workers, health):
+    for module in (jobs, datasets, certificates, tasks, workers, health, pages):
         app.include_router(module.router)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
