@@ -31,6 +31,39 @@ MaterialAxis = Annotated[ListAxis[MaterialName], SHORTHAND]
 TextureAxis = Annotated[ListAxis[Texture], SHORTHAND]
 
 
+class Lighting(StrEnum):
+    """Named ranges that the lamp of a clip is drawn from.
+
+    Their order gives the codes of the label `lighting`: add new ones at the end.
+    """
+
+    drawn = "drawn"
+    held_out = "held-out"
+
+
+class Substrate(StrEnum):
+    """Finishes of the floor: a matt black plate, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
+
+    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at the
+    end.
+    """
+
+    matt = "matt"
+    aluminium = "aluminium"
+    aluminium_pet = "aluminium-pet"
+    ceramic = "ceramic"
+    rough_glass = "rough-glass"
+    smooth_glass = "smooth-glass"
+    polyester_mirror = "polyester-mirror"
+    stainless_steel = "stainless-steel"
+    cloth = "cloth"
+    any = "any"
+
+
+LightingAxis = Annotated[ListAxis[Lighting], SHORTHAND]
+SubstrateAxis = Annotated[ListAxis[Substrate], SHORTHAND]
+
+
 class PresetName(StrEnum):
     """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
 
@@ -73,12 +106,25 @@ class ClothSimulation(Simulation):
 
 
 class ClothRender(Render):
-    """How a cloth is seen: all that its clip depends on besides its trajectory and the build."""
+    """How a cloth is seen: all that its clip depends on besides its trajectory and the build.
 
+    Everything but the texture decides on the trace; clips that differ only in their texture share it.
+    """
+
+    material: str
     texture: Texture
     viewpoint: str
+    lighting: Lighting = Lighting.drawn
+    substrate: Substrate = Substrate.matt
+    creases: float = 0.0
     instants: tuple[int, ...] = Field(description="which instants of the trajectory the frames of the clip show")
     light_seed: Seed
+    crease_seed: Seed
+
+    @property
+    def trace(self) -> dict[str, Any]:
+        """What the trace depends on, as JSON: all but the texture."""
+        return self.model_dump(mode="json", exclude={"texture"})
 
 
 class ClothSpec(JobSpec):
@@ -104,6 +150,9 @@ class ClothSpec(JobSpec):
         default=True, description="keep the positions of all vertices at all instants, beside the clips"
     )
     quality: Quality = Quality.standard
+    creases: float = Field(
+        default=0.0, ge=0, le=1, description="strength of the fine creases that the renderer adds; 1 is half a millimetre"
+    )
 
     @property
     def certified_preset(self) -> str:
@@ -133,6 +182,7 @@ class ClothSpec(JobSpec):
             "rig_digest": rig_digest(self.rig),
             "quality": self.quality,
             "instants": self.shown_instants,
+            "creases": self.creases,
         }
 
     def cameras(self) -> tuple[Camera, ...]:
@@ -194,16 +244,30 @@ class ClothSpec(JobSpec):
             ),
             _codes("texture", tuple(Texture)),
             _codes("viewpoint", viewpoints),
-            ArrayLayout("light_seed", "int32", (), (), "seed of the light", fill=-1),
+            _codes("lighting", tuple(Lighting)),
+            _codes("substrate", tuple(Substrate)),
+            ArrayLayout("light_seed", "int32", (), (), "seed of the lamp, the floor and the noise", fill=-1),
             ArrayLayout(
                 "light",
                 "float32",
-                (5,),
+                (3,),
                 ("light",),
-                "azimuth and elevation of the lamp [degree], its power over the nominal, albedo and roughness of the "
-                "floor",
+                "azimuth and elevation of the lamp [degree], its power over the nominal",
                 fill=NAN,
             ),
+            ArrayLayout(
+                "floor",
+                "float32",
+                (8,),
+                ("floor",),
+                "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)",
+                fill=NAN,
+            ),
+            ArrayLayout("creases", "float32", (), (), "strength of the creases that the renderer added", fill=NAN),
+            ArrayLayout("frame_share", "float32", (), (), "share of the frame that is cloth, mean of the clip", fill=NAN),
+            ArrayLayout("visible_share", "float32", (), (), "share of the cloth in sight, mean of the clip", fill=NAN),
+            ArrayLayout("gate_db", "float32", (), (), "image gate: PSNR of means of 4 x 4 pixels [dB]", fill=NAN),
+            ArrayLayout("composed", "bool", (), (), "false where the gate failed and Cycles rendered directly", fill=False),
         )
 
     def physical_arrays(self) -> tuple[ArrayLayout, ...]:

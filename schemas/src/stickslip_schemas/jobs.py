@@ -23,8 +23,10 @@ D = TypeVar("D", bound=Document)
 class Quality(StrEnum):
     """Named render settings; their numbers live with the renderer and are recorded in the dataset."""
 
+    preview = "preview"
     draft = "draft"
     standard = "standard"
+    high = "high"
 
 
 class Splits(Document):

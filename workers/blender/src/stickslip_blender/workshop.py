@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -14,10 +15,10 @@ from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
 
-from stickslip_blender.preview import side_by_side
-
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
     from stickslip_schemas.jobs import Render
+
+    from stickslip_blender.clips import Trace
 
 FRAME_MARGIN = 1.0
 """How far inside the frame a rod or a cloth has to stay [px]."""
@@ -43,7 +44,9 @@ class Workshop:
     """
 
     def __init__(self, store_root: str, scratch: str | None = None) -> None:
-        self._store = Store(store_root)
+        self.store = Store(store_root)
+        self.traces: OrderedDict[str, Trace] = OrderedDict()
+        """The last traces of cloth, by what they depend on: clips that differ in their texture share one."""
         self.scratch = scratch
         """Folder for frames on their way out of Blender; None: memory."""
         self._renderer: tuple[object, Renderer] | None = None
@@ -59,7 +62,7 @@ class Workshop:
         """Return one row of arrays of an artifact."""
         digest, arrays = self._records
         if digest != record.digest:
-            with np.load(io.BytesIO(self._store.read(record.digest)), allow_pickle=False) as file:
+            with np.load(io.BytesIO(self.store.read(record.digest)), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in names}
             self._records = record.digest, arrays
         rows = len(arrays[names[0]])
@@ -74,15 +77,19 @@ class Workshop:
             self._renderer = scene, build()
         return self._renderer[1]  # type: ignore[return-value]  # `scene` names what `build` makes
 
-    def rendered(self, name: str, pictures: Array, preview: Array | None, labels: dict[str, Any]) -> TaskResult:
-        """Publish pictures (n, height, width, 3), and some of them as a preview, and return the result."""
-        chunk = encode_chunk(pictures[None])
+    def rendered(self, name: str, pictures: Array, preview: bytes | None, labels: dict[str, Any]) -> TaskResult:
+        """Publish pictures (n, height, width, 3) of one sample, and a preview, and return the result."""
         output = RenderOutput(
-            chunks={name: ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
-            preview=None if preview is None else self._store.publish(side_by_side(preview)),
+            chunks={name: self.chunk(pictures)},
+            preview=None if preview is None else self.store.publish(preview),
             labels=labels,
         )
         return TaskResult(outcome="succeeded", output=output)
+
+    def chunk(self, pictures: Array) -> ChunkRef:
+        """Publish the pictures (n, height, width, 3) of one sample as a chunk."""
+        chunk = encode_chunk(pictures[None])
+        return ChunkRef(digest=self.store.publish(chunk), offset=0, length=len(chunk))
 
 
 def check_rig(render: Render) -> None:
