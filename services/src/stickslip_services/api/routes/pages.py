@@ -20,6 +20,7 @@ from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.responses import Dataset, DatasetVersion, JobDetail
 from stickslip_schemas.samples import grid
 from stickslip_schemas.states import JobState, TaskState
+from stickslip_schemas.store import Store
 
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import coordinator_of
@@ -233,12 +234,12 @@ def get_thumbs(
 def _open(coordinator: Coordinator, dataset: str, version: int) -> tuple[Dataset, DatasetVersion, SampleData]:
     with coordinator.database.read() as connection:
         found, committed = find_dataset(connection, dataset), find_version(connection, dataset, version)
-    return found, committed, _sample_data(coordinator, committed.manifest)
+    return found, committed, _sample_data(coordinator.store, committed.manifest)
 
 
 @lru_cache(maxsize=8)
-def _sample_data(coordinator: Coordinator, manifest: str) -> SampleData:
-    return SampleData(coordinator.store, Manifest.model_validate_json(coordinator.store.read(manifest)))
+def _sample_data(store: Store, manifest: str) -> SampleData:
+    return SampleData(store, Manifest.model_validate_json(store.read(manifest)))
 
 
 def _sliders(spec: JobSpec) -> list[dict[str, Any]]:
@@ -282,17 +283,14 @@ def _pictured(data: SampleData) -> str | None:
 
 def _histograms(data: SampleData) -> list[dict[str, Any]]:
     """Return the distributions of the labels that are not axes, over the valid samples."""
-    valid = data.label("valid").astype(bool) if "valid" in data.arrays else None
+    valid = data.label("valid").astype(bool)
     shown = []
     for name, array in data.arrays.items():
         is_axis = name in data.manifest.spec.named_axes
         if array.shape or is_axis or array.per_sample or array.dtype == "bool" or name in ("split", "valid"):
             continue
-        try:
-            values = np.asarray(data.label(name), dtype=float)
-        except (KeyError, OSError, ValueError):
-            continue
-        values = values[np.isfinite(values) & (valid if valid is not None else True)]
+        values = np.asarray(data.label(name), dtype=float)
+        values = values[np.isfinite(values) & valid]
         if array.categories or values.size < 2 or values.min() == values.max():
             continue
         counts, bounds = np.histogram(values, bins=min(20, max(5, values.size // 4)))
