@@ -305,7 +305,8 @@ class RunningServer:
 
     def worker(self, **options: Any) -> PretendWorker:
         """Return a worker that has registered."""
-        return PretendWorker(HttpApi(self.url), self.store, **options).register()
+        key = (self.data / "worker-key").read_text().strip()
+        return PretendWorker(HttpApi(self.url, key), self.store, **options).register()
 
     def stop(self) -> None:
         """Stop it."""
@@ -318,8 +319,9 @@ class RunningServer:
 class HttpApi:
     """The four verbs of the worker API over HTTP."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, key: str) -> None:
         self._url = url
+        self._key = key
 
     def register(self, document: WorkerRegistration) -> WorkerSession:
         """Register a worker."""
@@ -339,6 +341,7 @@ class HttpApi:
 
     def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
         content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
+        headers["Authorization"] = f"Bearer {self._key}"
         response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
         response.raise_for_status()
         return answer.model_validate_json(response.content)
