@@ -6,8 +6,9 @@ Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajector
     .venv-blender/bin/python benchmarks/render_cloth.py /tmp/cloth.npz [--frames 12] [--references DIR] [--substrates]
 
 References are rendered directly, not denoised, with another seed, in the window that the cloth is in; they take most of
-the time, and DIR keeps them. Decibels pool the squared error of 8-bit sRGB over the pixels that the cloth covers by half
-or more, over frames, views and three textures. CPU time is a median over frames, per frame and texture, with eight textures.
+the time, and DIR keeps them. Decibels pool the squared error of 8-bit sRGB over the pixels that the cloth covers by
+half or more, over frames, views and three textures. CPU time is a median over frames, per frame and texture, with eight
+textures.
 """
 
 import argparse
@@ -22,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.build import build_digest
-from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
 from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import grained, look_of
