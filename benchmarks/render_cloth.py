@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.build import build_digest
-from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
 from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import grained, look_of
@@ -34,7 +34,8 @@ from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Quality, Texture
+from stickslip_schemas.jobs import Quality
+from stickslip_schemas.textures import Texture
 
 MATERIAL = "gray-interlock"
 TEXTURES = tuple(Texture)[:8]

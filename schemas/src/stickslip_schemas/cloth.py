@@ -151,7 +151,10 @@ class ClothSpec(JobSpec):
     )
     quality: Quality = Quality.standard
     creases: float = Field(
-        default=0.0, ge=0, le=1, description="strength of the fine creases that the renderer adds; 1 is half a millimetre"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="strength of the fine creases that the renderer adds; 1 is half a millimetre",
     )
 
     @property
@@ -264,10 +267,14 @@ class ClothSpec(JobSpec):
                 fill=NAN,
             ),
             ArrayLayout("creases", "float32", (), (), "strength of the creases that the renderer added", fill=NAN),
-            ArrayLayout("frame_share", "float32", (), (), "share of the frame that is cloth, mean of the clip", fill=NAN),
+            ArrayLayout(
+                "frame_share", "float32", (), (), "share of the frame that is cloth, mean of the clip", fill=NAN
+            ),
             ArrayLayout("visible_share", "float32", (), (), "share of the cloth in sight, mean of the clip", fill=NAN),
             ArrayLayout("gate_db", "float32", (), (), "image gate: PSNR of means of 4 x 4 pixels [dB]", fill=NAN),
-            ArrayLayout("composed", "bool", (), (), "false where the gate failed and Cycles rendered directly", fill=False),
+            ArrayLayout(
+                "composed", "bool", (), (), "false where the gate failed and Cycles rendered directly", fill=False
+            ),
         )
 
     def physical_arrays(self) -> tuple[ArrayLayout, ...]:

@@ -147,9 +147,7 @@ class ClipRenderer:
         return np.stack(frames, axis=1), labels
 
     def _composed(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures) -> Any:
-        return self.stage.composer.compose(
-            light, shot.points, self.camera, self.stage.substrate, self.floor, textures
-        )
+        return self.stage.composer.compose(light, shot.points, self.camera, self.stage.substrate, self.floor, textures)
 
     def _direct(self, shot: Shot, pictures: Sequence[Clip]) -> Iterator[Clip]:
         for picture in pictures:
@@ -169,9 +167,7 @@ def block_decibels(one: Clip, other: Clip) -> float:
     return float(10.0 * np.log10(255.0**2 / max(float((blocks**2).mean()), 1e-3)))
 
 
-def render_clips(
-    look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set]
-) -> TaskResult:
+def render_clips(look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set]) -> TaskResult:
     """Render the clips of a task on the stage that `make` makes of a rest shape."""
     (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
     track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")

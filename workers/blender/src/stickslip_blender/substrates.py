@@ -103,7 +103,9 @@ def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDA
     share = place - texel
 
     def at(down: int, right: int) -> npt.NDArray[np.float64]:
-        found: npt.NDArray[np.float64] = marks[(texel[..., 1] + down) % GRAIN_SIZE, (texel[..., 0] + right) % GRAIN_SIZE]
+        found: npt.NDArray[np.float64] = marks[
+            (texel[..., 1] + down) % GRAIN_SIZE, (texel[..., 0] + right) % GRAIN_SIZE
+        ]
         return found
 
     low = at(0, 0) + share[..., 0] * (at(0, 1) - at(0, 0))
