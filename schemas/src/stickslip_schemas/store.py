@@ -4,6 +4,7 @@ An artifact is a file named by its SHA-256. It is written beside its place, made
 reader sees all of it or nothing, and two writers of the same bytes cannot disturb each other.
 """
 
+import hashlib
 import os
 import uuid
 from pathlib import Path
@@ -32,12 +33,31 @@ class Store:
         return self.root / "datasets" / dataset / f"v{version}"
 
     def publish(self, data: bytes) -> str:
-        """Make `data` an artifact, durably, and return its digest; a second time costs no write."""
+        """Make `data` an artifact, durably, and return its digest.
+
+        An artifact that is there already is read and compared, and written anew where its bytes have changed.
+        """
         digest = sha256(data)
-        path = self.path(digest)
-        if not path.exists():
-            write_durably(path, data)
+        if not self.holds(digest, size=len(data)):
+            write_durably(self.path(digest), data)
         return digest
+
+    def has(self, digest: str, *, size: int) -> bool:
+        """Tell whether an artifact is there with at least `size` bytes, without reading it."""
+        try:
+            return self.path(digest).stat().st_size >= size
+        except OSError:
+            return False
+
+    def holds(self, digest: str, *, size: int | None = None) -> bool:
+        """Tell whether an artifact is there, of `size` bytes where that is known, with the digest that names it."""
+        try:
+            with self.path(digest).open("rb") as file:
+                if size is not None and os.fstat(file.fileno()).st_size != size:
+                    return False
+                return hashlib.file_digest(file, "sha256").hexdigest() == digest
+        except OSError:
+            return False
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
         """Return an artifact's bytes; a whole artifact is checked against its digest."""

@@ -154,6 +154,7 @@ class PublishOutput(Document):
 
     stage: Literal["publish"] = "publish"
     manifest: Sha256
+    group: Sha256 = Field(description="of the root's zarr.json, which names the manifest")
     bytes: int = Field(ge=0, description="size of all files of the version")
 
 
@@ -168,6 +169,9 @@ class TaskResult(Document):
     reason: Reason | None = None
     message: str = ""
     output: Output | None = None
+    damaged_inputs: tuple[Sha256, ...] = Field(
+        default=(), description="artifacts that the task needed and that are damaged or not in the store"
+    )
     cpu_seconds: float = Field(default=0.0, ge=0)
     wall_seconds: float = Field(default=0.0, ge=0)
 
@@ -177,6 +181,8 @@ class TaskResult(Document):
             raise ValueError("output is there exactly when the outcome is succeeded")
         if (self.outcome == "succeeded") != (self.reason is None):
             raise ValueError("reason is there exactly when the outcome is not succeeded")
+        if self.outcome != "failed" and self.damaged_inputs:
+            raise ValueError("damaged_inputs are those of a task that has failed")
         if self.outcome == "rejected" and self.reason is not None and not self.reason.is_deterministic:
             raise ValueError(f"a sample is rejected for a reason of its own, and {self.reason} is not one")
         return self
@@ -184,3 +190,15 @@ class TaskResult(Document):
 
 task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = TypeAdapter(Task)
 """Validates and dumps a task of any stage."""
+
+
+def input_digests(task: SimulateTask | RenderTask | PackTask | PublishTask) -> tuple[Sha256, ...]:
+    """Return the artifacts that a task reads."""
+    if isinstance(task, RenderTask):
+        return (task.record.digest,)
+    if isinstance(task, PublishTask):
+        return tuple(dict.fromkeys(file.sha256 for file in task.files))
+    if isinstance(task, SimulateTask):
+        return ()
+    records = [slot.record.digest for slot in task.slots if slot.record is not None]
+    return tuple(dict.fromkeys([*records, *(chunk.digest for slot in task.slots for chunk in slot.chunks.values())]))

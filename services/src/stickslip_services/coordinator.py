@@ -13,8 +13,8 @@ import json
 import logging
 import socket
 import sys
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import uvicorn
@@ -49,11 +49,15 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(coordinator.start)
-        sweeper = asyncio.create_task(_sweep_for_ever(coordinator))
+        every = settings.sweep_seconds
+        keepers = [
+            asyncio.create_task(_for_ever(coordinator.sweep, every)),
+            asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+        ]
         yield
-        sweeper.cancel()
-        with suppress(asyncio.CancelledError):
-            await sweeper
+        for keeper in keepers:
+            keeper.cancel()
+        await asyncio.gather(*keepers, return_exceptions=True)
         coordinator.close()
 
     app = FastAPI(
@@ -77,13 +81,14 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     return app
 
 
-async def _sweep_for_ever(coordinator: Coordinator) -> None:
+async def _for_ever(work: Callable[[], None], seconds: float) -> None:
+    """Do some work again and again, in a thread, with pauses between."""
     while True:
-        await asyncio.sleep(coordinator.settings.sweep_seconds)
+        await asyncio.sleep(seconds)
         try:
-            await run_in_threadpool(coordinator.sweep)
-        except Exception:  # a full disk, say: the next sweep may find it otherwise
-            logger.exception("the sweep failed")
+            await run_in_threadpool(work)
+        except Exception:  # a full disk, say: the next time it may be otherwise
+            logger.exception("%s failed", work.__name__)
 
 
 def openapi_text() -> str:

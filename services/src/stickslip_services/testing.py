@@ -15,9 +15,11 @@ import httpx
 import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.chunks import encode_chunk
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
@@ -31,6 +33,7 @@ from stickslip_schemas.tasks import (
     RenderOutput,
     SimulateOutput,
     TaskResult,
+    input_digests,
 )
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -178,6 +181,9 @@ class PretendWorker:
         judged = self.judge(task)
         if judged is not None:
             return judged
+        damaged = tuple(digest for digest in input_digests(task) if not self.store.holds(digest))
+        if damaged:
+            return failure(Reason.storage_error, "inputs are damaged").model_copy(update={"damaged_inputs": damaged})
         output: Any
         if task.stage == "simulate":
             digest = self.store.publish(task.model_dump_json().encode())
@@ -186,18 +192,24 @@ class PretendWorker:
             data = task.model_dump_json().encode()
             digest = self.store.publish(data)
             preview = self.store.publish(b"\x89PNG" + data) if task.preview else None
-            chunk = ChunkRef(digest=digest, offset=0, length=len(data))
-            output = RenderOutput(chunks={"views": chunk}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
+            where = ChunkRef(digest=digest, offset=0, length=len(data))
+            output = RenderOutput(chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
         elif task.stage == "pack":
             data = b"".join(slot.sample_key.encode() for slot in task.slots) * 50
             entry = FileEntry(path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data))
-            output = PackOutput(files=(entry,))
+            keys = bytes.fromhex("".join(slot.sample_key for slot in task.slots))
+            chunk = encode_chunk(keys.ljust(task.spec.samples_per_shard * SAMPLE_KEY_BYTES, b"\0"))
+            path = f"sample_key/c/{task.shard}/0"
+            named = FileEntry(path=path, sha256=self.store.publish(chunk), size=len(chunk))
+            output = PackOutput(files=(entry, named))
         else:
             output = self._publish(task)
         return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0)
 
     def _publish(self, task: PublishTask) -> PublishOutput:
-        files = (*task.files, *self._zarr(len(task.sample_keys)))
+        zarr = {file.path: file for file in self._zarr(len(task.sample_keys))}
+        group = self.store.read(zarr.pop(GROUP_NAME).sha256)
+        files = (*task.files, *zarr.values())
         manifest = Manifest(
             dataset=task.dataset,
             version=task.version,
@@ -213,8 +225,15 @@ class PretendWorker:
             sample_keys=task.sample_keys,
             files=tuple(sorted(files, key=lambda file: file.path)),
         )
-        digest = self.store.publish(manifest.model_dump_json().encode())
-        return PublishOutput(manifest=digest, bytes=manifest.size)
+        content = manifest.model_dump_json().encode()
+        digest = self.store.publish(content)
+        group_digest = self.store.publish(with_manifest_digest(group, digest))
+        seal = self.store.publish(seal_text(digest, group_digest))
+        directory = self.store.dataset_path(task.dataset, task.version)
+        own = {MANIFEST_NAME: digest, GROUP_NAME: group_digest, SEAL_NAME: seal}
+        for path, artifact in (own | {file.path: file.sha256 for file in manifest.files}).items():
+            self.store.link(artifact, directory / path)
+        return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size)
 
     def _zarr(self, count: int) -> list[FileEntry]:
         """Return the files of a small Zarr group."""

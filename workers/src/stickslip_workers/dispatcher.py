@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Reason, Stage
+from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
@@ -30,7 +31,7 @@ from stickslip_workers.kinds import kind, kind_names
 from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import Settings
-from stickslip_workers.stages.run import AnyTask
+from stickslip_workers.stages.run import AnyTask, damaged_inputs
 
 log = logging.getLogger(__name__)
 
@@ -101,6 +102,7 @@ class Dispatcher:
                 **common,
             )
         )
+        self._store = Store(settings.store)
         self._coordinator = CoordinatorClient(settings.url)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
@@ -204,7 +206,10 @@ class Dispatcher:
                 log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
                 pool.bury(assignment.process)
             result = process_failure(error, renders=assignment.stage is Stage.render)
-            results = [result] * len(assignment.leases)
+            results = [
+                result.model_copy(update={"damaged_inputs": damaged_inputs(lease.task, self._store)})
+                for lease in assignment.leases
+            ]
         else:
             pool.give_back(assignment.process, resident)
             results = _read_results(answer, len(assignment.leases))

@@ -167,14 +167,19 @@ def block_decibels(one: Clip, other: Clip) -> float:
     return float(10.0 * np.log10(255.0**2 / max(float((blocks**2).mean()), 1e-3)))
 
 
-def render_clips(look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set]) -> TaskResult:
-    """Render the clips of a task on the stage that `make` makes of a rest shape."""
+def render_clips(
+    look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set], *, set_key: object = None
+) -> TaskResult:
+    """Render the clips of a task on the stage that `make` makes of a rest shape.
+
+    `set_key` says what else the stage depends on.
+    """
     (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
     track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")
     if rejected := why_unfit("cloth", track, 0.0, (camera,)):
         return rejected
     renderer = workshop.renderer(
-        (look.kind, triangles.tobytes(), rest.tobytes()),
+        (look.kind, set_key, triangles.tobytes(), rest.tobytes()),
         lambda: ClothRenderer(triangles, rest, make, workshop.scratch),
     )
     clip = renderer.clip(look, camera, track[list(look.instants)])

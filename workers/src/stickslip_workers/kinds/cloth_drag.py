@@ -39,4 +39,4 @@ def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult
     return result_of(simulation, fabric, run, store, record=forces, labels=labels)
 
 
-KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.scenes.cloth_drag")
+KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth")
