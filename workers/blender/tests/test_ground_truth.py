@@ -32,10 +32,10 @@ def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any]) ->
     assert np.isfinite(truth.uv[cloth]).all()
     assert np.isnan(truth.uv[~cloth]).all()
     vertices = now[: geometry.cloth_vertices]
-    nearest = np.linalg.norm(place[cloth][:, None] - vertices[None], axis=2)
-    assert nearest.min(axis=1).max() < 0.005
-    near = nearest.argmin(axis=1)
-    assert np.abs(truth.uv[cloth] - geometry.uv[near]).max() < 0.05
+    for point, uv in zip(place[cloth][::40], truth.uv[cloth][::40], strict=True):
+        distance = np.linalg.norm(vertices - point, axis=1)
+        assert distance.min() < 0.005
+        assert np.abs(uv - geometry.uv[distance.argmin()]).max() < 0.05
     # The sheet is dragged along x without changing its shape.
     shift = then[0] - now[0]
     moved, _ = camera.project(place[cloth] + shift)

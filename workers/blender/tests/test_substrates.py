@@ -55,4 +55,4 @@ def test_fabrics_differ_in_their_grain() -> None:
     assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
     assert prints["11oz-black-denim"].std() > 4 * prints["camel-ponte-roma"][20:-20, 20:-20].std()
     for picture in prints.values():
-        assert 180 < picture.mean() < 220
+        assert 170 < picture.mean() < 230

@@ -40,7 +40,7 @@ def test_creases_are_seeded_and_not_stronger_than_their_label(sheet: Any) -> Non
     for strength, seed in ((1.0, 1), (0.5, 1), (1.0, 2)):
         surface.dress(hem=0.0, creases=strength, seed=seed)
         heights.append((surface(_flat(sheet, 0.1)) - plain)[: surface._count, 2])
-    assert 0.5 * CREASE < np.abs(heights[0]).max() <= CREASE
+    assert 0.5 * CREASE < np.abs(heights[0]).max() <= CREASE * (1.0 + 1e-9)
     np.testing.assert_allclose(heights[1], 0.5 * heights[0], atol=1e-12)
     assert np.abs(heights[0] - heights[2]).max() > 0.3 * CREASE
     on_floor = surface(_flat(sheet, 0.0))[: surface._count]
