@@ -35,7 +35,8 @@ from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Quality, Texture
+from stickslip_schemas.jobs import Quality
+from stickslip_schemas.textures import Texture
 
 MATERIAL = "gray-interlock"
 TEXTURES = tuple(Texture)[:8]

@@ -263,7 +263,7 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
         assert dataset["positions"].dims == ("sample", "instant", "vertex", "xyz")
     assert group["video"].attrs["instants"] == [0, 150]
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
-    assert manifest.cameras == load_rig("drag-3")
+    assert manifest.cameras == load_rig("drag")
     assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
 
 

@@ -170,7 +170,10 @@ def block_decibels(one: Clip, other: Clip) -> float:
 def render_clips(
     look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set], *, set_key: object = None
 ) -> TaskResult:
-    """Render the clips of a task on the stage that `make` makes of a rest shape; `set_key` says what else it depends on."""
+    """Render the clips of a task on the stage that `make` makes of a rest shape.
+
+    `set_key` says what else the stage depends on.
+    """
     (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
     track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")
     if rejected := why_unfit("cloth", track, 0.0, (camera,)):
