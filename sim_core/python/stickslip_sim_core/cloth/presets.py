@@ -95,8 +95,12 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
             SolverSettings("fine", 0.01, tolerance=5e-5, step_error=5e-5, coarsest=8, finest=256),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
             SolverSettings("thesis-high", 0.0005, step_error=None),
-            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, step_error=None, unconverged_share_max=1.0),
-            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, step_error=None, unconverged_share_max=1.0),
+            SolverSettings(
+                "thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, step_error=None, unconverged_share_max=1.0
+            ),
+            SolverSettings(
+                "thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, step_error=None, unconverged_share_max=1.0
+            ),
         )
     }
 )

@@ -15,7 +15,6 @@ a floor that mirrors shows of the cloth, blurred as much as its roughness does.
 
 from __future__ import annotations
 
-
 from dataclasses import dataclass
 
 import numpy as np
