@@ -15,17 +15,18 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 from pydantic import ValidationError
-from stickslip_blender.actor import RenderActor
 from stickslip_blender import clips
+from stickslip_blender.actor import RenderActor
 from stickslip_blender.clips import GATE
 from stickslip_blender.color import silicone_color, to_linear
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_blender.stage import ClothStage
 from stickslip_blender.substrates import drawn_substrate
-from stickslip_schemas.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import decode_chunk
 from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.states import Reason

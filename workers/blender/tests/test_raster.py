@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_blender.raster import GRID, Textures, Window, projected, see, see_albedo, window_about
-from stickslip_blender.raster import _raster
+from stickslip_blender.raster import GRID, Textures, Window, _raster, projected, see, see_albedo, window_about
 from stickslip_blender.raster.visibility import barycentric
 from stickslip_schemas.cameras import Camera
 

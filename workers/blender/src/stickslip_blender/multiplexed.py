@@ -15,7 +15,6 @@ a floor that mirrors shows of the cloth, blurred as much as its roughness does.
 
 from __future__ import annotations
 
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,10 +57,11 @@ def encode(light: Floats) -> npt.NDArray[np.uint8]:
 def separate(trace: npt.NDArray[np.float16]) -> tuple[Floats, Floats, Floats]:
     """Return S, D and I (height, width) of a trace (height, width, 3)."""
     at_0, at_1, at_2 = (trace[..., k].astype(np.float32) for k in range(3))
-    _, a, b = (np.float32(level) for level in ALBEDOS)
+    _, a, b = ALBEDOS
     to_a, to_b = (at_1 - at_0) / a, (at_2 - at_0) / b
-    twice = (to_b - to_a) / (b - a)
-    return at_0, to_a - a * twice, twice
+    twice: Floats = (to_b - to_a) / np.float32(b - a)
+    once: Floats = to_a - np.float32(a) * twice
+    return at_0, once, twice
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Composer:
         cover = np.zeros(S.shape, dtype=np.float32)
         cover[seen.window.slices] = sight.coverage
         factor = 1.0 + (1.0 - cover[..., None]) * (floor - 1.0)
-        light = (D[..., None, None] + I[..., None, None] * mean) * albedo
+        light: Floats = albedo * (D[..., None, None] + I[..., None, None] * mean)
         light += S[..., None, None]
         light *= factor[:, :, None]
         share = self._in_sight(seen, sight)
@@ -160,8 +160,8 @@ class Composer:
         shown = sight.coverage[..., None]
         around = _blurred(np.concatenate([shown, shown * beyond[..., None]], axis=2), np.full(beyond.shape, 6), None)
         path = around[..., 1] / np.maximum(around[..., 0], 1e-6)
-        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower across
-        # the plane of incidence than in it, by the sine of the angle at which the camera looks down.
+        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower
+        # across the plane of incidence than in it, by the sine of the angle at which the camera looks down.
         down = _LOBE * camera.fy * substrate.roughness**2 * path
         across = np.rint(down * -np.asarray(camera.rotation)[2, 2]).astype(int)
         flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
