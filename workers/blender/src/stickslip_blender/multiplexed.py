@@ -59,9 +59,13 @@ def separate(trace: npt.NDArray[np.float16]) -> tuple[Floats, Floats, Floats]:
     at_0, at_1, at_2 = (trace[..., k].astype(np.float32) for k in range(3))
     _, a, b = ALBEDOS
     to_a, to_b = (at_1 - at_0) / a, (at_2 - at_0) / b
-    twice: Floats = (to_b - to_a) / np.float32(b - a)
-    once: Floats = to_a - np.float32(a) * twice
-    return at_0, once, twice
+    twice = (to_b - to_a) / (b - a)
+    return at_0, _single(to_a - a * twice), _single(twice)
+
+
+def _single(values: npt.ArrayLike) -> Floats:
+    """Return values as single floats, which is what they are at run time; the types of numpy do not know."""
+    return np.asarray(values, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ class Composer:
         cover = np.zeros(S.shape, dtype=np.float32)
         cover[seen.window.slices] = sight.coverage
         factor = 1.0 + (1.0 - cover[..., None]) * (floor - 1.0)
-        light: Floats = albedo * (D[..., None, None] + I[..., None, None] * mean)
+        light = _single(albedo * (D[..., None, None] + I[..., None, None] * mean))
         light += S[..., None, None]
         light *= factor[:, :, None]
         share = self._in_sight(seen, sight)
