@@ -112,9 +112,9 @@ class Composer:
         cover = np.zeros(S.shape, dtype=np.float32)
         cover[seen.window.slices] = sight.coverage
         factor = 1.0 + (1.0 - cover[..., None]) * (floor - 1.0)
-        light = _single(albedo * (D[..., None, None] + I[..., None, None] * mean))
+        light: Floats = _single(albedo * (D[..., None, None] + I[..., None, None] * mean))
         light += S[..., None, None]
-        light *= factor[:, :, None]
+        light *= _single(factor)[:, :, None]
         share = self._in_sight(seen, sight)
         return Composed(np.moveaxis(encode(light), 2, 0), float(weight) / S.size, share)
 
@@ -136,7 +136,7 @@ class Composer:
         seen = see(projected(camera, points), self._geometry.triangles, window)
         cover = np.zeros(light.shape[:2], dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        marked: Floats = light.astype(np.float32) * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0))
+        marked = _single(light * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0)))
         return marked
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
