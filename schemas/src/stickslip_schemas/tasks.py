@@ -9,7 +9,6 @@ from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.states import Reason
-from stickslip_schemas.textures import Texture
 
 # --- where bytes are ------------------------------------------------------------------------------------------
 
@@ -65,7 +64,7 @@ class RenderTask(Document):
     render: AnyRender
     record: RecordRef
     preview: bool = False
-    textures: tuple[Texture, ...] = Field(
+    textures: tuple[str, ...] = Field(
         default=(), description="textures to make clips of, one sample each; none: that of the render document"
     )
     trace: Sha256 | None = Field(
@@ -84,8 +83,8 @@ class RenderOutput(Document):
     chunks: dict[str, ChunkRef]
     preview: Sha256 | None = None
     labels: dict[str, Any]
-    clips: dict[Texture, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
-    previews: dict[Texture, Sha256] = Field(default_factory=dict)
+    clips: dict[str, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
+    previews: dict[str, Sha256] = Field(default_factory=dict)
     trace: Sha256 | None = Field(default=None, description="artifact of the trace, where the task kept it")
 
 

@@ -51,9 +51,9 @@ def kind_builds(name: str) -> dict[str, str]:
 
 
 def _core() -> str:
-    import stickslip_sim_core
+    from stickslip_sim_core import build_info
 
-    return str(stickslip_sim_core.build_info().build_hash)
+    return str(build_info().build_hash)
 
 
 def versions() -> dict[str, str]:

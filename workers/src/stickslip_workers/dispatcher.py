@@ -103,7 +103,7 @@ class Dispatcher:
             )
         )
         self._store = Store(settings.store)
-        self._coordinator = CoordinatorClient(settings.url)
+        self._coordinator = CoordinatorClient(settings.url, settings.key)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
         self._heartbeat: HeartbeatThread | None = None

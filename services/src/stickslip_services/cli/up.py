@@ -12,7 +12,7 @@ from stickslip_services.cli.common import console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.http import ClientError
 
-_SERVER_MODULES = ("alembic", "fastapi", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
+_SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
 
 
 class ServerNotInstalledError(ClientError):

@@ -135,12 +135,14 @@ def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array
     """Return the corners (n, 3) and barycentric weights (n, 3) of flat points: of the triangle they are most inside."""
     a, b, c = (flat[faces[:, k]] for k in range(3))
     inverse = np.linalg.inv(np.stack([b - a, c - a], axis=-1))  # (T, 2, 2)
+    middle, reach = (a + b + c) / 3.0, 2.0 * np.abs(np.concatenate([b - a, c - a, c - b])).max()
     corners, weights = np.empty((len(points), 3), dtype=np.int32), np.empty((len(points), 3))
     for number, point in enumerate(points):
-        bc = np.einsum("tij,tj->ti", inverse, point - a)
+        near = np.flatnonzero((np.abs(middle - point) < reach).all(axis=1))
+        bc = np.einsum("tij,tj->ti", inverse[near], point - a[near])
         all_three = np.column_stack([1.0 - bc.sum(axis=1), bc])
         best = int(all_three.min(axis=1).argmax())
-        corners[number], weights[number] = faces[best], all_three[best]
+        corners[number], weights[number] = faces[near[best]], all_three[best]
     return corners, weights
 
 
