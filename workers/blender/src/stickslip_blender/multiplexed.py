@@ -136,8 +136,7 @@ class Composer:
         seen = see(projected(camera, points), self._geometry.triangles, window)
         cover = np.zeros(light.shape[:2], dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        marked = _single(light * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0)))
-        return marked
+        return _single(light * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0)))
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
         return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
