@@ -47,8 +47,10 @@ class Run:
     steps: int = 1200
     unconverged_steps: int = 3
     worst_residual: float = 2e-4
-    side: int = -1
+    bias_side: int = -1
+    landed_side: int = 1
     bias: float = 1e-5
+    kernel: str = "baseline"
     valid: bool = True
     reason: str = ""
 
@@ -110,7 +112,9 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> N
         "areal_density": fabric("gray-interlock").density,
         "bending_rigidity": np.diag(fabric("gray-interlock").rigidity).tolist(),
         "stretching_stiffness": fabric("gray-interlock").stretching[0].tolist(),
-        "side": -1,
+        "kernel": "baseline",
+        "bias_side": -1,
+        "landed_side": 1,
         "bias": 1e-5,
         "steps": 1200,
         "unconverged_steps": 3,
@@ -189,7 +193,7 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
             labels = sample.labels | result.output.labels | {"light_seed": i, "light": light}
             arrays["valid"][i] = True
             for name in (*result.output.labels, "light_seed", "light"):
-                arrays[name][i] = labels[name]
+                arrays[name][i] = 0 if name == "kernel" else labels[name]
             for name, values in Records(store)(result.output.record.digest).items():
                 if name in arrays:
                     arrays[name][i] = values[0]

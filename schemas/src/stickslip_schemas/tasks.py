@@ -67,10 +67,6 @@ class RenderTask(Document):
     textures: tuple[str, ...] = Field(
         default=(), description="textures to make clips of, one sample each; none: that of the render document"
     )
-    trace: Sha256 | None = Field(
-        default=None, description="artifact of an earlier trace of the same render document: nothing is traced again"
-    )
-    keep_trace: bool = Field(default=False, description="put the trace into the store, for textures to come")
 
 
 class RenderOutput(Document):
@@ -85,7 +81,6 @@ class RenderOutput(Document):
     labels: dict[str, Any]
     clips: dict[str, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
     previews: dict[str, Sha256] = Field(default_factory=dict)
-    trace: Sha256 | None = Field(default=None, description="artifact of the trace, where the task kept it")
 
 
 # --- pack and publish -----------------------------------------------------------------------------------------

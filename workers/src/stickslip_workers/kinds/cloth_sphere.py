@@ -7,7 +7,7 @@ import numpy as np
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import TaskResult
 
-from stickslip_workers.cloth import fabric_of, result_of
+from stickslip_workers.cloth import fabric_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind
 
 if TYPE_CHECKING:
@@ -41,4 +41,4 @@ def _simulate_one(simulation: "ClothSphereSimulation", store: Store) -> TaskResu
     return result_of(simulation, fabric, run, store, record=record, labels={"bias": list(run.bias)})
 
 
-KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth")
+KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth", kernel=kernel_level)
