@@ -42,7 +42,7 @@ class Lighting(StrEnum):
 
 
 class Substrate(StrEnum):
-    """Finishes of the floor: a matt black plate, the seven of the thesis (4.2.2), woven cloth, or any of the hard ones.
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
 
     Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
     the end.

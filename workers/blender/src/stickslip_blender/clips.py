@@ -1,8 +1,8 @@
 """Clips of cloth: from a render task to a result, for every scene of cloth.
 
 One trace serves all textures (`stickslip_blender.multiplexed`) where an image gate finds it good enough. The gate
-renders one frame directly, with one texture, and compares means of 4 x 4 pixels: sampling noise is mostly gone from them,
-and what is wrong with the composition is not. Where it fails, every clip is rendered directly.
+renders one frame directly, with one texture, and compares means of 4 x 4 pixels: they have little sampling noise left,
+and all that is wrong with the composition. Where it fails, every clip is rendered directly.
 """
 
 from __future__ import annotations

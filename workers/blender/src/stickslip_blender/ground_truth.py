@@ -29,7 +29,8 @@ class GroundTruth:
     segmentation: npt.NDArray[np.uint8]
     """Codes, shape (height, width)."""
     normals: Floats
-    """Of length 1, towards the camera, in camera axes (x right, y down, z forward), 0 where there is nothing; shape (height, width, 3)."""
+    """Of length 1, towards the camera, in its axes (x right, y down, z forward); 0 where there is nothing; shape
+    (height, width, 3)."""
     uv: Floats
     """Texture coordinates of the cloth, NaN elsewhere; shape (height, width, 2)."""
     flow: Floats

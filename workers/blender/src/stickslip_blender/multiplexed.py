@@ -57,10 +57,15 @@ def encode(light: Floats) -> npt.NDArray[np.uint8]:
 def separate(trace: npt.NDArray[np.float16]) -> tuple[Floats, Floats, Floats]:
     """Return S, D and I (height, width) of a trace (height, width, 3)."""
     at_0, at_1, at_2 = (trace[..., k].astype(np.float32) for k in range(3))
-    _, a, b = (np.float32(level) for level in ALBEDOS)
+    _, a, b = ALBEDOS
     to_a, to_b = (at_1 - at_0) / a, (at_2 - at_0) / b
     twice = (to_b - to_a) / (b - a)
-    return at_0, to_a - a * twice, twice
+    return at_0, _single(to_a - a * twice), _single(twice)
+
+
+def _single(values: npt.ArrayLike) -> Floats:
+    """Return values as single floats, which is what they are at run time; the types of numpy do not know."""
+    return np.asarray(values, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -107,9 +112,9 @@ class Composer:
         cover = np.zeros(S.shape, dtype=np.float32)
         cover[seen.window.slices] = sight.coverage
         factor = 1.0 + (1.0 - cover[..., None]) * (floor - 1.0)
-        light = (D[..., None, None] + I[..., None, None] * mean) * albedo
+        light: Floats = _single(albedo * (D[..., None, None] + I[..., None, None] * mean))
         light += S[..., None, None]
-        light *= factor[:, :, None]
+        light *= _single(factor)[:, :, None]
         share = self._in_sight(seen, sight)
         return Composed(np.moveaxis(encode(light), 2, 0), float(weight) / S.size, share)
 
@@ -131,8 +136,7 @@ class Composer:
         seen = see(projected(camera, points), self._geometry.triangles, window)
         cover = np.zeros(light.shape[:2], dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        marked: Floats = light.astype(np.float32) * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0))
-        return marked
+        return _single(light * (1.0 + (1.0 - cover[..., None]) * (floor - 1.0)))
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
         return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
@@ -159,8 +163,8 @@ class Composer:
         shown = sight.coverage[..., None]
         around = _blurred(np.concatenate([shown, shown * beyond[..., None]], axis=2), np.full(beyond.shape, 6), None)
         path = around[..., 1] / np.maximum(around[..., 0], 1e-6)
-        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower across
-        # the plane of incidence than in it, by the sine of the angle at which the camera looks down.
+        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower
+        # across the plane of incidence than in it, by the sine of the angle at which the camera looks down.
         down = _LOBE * camera.fy * substrate.roughness**2 * path
         across = np.rint(down * -np.asarray(camera.rotation)[2, 2]).astype(int)
         flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)

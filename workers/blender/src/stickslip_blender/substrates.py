@@ -112,7 +112,8 @@ def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDA
     high = at(1, 0) + share[..., 0] * (at(1, 1) - at(1, 0))
     fine = low + share[..., 1] * (high - low)
     factor = fine.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(axis=(1, 3))
-    return (factor[..., None] * np.asarray(substrate.tint)).astype(np.float32)
+    tinted: npt.NDArray[np.float32] = (factor[..., None] * np.asarray(substrate.tint)).astype(np.float32)
+    return tinted
 
 
 def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:

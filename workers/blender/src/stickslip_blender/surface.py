@@ -1,7 +1,7 @@
 """The cloth that is seen: the solver's mesh refined, with weak creases and a hem of some thickness.
 
 The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at most; a label says
-how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer six millimetres.
+how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer 6 mm.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ class Surface:
         summed = np.stack(
             [np.bincount(index, weights=np.tile(face[:, x], 3), minlength=self._count) for x in range(3)], axis=1
         )
-        return summed / np.linalg.norm(summed, axis=1, keepdims=True)
+        normals: Array = summed / np.linalg.norm(summed, axis=1, keepdims=True)
+        return normals
 
 
 def _creases(uv: Array, seed: int) -> Array:
@@ -118,14 +119,16 @@ def _inward(rim: Array) -> Array:
     """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides there by 1."""
 
     def unit(v: Array) -> Array:
-        return v / np.linalg.norm(v, axis=1, keepdims=True)
+        scaled: Array = v / np.linalg.norm(v, axis=1, keepdims=True)
+        return scaled
 
     def left(v: Array) -> Array:
         return np.stack([-v[:, 1], v[:, 0]], axis=1)
 
     before, after = unit(rim - np.roll(rim, 1, axis=0)), unit(np.roll(rim, -1, axis=0) - rim)
     mean = unit(left(before) + left(after))
-    return mean / (mean * left(after)).sum(axis=1, keepdims=True)
+    inward: Array = mean / (mean * left(after)).sum(axis=1, keepdims=True)
+    return inward
 
 
 def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:
