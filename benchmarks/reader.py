@@ -15,6 +15,7 @@ MosaicML Streaming and WebDataset are peers that are not here: they would need p
 """
 
 import argparse
+import json
 import os
 import platform
 import statistics
@@ -41,6 +42,7 @@ from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.tasks import FileEntry
+from stickslip_training.data.seal import SEAL_NAME, sealed
 from stickslip_training.kinds.cloth_drag import ClipDataset
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
@@ -111,7 +113,7 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
     files = tuple(
         FileEntry(path=str(path.relative_to(root)), sha256=sha256(path.read_bytes()), size=path.stat().st_size)
         for path in sorted(root.rglob("*"))
-        if path.is_file()
+        if path.is_file() and path != root / "zarr.json"
     )
     manifest = Manifest(
         dataset=dataset_id(spec),
@@ -128,7 +130,17 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
         files=files,
     )
     (root / MANIFEST_NAME).write_text(manifest.model_dump_json())
+    _seal(root)
     return spec
+
+
+def _seal(root: Path) -> None:
+    """Write the manifest's digest into the group's metadata, and those of both beside them."""
+    metadata = json.loads((root / "zarr.json").read_bytes())
+    metadata["attributes"] = {"manifest_sha256": sha256((root / MANIFEST_NAME).read_bytes())}
+    (root / "zarr.json").write_text(json.dumps(metadata))
+    digests = {name: sha256((root / name).read_bytes()) for name in (MANIFEST_NAME, "zarr.json")}
+    (root / SEAL_NAME).write_bytes(sealed(digests))
 
 
 def _write_array(group: zarr.Group, root: Path, array: ArrayLayout, values: NDArray[Any], shard_size: int) -> None:

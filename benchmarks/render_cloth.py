@@ -1,125 +1,219 @@
-"""What a frame of cloth costs in CPU time and how far it is from a 256-sample reference, by quality.
+"""What a frame of cloth costs in CPU time and how far it is from 256 samples, by quality: one trace for many textures.
 
-Runs in Blender's interpreter:  .venv-blender/bin/python benchmarks/render_cloth.py [--frames N] [--all]
+Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
-PSNR is given twice: over the whole frame, most of which is dark floor, and over the pixels of the cloth. CPU time is
-all of a frame (mesh, Cycles, denoiser, pixels out), the median over frames after a first one. Textures, viewpoints and
-lights go round; the cloth is a made-up sheet of 41 x 41 vertices that trails over the floor.
+    .venv/bin/python benchmarks/render_trajectory.py /tmp/cloth.npz
+    .venv-blender/bin/python benchmarks/render_cloth.py /tmp/cloth.npz [--frames 12] [--references DIR] [--substrates]
+
+References are rendered directly, with another seed, in the window that the cloth is in; those of --substrates are
+denoised, for gloss is still noisy at 256 samples. They take most of the time, and DIR keeps them. Decibels pool the
+squared error of 8-bit sRGB over the pixels that the cloth covers by half or more, over frames, views and textures.
+CPU time is a median over frames, per frame and texture, with eight textures.
 """
 
 import argparse
+import hashlib
 import platform
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from render_rods import psnr
 from stickslip_blender.blender import import_bpy
-from stickslip_blender.cloth import ClothRenderer, Light
-from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, Sampling
+from stickslip_blender.build import build_digest
+from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
+from stickslip_blender.geometry import FLOOR
+from stickslip_blender.lights import drawn_light
+from stickslip_blender.looks import grained, look_of
+from stickslip_blender.multiplexed import encode
+from stickslip_blender.raster import Textures, Window, projected, see
+from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.stage import Shot
+from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.jobs import Quality
 from stickslip_schemas.textures import Texture
 
-SIDE = 41
-
-OTHERS = {
-    f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(samples=samples, denoiser=denoiser)
-    for samples in (4, 8, 16, 32, 64)
-    for denoiser in ("none", "fast")
-}
+MATERIAL = "gray-interlock"
+TEXTURES = tuple(Texture)[:8]
+COMPARED = (Texture.checker, Texture.houndstooth, Texture.floral)
+CREASES = 0.5
+SMOOTH = Sampling(REFERENCE.samples, "fast", REFERENCE.seed)
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """A mesh and its positions, one for each frame."""
+class View:
+    """One instant, seen by one camera."""
 
-    triangles: npt.NDArray[np.int32]
-    rest: npt.NDArray[np.float64]
-    track: npt.NDArray[np.float64]
+    frame: int
+    view: int
+    substrate: Substrate
 
-
-@dataclass(frozen=True)
-class Measured:
-    """Frames, (frames, height, width, 3), and the median CPU time of one [ms]."""
-
-    frames: npt.NDArray[np.uint8]
-    milliseconds: float
+    @property
+    def name(self) -> str:
+        return f"{self.substrate.name}-{self.frame}-{self.view}"
 
 
-def make_sheet(count: int) -> Sheet:
-    """Drag a sheet with wrinkles of its own in every frame from x = 0 to 0.3 m."""
-    line = np.linspace(-0.1, 0.1, SIDE)
-    rest = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-    number = np.arange(SIDE**2).reshape(SIDE, SIDE)
-    a, b, c, d = (number[i : SIDE - 1 + i, j : SIDE - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
-    triangles = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)]).astype(np.int32)
-    random = np.random.Generator(np.random.PCG64(0))
-    below = 0.1 - rest[:, 1]
-    hanging = np.minimum(below, 0.16)
-    sag = 1.0 - (rest[:, 0] / 0.1) ** 2
-    track = []
-    for shift in np.linspace(0.0, 0.3, count):
-        wave = sum(
-            0.004 / n * np.sin(20.0 * n * rest[:, 0] + 15.0 * rest[:, 1] + phase)
-            for n, phase in enumerate(random.uniform(0.0, 6.3, 4), start=1)
+class Bench:
+    """A stage with a simulated cloth on it."""
+
+    def __init__(self, trajectory: Path, references: Path | None) -> None:
+        with np.load(trajectory) as file:
+            self.track = file["track"].astype(np.float64)
+            self.renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
+        self.look = look_of(MATERIAL)
+        self.pictures = {texture: grained(texture_image(texture), self.look) for texture in TEXTURES}
+        self.textures = Textures(list(self.pictures.values()))
+        self.geometry, self.stage = self.renderer.geometry, self.renderer.stage
+        self.geometry.surface.dress(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)
+        self.rig = load_rig("drag")[:3]
+        build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[:12]
+        self.references = references and references / build
+
+    def set_up(self, shot: View) -> tuple[Shot, npt.NDArray[np.float32]]:
+        """Return where everything is, and the floor's factor."""
+        camera = self.rig[shot.view]
+        self.stage.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look)
+        return self.stage.shot(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
+
+    def reference(self, view: View, texture: Texture) -> tuple[Window, npt.NDArray[np.uint8]]:
+        """Return the window and what it should look like."""
+        shot, floor = self.set_up(view)
+        window = self.stage.window(shot)
+        kept = self.references and self.references / f"{view.name}-{texture}.npy"
+        if kept is not None and kept.exists():
+            return window, np.load(kept)
+        camera = self.rig[view.view]
+        light = np.zeros((camera.height, camera.width, 3), dtype=np.float16)
+        light[window.slices] = self.stage.direct(
+            shot, self.pictures[texture], REFERENCE if view.substrate.name == "matt" else SMOOTH, window
         )
-        x = shift - 0.05 * hanging / 0.16 - (below - hanging) + wave * hanging / 0.16
-        z = 0.15 * (1.0 - hanging / 0.16) * (1.0 - 0.35 * sag * np.exp(-below / 0.1)) + np.maximum(wave, 0.0) * 0.8
-        track.append(np.stack([x, rest[:, 0], z], axis=1))
-    return Sheet(triangles, rest, np.stack(track))
+        picture = encode(self.stage.composer.on_floor(light, shot.points, camera, floor))[window.slices]
+        if kept is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            np.save(kept, picture)
+        return window, picture
+
+    def composed(self, view: View, sampling: ClothSampling) -> tuple[npt.NDArray[np.uint8], float, float]:
+        """Return the pictures of all textures, the seconds of Cycles and those of all the rest."""
+        shot, floor = self.set_up(view)
+        placed = time.process_time()
+        trace = self.stage.trace(shot, sampling, seed=7)
+        traced = time.process_time()
+        camera = self.rig[view.view]
+        made = self.stage.composer.compose(trace, shot.points, camera, view.substrate, floor, self.textures)
+        ended = time.process_time()
+        return made.pictures, traced - placed, ended - traced + self._per_frame(view)
+
+    def _per_frame(self, view: View) -> float:
+        """Return the seconds that it takes to place everything: once a frame, the rest of `set_up` once a clip."""
+        start = time.process_time()
+        self.stage.shot(self.track[view.frame], view.frame)
+        return time.process_time() - start
+
+    def direct(self, view: View, texture: Texture, sampling: Sampling) -> tuple[npt.NDArray[np.uint8], float]:
+        """Return a picture rendered directly, and its seconds."""
+        shot, floor = self.set_up(view)
+        start = time.process_time()
+        light = self.stage.direct(shot, self.pictures[texture], sampling)
+        spent = time.process_time() - start
+        return encode(self.stage.composer.on_floor(light, shot.points, self.rig[view.view], floor)), spent
+
+    def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
+        """Return which pixels of a window the cloth covers by half or more."""
+        points = self.geometry.points(self.track[view.frame], view.frame)
+        seen = see(projected(self.rig[view.view], points), self.geometry.triangles, window)
+        share: npt.NDArray[np.bool_] = seen.share_below(self.geometry.cloth_triangles) >= 0.5
+        return share
 
 
-def measure(sampling: Sampling, sheet: Sheet) -> Measured:
-    rig, textures, frames, seconds = load_rig("drag-3"), cycle(Texture), [], []
-    with ClothRenderer(sheet.triangles, sheet.rest, quality=sampling) as renderer:
-        for texture in Texture if sampling is not REFERENCE else ():  # the pictures are drawn once
-            renderer.render(sheet.track[:1], rig[0], texture=texture, light=Light.drawn(0))
-        for seed, positions in enumerate(sheet.track):
-            start = time.process_time()
-            camera, light = rig[seed % 3], Light.drawn(seed)
-            frames.append(renderer.render(positions[None], camera, texture=next(textures), light=light)[0])
-            seconds.append(time.process_time() - start)
-    return Measured(np.stack(frames), 1e3 * float(np.median(seconds)))
+def decibels(errors: list[npt.NDArray[np.float64]]) -> float:
+    """Return the PSNR of pooled squared errors."""
+    return float(10.0 * np.log10(255.0**2 / max(float(np.concatenate(errors).mean()), 1e-9)))
 
 
-def cloth_pixels(sheet: Sheet) -> npt.NDArray[np.bool_]:
-    """Return which pixels the vertices, denser than pixels when halved twice, fall on, (frames, height, width)."""
-    rig = load_rig("drag-3")
-    masks = np.zeros((len(sheet.track), 224, 224), dtype=bool)
-    for number, positions in enumerate(sheet.track):
-        corners = positions[sheet.triangles]
-        weights = [(i / 4, j / 4, 1 - (i + j) / 4) for i in range(5) for j in range(5 - i)]
-        points = np.einsum("wk,tkx->twx", np.array(weights), corners).reshape(-1, 3)
-        column, row = np.rint(rig[number % 3].project(points)[0]).astype(int).clip(0, 223).T
-        masks[number, row, column] = True
-    return masks
+def squared(a: npt.NDArray[np.uint8], b: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
+    return (a.astype(np.float64) - b) ** 2
+
+
+def shots(track: npt.NDArray[np.float64], count: int, names: tuple[str, ...]) -> Iterator[View]:
+    """Yield `count` instants in each of three views, of each substrate."""
+    for name in names:
+        for frame in np.linspace(8, len(track) - 1, count).astype(int).tolist():
+            for view in range(3):
+                yield View(frame, view, drawn_substrate(name, 5))
+
+
+def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[View]) -> None:
+    """Print what a quality costs and how good it is."""
+    by_texture: dict[Texture, list[npt.NDArray[np.float64]]] = {texture: [] for texture in COMPARED}
+    by_view: dict[int, list[npt.NDArray[np.float64]]] = {view: [] for view in range(3)}
+    floor: list[npt.NDArray[np.float64]] = []
+    cycles, rest = [], []
+    order = list(bench.pictures)
+    for shot in chosen:
+        pictures, light, other = bench.composed(shot, sampling)
+        cycles.append(light)
+        rest.append(other)
+        for texture in COMPARED:
+            window, reference = bench.reference(shot, texture)
+            error = squared(pictures[order.index(texture)][window.slices], reference)
+            cloth = bench.cloth(shot, window)
+            by_texture[texture].append(error[cloth].ravel())
+            by_view[shot.view].append(error[cloth].ravel())
+            floor.append(error[~cloth].ravel())
+    everything = [error for errors in by_texture.values() for error in errors]
+    seconds = (np.median(cycles) + np.median(rest)) / len(order)
+    textures = " ".join(f"{texture} {decibels(errors):.1f}" for texture, errors in by_texture.items())
+    views = " ".join(f"{bench.rig[view].name} {decibels(errors):.1f}" for view, errors in by_view.items() if errors)
+    print(
+        f"{quality:18} {seconds:.4f} CPU s; cloth {decibels(everything):.2f} dB ({textures}; {views}); floor near it "
+        f"{decibels(floor):.1f} dB; Cycles {1e3 * np.median(cycles):.0f} ms, all else {1e3 * np.median(rest):.0f} ms "
+        f"({100 * np.median(rest) / np.median(cycles):.1f} %)",
+        flush=True,
+    )
 
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    arguments.add_argument("--frames", type=int, default=16, help="how many frames")
-    arguments.add_argument("--all", action="store_true", help="other samplings too, not only the named ones")
+    arguments.add_argument("trajectory", type=Path)
+    arguments.add_argument("--frames", type=int, default=12, help="instants, each in three views")
+    arguments.add_argument("--references", type=Path, help="folder that keeps them")
+    arguments.add_argument("--substrates", action="store_true", help="the seven of the thesis, one instant each")
+    arguments.add_argument("--direct", action="store_true", help="direct renderings too")
+    arguments.add_argument("--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings")
     options = arguments.parse_args()
 
-    sheet = make_sheet(options.frames)
-    reference = measure(REFERENCE, sheet)
-    cloth = cloth_pixels(sheet)
+    bench = Bench(options.trajectory, options.references)
     app = import_bpy().app
     print(f"bpy {app.version_string} ({app.build_hash.decode()}), {platform.machine()}, one thread")
-    print(f"{options.frames} frames; the cloth covers {100 * cloth.mean():.1f} % of the pixels")
-    print(f"{'quality':10} {'samples':>7} {'denoiser':>8} {'CPU ms/frame':>12} {'PSNR frame':>10} {'PSNR cloth':>10}")
-    named: dict[str, Sampling] = {str(name): sampling for name, sampling in CLOTH_SAMPLING.items()}
-    for name, sampling in (named | (OTHERS if options.all else {})).items():
-        result = measure(sampling, sheet)
-        quality = [psnr(result.frames, reference.frames), psnr(result.frames[cloth], reference.frames[cloth])]
-        print(
-            f"{name:10} {sampling.samples:7} {sampling.denoiser:>8} {result.milliseconds:12.0f} "
-            f"{quality[0]:10.1f} {quality[1]:10.1f}",
-            flush=True,
-        )
-    print(f"{'reference':10} {REFERENCE.samples:7} {REFERENCE.denoiser:>8} {reference.milliseconds:12.0f}")
+    qualities = {str(quality): sampling for quality, sampling in CLOTH_SAMPLING.items()}
+    for pair in options.also:
+        frame, window = map(int, pair.split("+"))
+        qualities[pair] = ClothSampling(frame=frame, window=window)
+    chosen = list(shots(bench.track, options.frames, ("matt",)))
+    bench.composed(chosen[0], CLOTH_SAMPLING[Quality.draft])  # shaders are compiled once
+    for quality, sampling in qualities.items():
+        compare(bench, quality, sampling, chosen)
+    if options.direct:
+        for samples in (16, 32):
+            errors, seconds = [], []
+            for view in chosen[:6]:
+                picture, spent = bench.direct(view, Texture.floral, Sampling(samples, "fast"))
+                part, reference = bench.reference(view, Texture.floral)
+                errors.append(squared(picture[part.slices], reference)[bench.cloth(view, part)].ravel())
+                seconds.append(spent)
+            print(
+                f"direct {samples:11} {np.median(seconds):.4f} CPU s; cloth {decibels(errors):.2f} dB (floral)",
+                flush=True,
+            )
+    if options.substrates:
+        for name in HARD:
+            compare(bench, name, CLOTH_SAMPLING[Quality.standard], list(shots(bench.track, 1, (name,))))
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ class TestTheRule:
 
     @pytest.mark.parametrize(
         "other",
-        [{"preset": "fast"}, {"sim_core": "9" * 64}, {"extent": "quick"}, {"error": 0.02}],
+        [{"preset": "fast"}, {"sim_core": "8" * 64}, {"extent": "quick"}, {"error": 0.02}],
         ids=["preset", "build", "quick", "failed"],
     )
     def test_no_other_certificate_will_do(

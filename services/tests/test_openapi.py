@@ -9,7 +9,9 @@ COMMITTED = Path(__file__).parents[2] / "docs" / "openapi.json"
 
 
 def test_the_committed_document_is_up_to_date() -> None:
-    assert COMMITTED.read_text() == openapi_text(), "run: python -m stickslip_services.api.openapi > docs/openapi.json"
+    assert COMMITTED.read_text() == openapi_text(), (
+        "run: python -m stickslip_services.coordinator --openapi > docs/openapi.json"
+    )
 
 
 def test_every_reference_leads_somewhere() -> None:

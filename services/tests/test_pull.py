@@ -1,12 +1,13 @@
 """Pulling and verifying: every byte checked, interruptions survived, nothing written outside."""
 
+import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Manifest, seal_text, with_manifest_digest
 from stickslip_services.client.http import Client, ProblemError, UnexpectedError, UnreachableError
 from stickslip_services.client.pull import DamagedError, UnsafePathError, pull, safe_path, verify
 from stickslip_services.coordinator import make_app
@@ -72,13 +73,13 @@ def test_a_pull_brings_everything_and_a_second_one_nothing(origin: tuple[str, st
     with Client(url, transport=meddler) as client:
         loaded: list[int] = []
         first = pull(client, dataset, 1, tmp_path / "d", on_bytes=loaded.append)
-        assert first.files == first.downloaded_files == 5
+        assert first.files == first.downloaded_files == 9
         assert sum(loaded) == first.downloaded_bytes
         assert verify(tmp_path / "d") == []
         before = len(meddler.requests)
         second = pull(client, dataset, 1, tmp_path / "d")
         assert (second.downloaded_files, second.downloaded_bytes) == (0, 0)
-        assert len(meddler.requests) - before == 2  # the version and its manifest
+        assert len(meddler.requests) - before == 4  # the version and the three files that vouch for it
     assert not list((tmp_path / "d").rglob("*.part"))
 
 
@@ -132,12 +133,12 @@ def test_a_damaged_file_is_loaded_again(origin: tuple[str, str], tmp_path: Path)
         data = bytearray(file.read_bytes())
         data[7] ^= 1
         file.write_bytes(data)
-        (tmp_path / "zarr.json").unlink()
+        (tmp_path / "mu" / "zarr.json").unlink()
         (tmp_path / "extra").write_text("mine")
         assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [
             ("extra", "extra"),
+            ("mu/zarr.json", "missing"),
             ("views/c/0/0", "sha256"),
-            ("zarr.json", "missing"),
         ]
         assert pull(client, origin[1], 1, tmp_path).downloaded_files == 2
         assert [fault.fault for fault in verify(tmp_path)] == ["extra"]
@@ -175,16 +176,16 @@ def test_a_malicious_manifest_writes_nothing(origin: tuple[str, str], tmp_path: 
     evil_file = manifest.files[0].model_copy(update={"path": "a/../../evil"})
     evil = manifest.model_copy(update={"files": (evil_file,)}).model_dump_json().encode()
     assert Manifest.model_validate_json(evil)
+    group = with_manifest_digest(b"{}", sha256(evil))
+    answers = {"zarr.json": group, "manifest.sha256": seal_text(sha256(evil), sha256(group)), "manifest": evil}
 
     def lie(request: httpx.Request, response: httpx.Response) -> httpx.Response:
-        if request.url.path.endswith("/manifest"):
-            return httpx.Response(200, content=evil)
+        name = request.url.path.rpartition("/")[2]
+        if name in answers:
+            return httpx.Response(200, content=answers[name])
         if request.url.path.endswith("/versions/1"):
-            return httpx.Response(200, content=response.content.replace(sha256_of(response), sha256(evil).encode()))
+            return httpx.Response(200, json=response.json() | {"manifest": sha256(evil), "group": sha256(group)})
         return response
-
-    def sha256_of(response: httpx.Response) -> bytes:
-        return str(response.json()["manifest"]).encode()
 
     with Client(origin[0], transport=Meddler("", lie)) as client, pytest.raises(UnsafePathError):
         pull(client, origin[1], 1, tmp_path / "d")
@@ -201,7 +202,7 @@ def test_a_manifest_other_than_promised_is_refused(origin: tuple[str, str], tmp_
 
 def test_a_coordinator_that_is_away_is_waited_for() -> None:
     answers: Iterator[httpx.Response | Exception] = iter(
-        [httpx.ConnectError("refused"), httpx.Response(503), httpx.Response(200, json=[])]
+        [httpx.Response(503), httpx.ConnectError("refused"), httpx.ReadError("gone"), httpx.Response(200, json=[])]
     )
     slept: list[float] = []
 
@@ -213,10 +214,21 @@ def test_a_coordinator_that_is_away_is_waited_for() -> None:
 
     with Client(transport=httpx.MockTransport(answer), sleep=slept.append) as client:
         assert client.workers() == []
-    assert len(slept) == 2
+    assert len(slept) == 3
     always = httpx.MockTransport(lambda _request: httpx.Response(503))
     with Client(transport=always, patience=0) as client, pytest.raises(UnexpectedError, match="503"):
         client.workers()
+
+
+def test_a_coordinator_that_is_not_there_is_not_waited_for() -> None:
+    def refuse(_request: httpx.Request) -> httpx.Response:
+        raise httpx.ConnectError("refused")
+
+    slept: list[float] = []
+    transport = httpx.MockTransport(refuse)
+    with Client(transport=transport, sleep=slept.append) as client, pytest.raises(UnreachableError, match="refused"):
+        client.workers()
+    assert slept == []
 
 
 def test_a_problem_is_an_exception_with_all_it_says(origin: tuple[str, str]) -> None:
@@ -224,3 +236,72 @@ def test_a_problem_is_an_exception_with_all_it_says(origin: tuple[str, str]) -> 
         client.submit({"kind": "rod_hang", "axes": {"gamma": -1.0, "phi0": 0.0, "phi1": 0.0}}, idempotency_key="bad")
     (field,) = caught.value.problem.errors
     assert (field.pointer, field.value) == ("/axes/gamma", "-1.0")
+
+
+SEALED = ("manifest.json", "zarr.json", "manifest.sha256")
+
+
+def flipped(data: bytes, rng: random.Random) -> bytes:
+    position = rng.randrange(len(data))
+    return data[:position] + bytes([data[position] ^ 1 << rng.randrange(8)]) + data[position + 1 :]
+
+
+def test_no_flipped_bit_of_the_sealed_files_is_silent(origin: tuple[str, str], tmp_path: Path) -> None:
+    with Client(origin[0]) as client:
+        pull(client, origin[1], 1, tmp_path)
+    rng = random.Random(7)
+    for name in SEALED:
+        path = tmp_path / name
+        whole = path.read_bytes()
+        for _ in range(700):
+            path.write_bytes(flipped(whole, rng))
+            assert [fault.path for fault in verify(tmp_path)] in (["manifest.sha256"], ["manifest.json"])
+        path.write_bytes(whole)
+    assert verify(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["manifest", "zarr.json", "manifest.sha256"])
+def test_no_flipped_bit_arrives_in_silence(origin: tuple[str, str], tmp_path: Path, name: str) -> None:
+    rng = random.Random(8)
+
+    def flip(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
+        return httpx.Response(200, content=flipped(response.content, rng))
+
+    with Client(origin[0], transport=Meddler(f"/{name}", flip), patience=0) as client:
+        for _ in range(20):
+            with pytest.raises((DamagedError, UnexpectedError)):
+                pull(client, origin[1], 1, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_swapped_shards_are_found(origin: tuple[str, str], tmp_path: Path) -> None:
+    with Client(origin[0]) as client:
+        pull(client, origin[1], 1, tmp_path)
+    rng = random.Random(9)
+    sizes: dict[int, list[Path]] = {}
+    for path in tmp_path.rglob("c/*/0"):
+        sizes.setdefault(path.stat().st_size, []).append(path)
+    pairs = [group for group in sizes.values() if len(group) > 1]
+    assert pairs
+    for _ in range(200):
+        one, other = rng.sample(rng.choice(pairs), 2)
+        contents = one.read_bytes(), other.read_bytes()
+        other.write_bytes(contents[0]), one.write_bytes(contents[1])
+        found = {fault.path for fault in verify(tmp_path)}
+        assert found == {path.relative_to(tmp_path).as_posix() for path in (one, other)}
+        one.write_bytes(contents[0]), other.write_bytes(contents[1])
+
+
+def test_keys_that_the_manifest_does_not_list_are_found(origin: tuple[str, str], tmp_path: Path) -> None:
+    """A manifest and its seal made anew, consistent in themselves, over the arrays of another dataset."""
+    with Client(origin[0]) as client:
+        pull(client, origin[1], 1, tmp_path)
+    manifest = Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes())
+    keys = (manifest.sample_keys[1], manifest.sample_keys[0], *manifest.sample_keys[2:])
+    content = manifest.model_copy(update={"sample_keys": keys}).model_dump_json().encode()
+    group = with_manifest_digest((tmp_path / "zarr.json").read_bytes(), sha256(content))
+    for name, data in zip(SEALED, (content, group, seal_text(sha256(content), sha256(group))), strict=True):
+        (tmp_path / name).write_bytes(data)
+    (fault,) = verify(tmp_path)
+    assert (fault.path, fault.fault) == ("sample_key/c/0/0", "sample_key")
+    assert "slots 0 to 1" in fault.detail

@@ -93,7 +93,9 @@ def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, work
     worker.finish(first, second)
     (publish,) = worker.lease(publish=1)
     assert isinstance(publish.task, PublishTask)
-    assert [file.path for file in publish.task.files] == ["views/c/0/0", "views/c/1/0"]
+    assert [file.path for file in publish.task.files] == [
+        f"{name}/c/{shard}/0" for name in ("sample_key", "views") for shard in (0, 1)
+    ]
     assert [entry.slot for entry in publish.task.rejections] == [0]
     assert len(publish.task.sample_keys) == 4
     assert publish.task.sample_keys[1] == good.sample_key

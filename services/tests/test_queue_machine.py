@@ -221,7 +221,7 @@ class QueueMachine(RuleBasedStateMachine):
         """Tell whether a job that may run needs the task."""
         with self.coordinator.database.read() as connection:
             seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
-            return bool(runnable_tasks(connection, [seq]))
+            return seq is not None and bool(runnable_tasks(connection, [seq]))
 
     def _expired_unnoticed(self, worker: PretendWorker, lease: Lease) -> bool:
         """Tell whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""

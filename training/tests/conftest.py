@@ -1,5 +1,6 @@
 """Datasets to test with, written by zarr-python: an implementation that our reader knows nothing of."""
 
+import json
 import shutil
 import warnings
 from collections.abc import Callable
@@ -44,14 +45,31 @@ class MadeDataset:
     def rewrite(self, path: str, data: bytes) -> None:
         """Replace a file and let the manifest agree, as a faulty writer would have it."""
         (self.root / path).write_bytes(data)
+        if path == "zarr.json":
+            seal(self.root)
+            return
         entry = FileEntry(path=path, sha256=sha256(data), size=len(data))
         files = tuple(entry if file.path == path else file for file in self.manifest.files)
         self.edit_manifest(files=files)
+
+    def seal(self) -> None:
+        """Let the files that vouch for the others agree with what they are now."""
+        seal(self.root)
 
     def edit_manifest(self, **changes: Any) -> None:
         """Change fields of the manifest."""
         manifest = self.manifest.model_copy(update=changes)
         (self.root / MANIFEST_NAME).write_text(manifest.model_dump_json())
+        seal(self.root)
+
+
+def seal(root: Path) -> None:
+    """Write the manifest's digest into the group's metadata, and those of both beside them."""
+    group = json.loads((root / "zarr.json").read_bytes())
+    group.setdefault("attributes", {})["manifest_sha256"] = sha256((root / MANIFEST_NAME).read_bytes())
+    (root / "zarr.json").write_text(json.dumps(group))
+    lines = [f"{sha256((root / name).read_bytes())}  {name}\n" for name in (MANIFEST_NAME, "zarr.json")]
+    (root / "manifest.sha256").write_text("".join(lines))
 
 
 def write_dataset(
@@ -78,7 +96,7 @@ def write_dataset(
             _write_array(group, array, values, spec.samples_per_shard)
             arrays[array.name] = values
         zarr.consolidate_metadata(group.store)
-    files = sorted(path for path in root.rglob("*") if path.is_file())
+    files = sorted(path for path in root.rglob("*") if path.is_file() and path != root / "zarr.json")
     entries = tuple(
         FileEntry(path=str(path.relative_to(root)), sha256=sha256(path.read_bytes()), size=path.stat().st_size)
         for path in files
@@ -108,6 +126,7 @@ def write_dataset(
         files=entries,
     )
     (root / MANIFEST_NAME).write_text(manifest.model_dump_json())
+    seal(root)
     return MadeDataset(root, arrays, spec)
 
 

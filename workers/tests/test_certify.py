@@ -51,7 +51,7 @@ class TestCertify:
         assert certificate.numbers == {"dt": 0.01, "solver": "<b>"}
         assert [report.build_hash for report in certificate.protocols] == [build_info().build_hash] * 2
         assert certificate.protocols[1].settings == {"elements": 512}
-        assert {"cpu_seconds/rod-cantilever", "protocol_sources", "processor"} <= set(certificate.environment)
+        assert {"cpu_seconds/rod-cantilever", "processor"} <= set(certificate.environment)
         page = (tmp_path / "a" / "certificate.html").read_text()
         assert page.count("data:image/svg+xml;base64,") == 2
         assert certificate.digest in page

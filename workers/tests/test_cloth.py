@@ -21,6 +21,7 @@ from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import ChunkRef, FileEntry, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
+from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module
 from stickslip_workers.stages.metadata import create_array
@@ -46,8 +47,10 @@ class Run:
     steps: int = 1200
     unconverged_steps: int = 3
     worst_residual: float = 2e-4
-    side: int = -1
+    bias_side: int = -1
+    landed_side: int = 1
     bias: float = 1e-5
+    kernel: str = "baseline"
     valid: bool = True
     reason: str = ""
 
@@ -59,8 +62,8 @@ class Core:
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     changes: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(self, material: str, mu: float, *, preset: str, vertices: int, frames: int, seed: int) -> Run:
-        self.calls.append((material, mu, preset, vertices, frames, seed))
+    def __call__(self, fabric: Fabric, mu: float, *, preset: str, vertices: int, frames: int, seed: int) -> Run:
+        self.calls.append((fabric.name, mu, preset, vertices, frames, seed))
         line = np.linspace(-0.1, 0.1, vertices)
         rest = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
         number = np.arange(vertices**2).reshape(vertices, vertices)
@@ -89,7 +92,15 @@ def core(monkeypatch: pytest.MonkeyPatch) -> Core:
 
 
 def _task(**changes: Any) -> SimulateTask:
-    cloth = {"material": "gray-interlock", "mu": 0.25, "preset": "fast", "mesh": SIDE, "seed": 7}
+    cloth = {
+        "material": "gray-interlock",
+        "fabric": None,
+        "mu": 0.25,
+        "preset": "fast",
+        "mesh": SIDE,
+        "frames": 300,
+        "seed": 7,
+    }
     return SimulateTask(simulation=ClothDragSimulation(**(cloth | changes)))
 
 
@@ -98,7 +109,12 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> N
     assert core.calls == [("gray-interlock", 0.25, "fast", SIDE, 300, 7)]
     assert result.outcome == "succeeded"
     assert result.output.labels == {
-        "side": -1,
+        "areal_density": fabric("gray-interlock").density,
+        "bending_rigidity": np.diag(fabric("gray-interlock").rigidity).tolist(),
+        "stretching_stiffness": fabric("gray-interlock").stretching[0].tolist(),
+        "kernel": "baseline",
+        "bias_side": -1,
+        "landed_side": 1,
         "bias": 1e-5,
         "steps": 1200,
         "unconverged_steps": 3,
@@ -107,14 +123,14 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> N
     with np.load(io.BytesIO(store.read(result.output.record.digest))) as arrays:
         record = {name: values[result.output.record.row] for name, values in arrays.items()}
     assert {name: (values.shape, values.dtype) for name, values in record.items()} == {
-        "mesh": ((300, 25, 3), np.float32),
+        "positions": ((300, 25, 3), np.float32),
         "rest": ((25, 2), np.float32),
         "triangles": ((32, 3), np.int32),
         "self_intersections": ((300,), np.int16),
         "contact_force": ((300, 3), np.float32),
         "holder_force": ((300, 3), np.float32),
     }
-    assert record["mesh"][-1, :, 0] == pytest.approx(0.25)
+    assert record["positions"][-1, :, 0] == pytest.approx(0.25)
     assert record["self_intersections"][[1, 50]].tolist() == [1000, 32767]  # more than fits is still many
 
 
@@ -173,11 +189,14 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
-            light = [float(value) for value in rng.random(5).astype(np.float32)]
-            labels = sample.labels | result.output.labels | {"light_seed": i, "light": light}
+            shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": (), "gate_db": ()}
+            seen = {name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()}
+            seen |= {"light_seed": i, "composed": True, "lighting": "drawn", "substrate": "ceramic"}
+            labels = sample.labels | result.output.labels | seen
             arrays["valid"][i] = True
-            for name in ("side", "bias", "steps", "unconverged_steps", "worst_residual", "light_seed", "light"):
-                arrays[name][i] = labels[name]
+            codes = {"kernel": 0, "lighting": 0, "substrate": 3}
+            for name in (*result.output.labels, *seen):
+                arrays[name][i] = codes.get(name, labels[name])
             for name, values in Records(store)(result.output.record.digest).items():
                 if name in arrays:
                     arrays[name][i] = values[0]
@@ -215,11 +234,11 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
     return make
 
 
-@pytest.mark.parametrize("store_mesh", [True, False])
+@pytest.mark.parametrize("store_positions", [True, False])
 def test_files_are_those_of_zarr_python(
-    make_clips: Callable[..., Clips], store: Store, tmp_path: Path, store_mesh: bool
+    make_clips: Callable[..., Clips], store: Store, tmp_path: Path, store_positions: bool
 ) -> None:
-    made = make_clips(rejected=(2,), store_mesh=store_mesh)
+    made = make_clips(rejected=(2,), store_positions=store_positions)
     packed = {file.path: store.read(file.sha256) for task in made.pack_tasks for file in pack(task, store).files}
     group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
     for array in layout(made.spec):
@@ -230,7 +249,7 @@ def test_files_are_those_of_zarr_python(
         for path in (tmp_path / "zarr").rglob("*")
         if path.is_file() and path.name != "zarr.json"
     }
-    assert ("mesh/c/0/0/0/0" in packed) == store_mesh
+    assert ("positions/c/0/0/0/0" in packed) == store_positions
     assert packed.keys() == written.keys()
     assert [path for path in packed if packed[path] != written[path]] == []
 
@@ -248,10 +267,10 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
             for got in (group[name][...], dataset[name].values, third):
                 assert got.dtype == expected.dtype, name
                 assert got.tobytes() == expected.tobytes(), name
-        assert dataset["mesh"].dims == ("sample", "instant", "vertex", "xyz")
+        assert dataset["positions"].dims == ("sample", "instant", "vertex", "xyz")
     assert group["video"].attrs["instants"] == [0, 150]
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
-    assert manifest.cameras == load_rig("drag-3")
+    assert manifest.cameras == load_rig("drag")
     assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
 
 
@@ -272,7 +291,7 @@ def test_a_trajectory_is_encoded_once_for_all_its_renders(
 
 def test_a_mesh_of_another_size_is_refused(make_clips: Callable[..., Clips], store: Store) -> None:
     (task, *_) = make_clips().pack_tasks
-    other = task.spec.model_copy(update={"mesh": 7})
+    other = ClothDragSpec.model_validate(task.spec.model_dump() | {"mesh": 7})
     with pytest.raises(ValueError, match=r"must be float32 of shape \(n, \*\(300, 49, 3\)\) with n > 0; got float32"):
         pack(task.model_copy(update={"spec": other}), store)
 

@@ -7,10 +7,12 @@ from typing import Any
 import pytest
 import zarr
 from stickslip_schemas.layout import layout
+from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import ChunkRef, PackTask
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
+from stickslip_workers.stages.run import run_tasks
 
 
 @pytest.mark.parametrize("views", [True, False])
@@ -83,3 +85,27 @@ def test_what_is_wrong_is_named(make_dataset: Callable[..., Any], store: Store) 
         pack(_with_first_slot(task, labels={"gamma": 1, "phi0": 1, "phi1": 1, "color": [0] * 3}), store)
     with pytest.raises(ValueError, match="with n > 99; got float32"):
         pack(_with_first_slot(task, record=slot.record.model_copy(update={"row": 99})), store)
+
+
+def test_a_failed_task_names_all_its_damaged_inputs(make_dataset: Callable[..., Any], store: Store) -> None:
+    task = make_dataset().pack_tasks[1]
+    (whole,) = run_tasks([task], store)
+    assert whole.outcome == "succeeded"
+    chunks = [slot.chunks["views"].digest for slot in task.slots if slot.valid]
+    store.path(chunks[0]).unlink()
+    store.path(chunks[1]).write_bytes(b"rotten")
+    (result,) = run_tasks([task], store)
+    assert (result.outcome, result.reason) == ("failed", Reason.storage_error)
+    assert set(result.damaged_inputs) == set(chunks[:2])
+
+
+def test_publishing_a_rotten_shard_names_it(make_dataset: Callable[..., Any], store: Store) -> None:
+    task = make_dataset().publish_task
+    path = store.path(task.files[3].sha256)
+    data = bytearray(path.read_bytes())
+    data[5] ^= 1
+    path.write_bytes(data)
+    (result,) = run_tasks([task], store)
+    assert (result.outcome, result.reason) == ("failed", Reason.storage_error)
+    assert result.damaged_inputs == (task.files[3].sha256,)
+    assert not store.dataset_path(task.dataset, 1).exists()

@@ -10,7 +10,7 @@ import tensorstore
 import xarray
 import zarr
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Manifest, check_seal
 from stickslip_schemas.store import Store
 from stickslip_workers.stages import publish as publish_module
 from stickslip_workers.stages.publish import publish
@@ -60,6 +60,10 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     directory = made.publish()
     tree = _tree(directory)
     manifest = Manifest.model_validate_json(tree.pop("manifest.json"))
+    digest = check_seal(
+        directory.joinpath("manifest.json").read_bytes(), tree.pop("zarr.json"), tree["manifest.sha256"]
+    )
+    assert tree.pop("manifest.sha256").startswith(f"{digest}  manifest.json\n".encode())
     assert {file.path: (file.sha256, file.size) for file in manifest.files} == {
         path: (sha256(data), len(data)) for path, data in tree.items()
     }
@@ -111,9 +115,9 @@ def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
     with pytest.raises(ValueError, match="dataset must be the id of its spec"):
         publish(task.model_copy(update={"dataset": "../elsewhere"}), made.store)
     made.store.path(task.files[0].sha256).write_bytes(b"cut")
-    with pytest.raises(OSError, match=r"must have .* bytes; it has 3"):
+    with pytest.raises(OSError, match=r"must have .* bytes and the digest that names it"):
         publish(task, made.store)
     made.store.path(task.files[0].sha256).unlink()
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(OSError, match="must have"):
         publish(task, made.store)
     assert not made.store.dataset_path(task.dataset, 1).exists()

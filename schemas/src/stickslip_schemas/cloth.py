@@ -31,11 +31,49 @@ MaterialAxis = Annotated[ListAxis[MaterialName], SHORTHAND]
 TextureAxis = Annotated[ListAxis[Texture], SHORTHAND]
 
 
+class Lighting(StrEnum):
+    """Named ranges that the lamp of a clip is drawn from.
+
+    Their order gives the codes of the label `lighting`: add new ones at the end.
+    """
+
+    drawn = "drawn"
+    held_out = "held-out"
+
+
+class Substrate(StrEnum):
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
+
+    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
+    the end.
+    """
+
+    matt = "matt"
+    aluminium = "aluminium"
+    aluminium_pet = "aluminium-pet"
+    ceramic = "ceramic"
+    rough_glass = "rough-glass"
+    smooth_glass = "smooth-glass"
+    polyester_mirror = "polyester-mirror"
+    stainless_steel = "stainless-steel"
+    cloth = "cloth"
+    any = "any"
+
+
+LightingAxis = Annotated[ListAxis[Lighting], SHORTHAND]
+SubstrateAxis = Annotated[ListAxis[Substrate], SHORTHAND]
+
+
+KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
+"""Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""
+
+
 class PresetName(StrEnum):
     """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
 
     certified = "certified"
     fast = "fast"
+    fine = "fine"
     thesis_high = "thesis-high"
     thesis_low_small_dt = "thesis-low-small-dt"
     thesis_low_big_dt = "thesis-low-big-dt"
@@ -73,17 +111,36 @@ class ClothSimulation(Simulation):
 
 
 class ClothRender(Render):
-    """How a cloth is seen: all that its clip depends on besides its trajectory and the build."""
+    """How a cloth is seen: all that its clip depends on besides its trajectory and the build.
 
+    Everything but the texture decides on the trace; clips that differ only in their texture share it.
+    """
+
+    material: str
     texture: Texture
     viewpoint: str
+    lighting: Lighting = Lighting.drawn
+    substrate: Substrate = Substrate.matt
+    creases: float = 0.0
     instants: tuple[int, ...] = Field(description="which instants of the trajectory the frames of the clip show")
     light_seed: Seed
+    crease_seed: Seed
+
+    @property
+    def trace(self) -> dict[str, Any]:
+        """What the trace depends on, as JSON: all but the texture."""
+        return self.model_dump(mode="json", exclude={"texture"})
+
+    @property
+    def variant(self) -> str:
+        """The texture, which no trace depends on."""
+        return self.texture.value
 
 
 class ClothSpec(JobSpec):
     """What the specs of all kinds of cloth have in common."""
 
+    variant_axis = "texture"
     instants: ClassVar[int]
     """How many instants of the motion a trajectory holds."""
     instants_per_second: ClassVar[float]
@@ -104,6 +161,12 @@ class ClothSpec(JobSpec):
         default=True, description="keep the positions of all vertices at all instants, beside the clips"
     )
     quality: Quality = Quality.standard
+    creases: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="strength of the fine creases that the renderer adds; 1 is half a millimetre",
+    )
 
     @property
     def certified_preset(self) -> str:
@@ -133,6 +196,7 @@ class ClothSpec(JobSpec):
             "rig_digest": rig_digest(self.rig),
             "quality": self.quality,
             "instants": self.shown_instants,
+            "creases": self.creases,
         }
 
     def cameras(self) -> tuple[Camera, ...]:
@@ -194,15 +258,33 @@ class ClothSpec(JobSpec):
             ),
             _codes("texture", tuple(Texture)),
             _codes("viewpoint", viewpoints),
-            ArrayLayout("light_seed", "int32", (), (), "seed of the light", fill=-1),
+            _codes("lighting", tuple(Lighting)),
+            _codes("substrate", tuple(Substrate)),
+            ArrayLayout("light_seed", "int32", (), (), "seed of the lamp, the floor and the noise", fill=-1),
             ArrayLayout(
                 "light",
                 "float32",
-                (5,),
+                (3,),
                 ("light",),
-                "azimuth and elevation of the lamp [degree], its power over the nominal, albedo and roughness of the "
-                "floor",
+                "azimuth and elevation of the lamp [degree], its power over the nominal",
                 fill=NAN,
+            ),
+            ArrayLayout(
+                "floor",
+                "float32",
+                (8,),
+                ("floor",),
+                "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)",
+                fill=NAN,
+            ),
+            ArrayLayout("creases", "float32", (), (), "strength of the creases that the renderer added", fill=NAN),
+            ArrayLayout(
+                "frame_share", "float32", (), (), "share of the frame that is cloth, mean of the clip", fill=NAN
+            ),
+            ArrayLayout("visible_share", "float32", (), (), "share of the cloth in sight, mean of the clip", fill=NAN),
+            ArrayLayout("gate_db", "float32", (), (), "image gate: PSNR of means of 4 x 4 pixels [dB]", fill=NAN),
+            ArrayLayout(
+                "composed", "bool", (), (), "false where the gate failed and Cycles rendered directly", fill=False
             ),
         )
 
@@ -243,6 +325,7 @@ class ClothSpec(JobSpec):
     def solver_arrays(self) -> tuple[ArrayLayout, ...]:
         """Return what the solver says of its work."""
         return (
+            _codes("kernel", KERNELS),
             ArrayLayout("steps", "int32", (), (), "time steps of the solver", fill=-1),
             ArrayLayout("unconverged_steps", "int32", (), (), "steps that stopped short of the tolerance", fill=-1),
             ArrayLayout(

@@ -1,5 +1,11 @@
-"""The manifest of a dataset version: what is in it, what it was made from, and how to check it."""
+"""The manifest of a dataset version: what is in it, what it was made from, and how to check it.
 
+Three files vouch for all others and for one another. `manifest.json` has the SHA-256 of every file but these three. The
+attribute `manifest_sha256` of the root's `zarr.json` is that of the manifest. `manifest.sha256` has those of both, in
+the form that `sha256sum --check` reads. So a bit that flips in any of the three shows.
+"""
+
+import json
 from typing import Literal
 
 from pydantic import Field
@@ -7,11 +13,21 @@ from pydantic import Field
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import Camera
-from stickslip_schemas.keys import Sha256
+from stickslip_schemas.keys import Sha256, sha256
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.tasks import FileEntry, Rejection
 
 MANIFEST_NAME = "manifest.json"
+GROUP_NAME = "zarr.json"
+SEAL_NAME = "manifest.sha256"
+SEALED_NAMES = (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
+"""The files of a version that its manifest does not list."""
+
+MANIFEST_ATTRIBUTE = "manifest_sha256"
+
+
+class BrokenSealError(ValueError):
+    """The manifest, the root's metadata and the seal of a version do not fit each other."""
 
 
 class Manifest(Document):
@@ -34,7 +50,10 @@ class Manifest(Document):
     split_counts: dict[str, int] = Field(description="valid samples by split")
     rejections: tuple[Rejection, ...]
     sample_keys: tuple[Sha256, ...] = Field(description="by slot")
-    files: tuple[FileEntry, ...] = Field(description="every file of the version but this one, by path")
+    files: tuple[FileEntry, ...] = Field(
+        description="every file of the version, by path, but the three that vouch for it: this one, the root's "
+        "zarr.json and manifest.sha256"
+    )
 
     @property
     def acceptance_rate(self) -> float:
@@ -43,5 +62,34 @@ class Manifest(Document):
 
     @property
     def size(self) -> int:
-        """Size of all files but the manifest [bytes]."""
+        """Size of all files that it lists [bytes]."""
         return sum(file.size for file in self.files)
+
+
+def seal_text(manifest: Sha256, group: Sha256) -> bytes:
+    """Return the bytes of `manifest.sha256`, from the digests of the manifest and of the root's `zarr.json`."""
+    return f"{manifest}  {MANIFEST_NAME}\n{group}  {GROUP_NAME}\n".encode()
+
+
+def with_manifest_digest(group: bytes, manifest: Sha256) -> bytes:
+    """Return the root's `zarr.json` with the attribute that names the manifest."""
+    document = json.loads(group)
+    document["attributes"] = {**document.get("attributes", {}), MANIFEST_ATTRIBUTE: manifest}
+    return json.dumps(document, indent=2).encode()
+
+
+def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
+    """Return the digest of the manifest; raise BrokenSealError where one of the three files is not as it was made."""
+    digest = sha256(manifest)
+    if seal != seal_text(digest, sha256(group)):
+        raise BrokenSealError(
+            f"{MANIFEST_NAME} has the SHA-256 {digest} and {GROUP_NAME} {sha256(group)}, and {SEAL_NAME} must say so; "
+            f"it says {seal[:200]!r}"
+        )
+    try:
+        named = json.loads(group)["attributes"][MANIFEST_ATTRIBUTE]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BrokenSealError(f"{GROUP_NAME} must have the attribute {MANIFEST_ATTRIBUTE}") from error
+    if named != digest:
+        raise BrokenSealError(f"{MANIFEST_ATTRIBUTE} of {GROUP_NAME} must be {digest}, and it is {named!r}")
+    return digest

@@ -98,6 +98,9 @@ class DatasetVersion(Document):
 
     version: int
     manifest: Sha256
+    group: Sha256 | None = Field(
+        description="of the root's zarr.json, which names the manifest; null: made before versions were sealed"
+    )
     created_at: datetime
     sample_count: int
     valid_count: int

@@ -4,6 +4,7 @@ An artifact is a file named by its SHA-256. It is written beside its place, made
 reader sees all of it or nothing, and two writers of the same bytes cannot disturb each other.
 """
 
+import hashlib
 import os
 import uuid
 from pathlib import Path
@@ -32,12 +33,31 @@ class Store:
         return self.root / "datasets" / dataset / f"v{version}"
 
     def publish(self, data: bytes) -> str:
-        """Make `data` an artifact, durably, and return its digest; a second time costs no write."""
+        """Make `data` an artifact, durably, and return its digest.
+
+        An artifact that is there already is read and compared, and written anew where its bytes have changed.
+        """
         digest = sha256(data)
-        path = self.path(digest)
-        if not path.exists():
-            write_durably(path, data)
+        if not self.holds(digest, size=len(data)):
+            write_durably(self.path(digest), data)
         return digest
+
+    def has(self, digest: str, *, size: int) -> bool:
+        """Tell whether an artifact is there with at least `size` bytes, without reading it."""
+        try:
+            return self.path(digest).stat().st_size >= size
+        except OSError:
+            return False
+
+    def holds(self, digest: str, *, size: int | None = None) -> bool:
+        """Tell whether an artifact is there, of `size` bytes where that is known, with the digest that names it."""
+        try:
+            with self.path(digest).open("rb") as file:
+                if size is not None and os.fstat(file.fileno()).st_size != size:
+                    return False
+                return hashlib.file_digest(file, "sha256").hexdigest() == digest
+        except OSError:
+            return False
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
         """Return an artifact's bytes; a whole artifact is checked against its digest."""
@@ -63,12 +83,15 @@ class Store:
         scratch.unlink(missing_ok=True)  # replace() does nothing where both names are one file already
 
 
-def write_durably(path: Path, data: bytes) -> None:
-    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename, fsync directory."""
+def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:
+    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename, fsync directory.
+
+    `mode` are its permissions, less those that the umask takes away.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = _scratch_path(path)
     try:
-        with scratch.open("wb") as file:
+        with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

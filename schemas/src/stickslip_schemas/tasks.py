@@ -58,21 +58,29 @@ class SimulateOutput(Document):
 
 
 class RenderTask(Document):
-    """Make the pictures of one sample; `preview` asks for a small PNG besides."""
+    """Make the pictures of one sample, or of all samples that share a trace; `preview` asks for small ones, too."""
 
     stage: Literal["render"] = "render"
     render: AnyRender
     record: RecordRef
     preview: bool = False
+    textures: tuple[str, ...] = Field(
+        default=(), description="textures to make clips of, one sample each; none: that of the render document"
+    )
 
 
 class RenderOutput(Document):
-    """Encoded chunks by array name, the digest of the preview PNG if there is one, and labels (colour, ...)."""
+    """Encoded chunks by array name, the digest of the preview if there is one, and labels (colour, ...).
+
+    With `textures` in the task, clips and previews are by texture, and labels are those that all of them share.
+    """
 
     stage: Literal["render"] = "render"
     chunks: dict[str, ChunkRef]
     preview: Sha256 | None = None
     labels: dict[str, Any]
+    clips: dict[str, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
+    previews: dict[str, Sha256] = Field(default_factory=dict)
 
 
 # --- pack and publish -----------------------------------------------------------------------------------------
@@ -140,6 +148,7 @@ class PublishOutput(Document):
 
     stage: Literal["publish"] = "publish"
     manifest: Sha256
+    group: Sha256 = Field(description="of the root's zarr.json, which names the manifest")
     bytes: int = Field(ge=0, description="size of all files of the version")
 
 
@@ -154,6 +163,9 @@ class TaskResult(Document):
     reason: Reason | None = None
     message: str = ""
     output: Output | None = None
+    damaged_inputs: tuple[Sha256, ...] = Field(
+        default=(), description="artifacts that the task needed and that are damaged or not in the store"
+    )
     cpu_seconds: float = Field(default=0.0, ge=0)
     wall_seconds: float = Field(default=0.0, ge=0)
 
@@ -163,6 +175,8 @@ class TaskResult(Document):
             raise ValueError("output is there exactly when the outcome is succeeded")
         if (self.outcome == "succeeded") != (self.reason is None):
             raise ValueError("reason is there exactly when the outcome is not succeeded")
+        if self.outcome != "failed" and self.damaged_inputs:
+            raise ValueError("damaged_inputs are those of a task that has failed")
         if self.outcome == "rejected" and self.reason is not None and not self.reason.is_deterministic:
             raise ValueError(f"a sample is rejected for a reason of its own, and {self.reason} is not one")
         return self
@@ -170,3 +184,15 @@ class TaskResult(Document):
 
 task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = TypeAdapter(Task)
 """Validates and dumps a task of any stage."""
+
+
+def input_digests(task: SimulateTask | RenderTask | PackTask | PublishTask) -> tuple[Sha256, ...]:
+    """Return the artifacts that a task reads."""
+    if isinstance(task, RenderTask):
+        return (task.record.digest,)
+    if isinstance(task, PublishTask):
+        return tuple(dict.fromkeys(file.sha256 for file in task.files))
+    if isinstance(task, SimulateTask):
+        return ()
+    records = [slot.record.digest for slot in task.slots if slot.record is not None]
+    return tuple(dict.fromkeys([*records, *(chunk.digest for slot in task.slots for chunk in slot.chunks.values())]))

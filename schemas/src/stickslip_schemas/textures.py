@@ -14,3 +14,11 @@ class Texture(StrEnum):
     herringbone = "herringbone"
     houndstooth = "houndstooth"
     floral = "floral"
+    argyle = "argyle"
+    camouflage = "camouflage"
+    chevron = "chevron"
+    terrazzo = "terrazzo"
+
+
+HELD_OUT_TEXTURES = (Texture.argyle, Texture.camouflage, Texture.chevron, Texture.terrazzo)
+"""To test with: a network that is to cope with a new texture is not trained with these [thesis, 4.5.1]."""

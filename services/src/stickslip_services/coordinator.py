@@ -13,25 +13,29 @@ import json
 import logging
 import socket
 import sys
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
+from starlette.staticfiles import StaticFiles
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
+from stickslip_services.api.doors import DoorMiddleware, worker_key
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
-from stickslip_services.api.routes import certificates, datasets, health, jobs, tasks, workers
+from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, workers
 from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
+from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 
@@ -49,11 +53,15 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(coordinator.start)
-        sweeper = asyncio.create_task(_sweep_for_ever(coordinator))
+        every = settings.sweep_seconds
+        keepers = [
+            asyncio.create_task(_for_ever(coordinator.sweep, every)),
+            asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+        ]
         yield
-        sweeper.cancel()
-        with suppress(asyncio.CancelledError):
-            await sweeper
+        for keeper in keepers:
+            keeper.cancel()
+        await asyncio.gather(*keepers, return_exceptions=True)
         coordinator.close()
 
     app = FastAPI(
@@ -61,34 +69,39 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         version=__version__,
         description="Physically verified synthetic datasets of slender things.",
         lifespan=lifespan,
-        docs_url="/docs",
+        docs_url=None,
         redoc_url=None,
         openapi_url="/openapi.json",
     )
     app.state.coordinator = coordinator
     app.state.metrics = metrics
-    for module in (jobs, datasets, certificates, tasks, workers, health):
+    app.state.worker_key = worker_key(settings.worker_key_path)
+    for module in (jobs, datasets, certificates, tasks, workers, health, pages):
         app.include_router(module.router)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
+    app.add_middleware(DoorMiddleware, allowed_hosts=settings.allowed_hosts)
     app.add_middleware(RequestIdMiddleware)
     app.add_middleware(TimingMiddleware, observe=metrics.observe)
     return app
 
 
-async def _sweep_for_ever(coordinator: Coordinator) -> None:
+async def _for_ever(work: Callable[[], None], seconds: float) -> None:
+    """Do some work again and again, in a thread, with pauses between."""
     while True:
-        await asyncio.sleep(coordinator.settings.sweep_seconds)
+        await asyncio.sleep(seconds)
         try:
-            await run_in_threadpool(coordinator.sweep)
-        except Exception:  # a full disk, say: the next sweep may find it otherwise
-            logger.exception("the sweep failed")
+            await run_in_threadpool(work)
+        except Exception:  # a full disk, say: the next time it may be otherwise
+            logger.exception("%s failed", work.__name__)
 
 
 def openapi_text() -> str:
     """Return the OpenAPI document as it is committed."""
-    return json.dumps(make_app(Settings()).openapi(), indent=2, sort_keys=True) + "\n"
+    with TemporaryDirectory() as data:
+        return json.dumps(make_app(Settings(data=Path(data))).openapi(), indent=2, sort_keys=True) + "\n"
 
 
 class _Server(uvicorn.Server):

@@ -8,16 +8,21 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
+import numpy as np
 import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES, ArrayLayout
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.chunks import encode_chunk, encode_shard, encode_trajectory
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
@@ -25,12 +30,14 @@ from stickslip_schemas.tasks import (
     ChunkRef,
     FileEntry,
     PackOutput,
+    PackTask,
     PublishOutput,
     PublishTask,
     RecordRef,
     RenderOutput,
     SimulateOutput,
     TaskResult,
+    input_digests,
 )
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -126,6 +133,8 @@ class PretendWorker:
     judge: Callable[[Any], TaskResult | None] = lambda _task: None
     id: str = ""
     ran: list[str] = field(default_factory=list)
+    whole: bool = False
+    """Whether its datasets have all the arrays of their kind, filled with something, and not just two."""
 
     def register(self) -> "PretendWorker":
         """Present itself."""
@@ -178,6 +187,9 @@ class PretendWorker:
         judged = self.judge(task)
         if judged is not None:
             return judged
+        damaged = tuple(digest for digest in input_digests(task) if not self.store.holds(digest))
+        if damaged:
+            return failure(Reason.storage_error, "inputs are damaged").model_copy(update={"damaged_inputs": damaged})
         output: Any
         if task.stage == "simulate":
             digest = self.store.publish(task.model_dump_json().encode())
@@ -186,18 +198,31 @@ class PretendWorker:
             data = task.model_dump_json().encode()
             digest = self.store.publish(data)
             preview = self.store.publish(b"\x89PNG" + data) if task.preview else None
-            chunk = ChunkRef(digest=digest, offset=0, length=len(data))
-            output = RenderOutput(chunks={"views": chunk}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
+            where = ChunkRef(digest=digest, offset=0, length=len(data))
+            output = RenderOutput(chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
+        elif task.stage == "pack" and self.whole:
+            arrays = ((array.shard_path(task.shard), _encoded(array, task)) for array in layout(task.spec))
+            output = PackOutput(
+                files=tuple(
+                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data)) for path, data in arrays
+                )
+            )
         elif task.stage == "pack":
             data = b"".join(slot.sample_key.encode() for slot in task.slots) * 50
             entry = FileEntry(path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data))
-            output = PackOutput(files=(entry,))
+            keys = bytes.fromhex("".join(slot.sample_key for slot in task.slots))
+            chunk = encode_chunk(keys.ljust(task.spec.samples_per_shard * SAMPLE_KEY_BYTES, b"\0"))
+            path = f"sample_key/c/{task.shard}/0"
+            named = FileEntry(path=path, sha256=self.store.publish(chunk), size=len(chunk))
+            output = PackOutput(files=(entry, named))
         else:
             output = self._publish(task)
         return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0)
 
     def _publish(self, task: PublishTask) -> PublishOutput:
-        files = (*task.files, *self._zarr(len(task.sample_keys)))
+        zarr = {file.path: file for file in self._zarr(len(task.sample_keys))}
+        group = self.store.read(zarr.pop(GROUP_NAME).sha256)
+        files = (*task.files, *zarr.values())
         manifest = Manifest(
             dataset=task.dataset,
             version=task.version,
@@ -213,8 +238,15 @@ class PretendWorker:
             sample_keys=task.sample_keys,
             files=tuple(sorted(files, key=lambda file: file.path)),
         )
-        digest = self.store.publish(manifest.model_dump_json().encode())
-        return PublishOutput(manifest=digest, bytes=manifest.size)
+        content = manifest.model_dump_json().encode()
+        digest = self.store.publish(content)
+        group_digest = self.store.publish(with_manifest_digest(group, digest))
+        seal = self.store.publish(seal_text(digest, group_digest))
+        directory = self.store.dataset_path(task.dataset, task.version)
+        own = {MANIFEST_NAME: digest, GROUP_NAME: group_digest, SEAL_NAME: seal}
+        for path, artifact in (own | {file.path: file.sha256 for file in manifest.files}).items():
+            self.store.link(artifact, directory / path)
+        return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size)
 
     def _zarr(self, count: int) -> list[FileEntry]:
         """Return the files of a small Zarr group."""
@@ -235,6 +267,29 @@ class PretendWorker:
         return entries
 
 
+def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
+    """Return the file of an array whose values rise from sample to sample."""
+    size = task.spec.samples_per_shard
+    ramp = np.arange(prod(array.shape)).reshape(array.shape)
+    values = [((ramp + slot.slot) % 251).astype(array.dtype) for slot in task.slots if slot.valid]
+    if array.name == "sample_key":
+        keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]
+        values = keys
+    encode = encode_trajectory if array.is_trajectory else encode_chunk
+    if array.per_sample:
+        rows = iter(values)
+        chunks = [encode(next(rows)) if slot.valid else None for slot in task.slots]
+        return encode_shard([*chunks, *[None] * (size - len(chunks))])
+    if array.name == "valid":
+        values = [np.asarray(slot.valid) for slot in task.slots]
+    elif array.name != "sample_key" and len(values) < len(task.slots):
+        rows = iter(values)
+        values = [next(rows) if slot.valid else np.full(array.shape, array.fill, array.dtype) for slot in task.slots]
+    column = np.full((size, *array.shape), array.fill, dtype=array.dtype)
+    column[: len(values)] = values
+    return encode_chunk(column)
+
+
 @dataclass
 class RunningServer:
     """A coordinator as a process of its own."""
@@ -250,7 +305,8 @@ class RunningServer:
 
     def worker(self, **options: Any) -> PretendWorker:
         """Return a worker that has registered."""
-        return PretendWorker(HttpApi(self.url), self.store, **options).register()
+        key = (self.data / "worker-key").read_text().strip()
+        return PretendWorker(HttpApi(self.url, key), self.store, **options).register()
 
     def stop(self) -> None:
         """Stop it."""
@@ -263,8 +319,9 @@ class RunningServer:
 class HttpApi:
     """The four verbs of the worker API over HTTP."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, key: str) -> None:
         self._url = url
+        self._key = key
 
     def register(self, document: WorkerRegistration) -> WorkerSession:
         """Register a worker."""
@@ -284,6 +341,7 @@ class HttpApi:
 
     def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
         content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
+        headers["Authorization"] = f"Bearer {self._key}"
         response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
         response.raise_for_status()
         return answer.model_validate_json(response.content)

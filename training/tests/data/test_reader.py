@@ -1,12 +1,17 @@
 import os
 import pickle
+import re
+import shutil
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 import pytest
 import zarr
+from stickslip_schemas.keys import sha256
 from stickslip_training.data.errors import (
     CorruptDataError,
+    DatasetError,
     InvalidDatasetError,
     MissingFileError,
     RejectedSampleError,
@@ -63,13 +68,13 @@ def test_reads_into_the_given_buffer_and_no_other(clips):
 
 def test_names_and_slots_are_checked(clips):
     reader = DatasetReader(clips.root)
-    with pytest.raises(ValueError, match="array must be one of video, material"):
+    with pytest.raises(ValueError, match="array must be one of video, texture"):
         reader.read("vdieo", [0])
     with pytest.raises(IndexError, match="slot must be from 0 to 11, and is 12"):
         reader.read("video", [12])
     with pytest.raises(IndexError):
         reader.read("video", [-1])
-    with pytest.raises(ValueError, match="video is no label; the labels are material"):
+    with pytest.raises(ValueError, match="video is no label; the labels are texture"):
         reader.label("video")
 
 
@@ -137,10 +142,12 @@ def test_the_message_about_a_corrupt_chunk_names_array_sample_and_file(clips, tm
     data = bytearray(path.read_bytes())
     data[100] ^= 1
     path.write_bytes(data)
-    reader = DatasetReader(made.root)
+    reader = DatasetReader(made.root, check_shards=False)
     with pytest.raises(CorruptDataError, match=r"array video, sample 0, .*video/c/0/0/0/0/0: the crc32c of the chunk"):
         reader.read("video", [0])
     assert np.array_equal(reader.read("video", [1]), made.arrays["video"][[1]])
+    with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"):
+        DatasetReader(made.root).read("video", [1])
     with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"):
         DatasetReader(made.root, verify=True)
 
@@ -150,7 +157,7 @@ def test_a_truncated_shard_raises(clips, tmp_path, kept):
     made = clips.copy(tmp_path / "v1")
     path = made.root / "video/c/1/0/0/0/0"
     path.write_bytes(path.read_bytes()[:kept])
-    reader = DatasetReader(made.root)
+    reader = DatasetReader(made.root, check_shards=False)
     with pytest.raises(CorruptDataError, match=r"has \d+ bytes, and the manifest says"):
         reader.read("video", [8])
 
@@ -216,12 +223,109 @@ def test_an_uncommitted_directory_is_no_dataset(tmp_path):
         DatasetReader(tmp_path / "nothing")
 
 
+NAMED = re.compile(r"manifest\.json|zarr\.json|manifest\.sha256")
+
+
+def test_no_flipped_bit_in_the_files_that_vouch_for_the_others_is_silent(rods, tmp_path):
+    """2,000 single flips, in each file as many as its share of the bytes, and 100 at least."""
+    made = rods.copy(tmp_path / "v1")
+    paths = [made.root / name for name in ("manifest.json", "zarr.json", "manifest.sha256")]
+    sizes = np.array([path.stat().st_size for path in paths])
+    generator = np.random.default_rng(4)
+    counts = 100 + generator.multinomial(1700, sizes / sizes.sum())
+    silent = []
+    for path, count in zip(paths, counts, strict=True):
+        intact = path.read_bytes()
+        for bit in generator.integers(8 * len(intact), size=count).tolist():
+            damaged = bytearray(intact)
+            damaged[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(damaged)
+            try:
+                DatasetReader(made.root)
+            except DatasetError as error:
+                if NAMED.search(str(error)):
+                    continue
+            silent.append((path.name, bit))
+        path.write_bytes(intact)
+    assert silent == []
+    DatasetReader(made.root)
+
+
+def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
+    """200 swaps: those that chance makes equal in size, and a sample's chunk that is put where another's was."""
+    made = clips.copy(tmp_path / "v1")
+    shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
+    content = {path: path.read_bytes() for path in shards}
+    pairs = [(a, b) for a in shards for b in shards if a < b and content[a] != content[b]]
+    pairs = [(a, b) for a, b in pairs if len(content[a]) == len(content[b])]
+    generator = np.random.default_rng(5)
+    silent = 0
+    for place in generator.integers(len(pairs), size=200):
+        a, b = pairs[place]
+        a.write_bytes(content[b])
+        b.write_bytes(content[a])
+        try:
+            reader = DatasetReader(made.root)
+            for name in reader.arrays:
+                reader.read(name, reader.slots())
+                if name in reader.label_names:
+                    reader.label(name)
+        except CorruptDataError:
+            pass
+        else:
+            silent += 1
+        a.write_bytes(content[a])
+        b.write_bytes(content[b])
+    assert len({path for pair in pairs for path in pair}) > 10
+    assert silent == 0
+
+
+def test_a_sample_that_changed_its_place_in_a_shard_raises(clips, tmp_path):
+    """Every chunk has its checksum, and the file its size: only the manifest knows whose chunk it was."""
+    made = clips.copy(tmp_path / "v1")
+    path = made.root / "video/c/0/0/0/0/0"
+    data, index = path.read_bytes(), -(16 * 8 + 4)
+    places = np.frombuffer(data[index:-4], dtype="<u8").reshape(8, 2).copy()
+    places[[0, 1]] = places[[1, 0]]
+    body = data[:index] + places.tobytes()
+    path.write_bytes(body + google_crc32c.value(places.tobytes()).to_bytes(4, "little"))
+    swapped = DatasetReader(made.root, check_shards=False)
+    assert np.array_equal(swapped.read("video", [0]), made.arrays["video"][[1]])
+    with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256"):
+        DatasetReader(made.root).read("video", [0])
+
+
+def test_a_version_from_before_the_seal_is_refused(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    (made.root / "manifest.sha256").unlink()
+    with pytest.raises(InvalidDatasetError, match=r"manifest.sha256 does not exist: .* Make the dataset again"):
+        DatasetReader(made.root)
+
+
+def test_each_of_the_three_is_checked(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    group, seal_of = made.root / "zarr.json", made.root / "manifest.sha256"
+    other = sha256(b"other")
+    group.write_text(group.read_text().replace(sha256((made.root / "manifest.json").read_bytes()), other))
+    with pytest.raises(CorruptDataError, match=r"zarr.json has SHA-256"):
+        DatasetReader(made.root)
+    lines = [f"{sha256((made.root / name).read_bytes())}  {name}\n" for name in ("manifest.json", "zarr.json")]
+    seal_of.write_text("".join(lines))
+    with pytest.raises(CorruptDataError, match=f"manifest_sha256 must be that of manifest.json, .*, and is {other}"):
+        DatasetReader(made.root)
+    made.seal()
+    seal_of.write_text("".join(lines) + "\n")
+    with pytest.raises(CorruptDataError, match=r"manifest.sha256"):
+        DatasetReader(made.root)
+
+
 # --- contradictions -------------------------------------------------------------------------------------------
 
 
 def test_the_manifest_must_be_one(clips, tmp_path):
     made = clips.copy(tmp_path / "v1")
     (made.root / "manifest.json").write_text("{}")
+    made.seal()
     with pytest.raises(InvalidDatasetError, match="the manifest does not hold to the contract"):
         DatasetReader(made.root)
 
@@ -245,7 +349,10 @@ def test_the_manifest_must_not_contradict_itself_or_the_arrays(clips, tmp_path, 
 def test_the_manifest_of_another_dataset_is_refused(clips, rods, tmp_path):
     made = clips.copy(tmp_path / "v1")
     (made.root / "manifest.json").write_text(rods.manifest.model_dump_json())
-    with pytest.raises(CorruptDataError, match=r"zarr.json has \d+ bytes, and the manifest says"):
+    with pytest.raises(CorruptDataError, match=r"manifest.json has SHA-256 .*, and manifest.sha256 says"):
+        DatasetReader(made.root)
+    shutil.copy(rods.root / "manifest.sha256", made.root)
+    with pytest.raises(CorruptDataError, match=r"zarr.json has SHA-256 .*, and manifest.sha256 says"):
         DatasetReader(made.root)
 
 
@@ -254,16 +361,16 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
     keys = made.manifest.sample_keys
     made.edit_manifest(sample_keys=(keys[1], keys[0], *keys[2:]))
     with pytest.raises(InvalidDatasetError, match=r"sample_key is not what the manifest says of samples \[0, 1\]"):
-        DatasetReader(made.root).label("sample_key")
+        DatasetReader(made.root)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('"zstd"', '"gzip"', "array video: codecs must be"),
-        ('"order": [', '"order": [3, ', "array mesh: codecs must be"),
-        ('"data_type": "int16"', '"data_type": "int32"', "array material: data_type must be"),
-        ('"fill_value": -1', '"fill_value": 0', "array material: fill_value must be -1, and is 0"),
+        ('"order": [', '"order": [3, ', "array positions: codecs must be"),
+        ('"data_type": "int16"', '"data_type": "int32"', "array texture: data_type must be"),
+        ('"fill_value": -1', '"fill_value": 0', "array texture: fill_value must be -1, and is 0"),
         ('"separator": "/"', '"separator": "."', "array video: chunk_key_encoding must be"),
         ('"viewpoint": {', '"view": {', "array viewpoint: there must be metadata, and there are none"),
         ('"node_type": "group"', '"node_type": "array"', "zarr.json must be of a Zarr v3 group"),

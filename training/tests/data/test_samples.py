@@ -52,7 +52,7 @@ def test_a_clip(clips):
     with pytest.raises(ValueError, match="label must be one of material, texture, viewpoint, and is 'mu'"):
         item.name("mu")
     assert item["mu"] == np.float32(0.4)
-    assert item["side"] == clips.arrays["side"][10]
+    assert item["landed_side"] == clips.arrays["landed_side"][10]
     assert "positions" not in item
 
 
@@ -68,11 +68,11 @@ def test_a_clip_with_its_mesh(clips):
 
 
 def test_a_dataset_without_meshes_says_so(make_clips):
-    made = make_clips(store_mesh=False)
+    made = make_clips(store_positions=False)
     assert ClipDataset(made.root)[1]["video"].shape == (2, 224, 224, 3)
-    with pytest.raises(ValueError, match="the dataset has no array mesh; it has video"):
+    with pytest.raises(ValueError, match="the dataset has no array positions; it has video"):
         ClipDataset(made.root, positions=True)
-    with pytest.raises(ValueError, match="the dataset has no rest: it was made with store_mesh: false"):
+    with pytest.raises(ValueError, match="the dataset has no rest: its spec says store_positions: false"):
         ClipDataset(made.root).rest()
 
 

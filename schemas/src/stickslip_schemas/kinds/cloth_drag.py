@@ -3,14 +3,25 @@
 from enum import StrEnum
 from typing import Annotated, Literal
 
+from pydantic import Field
+
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, ListAxis
-from stickslip_schemas.cloth import PHYSICAL_AXES, ClothAxes, ClothRender, ClothSimulation, ClothSpec, TextureAxis
+from stickslip_schemas.cloth import (
+    PHYSICAL_AXES,
+    ClothAxes,
+    ClothRender,
+    ClothSimulation,
+    ClothSpec,
+    LightingAxis,
+    SubstrateAxis,
+    TextureAxis,
+)
 from stickslip_schemas.jobs import SeedRule
 
 
 class Viewpoint(StrEnum):
-    """Cameras of the rig `drag-3`; the first is calibrated on the real stage.
+    """Cameras of the rig `drag`; the first is calibrated on the real stage, and the last twelve are held out.
 
     Their order gives the codes of the label `viewpoint`: add new ones at the end.
     """
@@ -18,6 +29,23 @@ class Viewpoint(StrEnum):
     calibrated = "calibrated"
     left = "left"
     right = "right"
+    azimuth_minus_15 = "azimuth-minus-15"
+    azimuth_minus_10 = "azimuth-minus-10"
+    azimuth_minus_5 = "azimuth-minus-5"
+    azimuth_plus_5 = "azimuth-plus-5"
+    azimuth_plus_10 = "azimuth-plus-10"
+    azimuth_plus_15 = "azimuth-plus-15"
+    elevation_minus_15 = "elevation-minus-15"
+    elevation_minus_10 = "elevation-minus-10"
+    elevation_minus_5 = "elevation-minus-5"
+    elevation_plus_5 = "elevation-plus-5"
+    elevation_plus_10 = "elevation-plus-10"
+    elevation_plus_15 = "elevation-plus-15"
+
+
+TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
+HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)
+"""`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
 
 
 class ClothDragAxes(ClothAxes):
@@ -25,6 +53,8 @@ class ClothDragAxes(ClothAxes):
 
     texture: TextureAxis
     viewpoint: Annotated[ListAxis[Viewpoint], SHORTHAND]
+    lighting: LightingAxis | None = Field(default=None, description="which lamps to draw from; by default `drawn`")
+    substrate: SubstrateAxis | None = Field(default=None, description="finishes of the floor; by default `matt`")
 
 
 class ClothDragSimulation(ClothSimulation):
@@ -46,10 +76,13 @@ class ClothDragSpec(ClothSpec):
     simulation_type = ClothDragSimulation
     render_type = ClothDragRender
     simulation_seeds = (SeedRule("seed", "bias", PHYSICAL_AXES),)
-    render_seeds = (SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint")),)
+    render_seeds = (
+        SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint", "lighting", "substrate")),
+        SeedRule("crease_seed", "creases", PHYSICAL_AXES),
+    )
     instants = 300
     instants_per_second = 2.4
-    rig = "drag-3"
+    rig = "drag"
 
     kind: Literal["cloth_drag"]
     axes: ClothDragAxes
@@ -63,7 +96,10 @@ class ClothDragSpec(ClothSpec):
         return (
             *self.clip_arrays(tuple(Viewpoint)),
             *self.physical_arrays(),
-            ArrayLayout("side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
+            ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
+            ArrayLayout(
+                "landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"
+            ),
             ArrayLayout(
                 "bias",
                 "float64",

@@ -3,12 +3,11 @@
 import json
 from collections.abc import Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Row, select
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, seal_text
 from stickslip_schemas.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import FileEntry
@@ -44,27 +43,30 @@ def find_version(connection: Connection, dataset: str, version: int) -> DatasetV
     raise NotFoundError(f"dataset {dataset} has no version {version}")
 
 
-def find_file(store: Store, manifest: Sha256, dataset: str, version: int, path: str) -> FileEntry:
-    """Return the file at `path` of a version; raise NotFoundError where its manifest names none."""
-    if path == MANIFEST_NAME:
-        return FileEntry(path=path, sha256=manifest, size=_size(store, manifest))
-    digest_and_size = _files(store.path(manifest)).get(path)
-    if digest_and_size is None:
-        raise NotFoundError(f"{dataset}, version {version}, has no file {path[:200]!r}")
-    digest, size = digest_and_size
-    if _size(store, digest) != size:
-        raise MissingArtifactError(f"file {path} of {dataset}, version {version}, is damaged in the store")
-    return FileEntry(path=path, sha256=digest, size=size)
+def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
+    """Return the file at `path` of a version; raise NotFoundError where the version has none."""
+    digests = {MANIFEST_NAME: version.manifest}
+    if version.group is not None:
+        digests[GROUP_NAME] = version.group
+        digests[SEAL_NAME] = sha256(seal_text(version.manifest, version.group))
+    if path in digests:
+        return FileEntry(path=path, sha256=digests[path], size=_size(store, digests[path]))
+    file = _files(store, version.manifest).get(path)
+    if file is None:
+        raise NotFoundError(f"version {version.version} has no file {path[:200]!r}")
+    if _size(store, file.sha256) != file.size:
+        raise MissingArtifactError(f"file {path} of version {version.version} is damaged in the store")
+    return file
 
 
 @lru_cache(maxsize=16)
-def _files(manifest: Path) -> Mapping[str, tuple[Sha256, int]]:
-    """Return digest and size by path; a manifest never changes, so it is read once."""
+def _files(store: Store, manifest: Sha256) -> Mapping[str, FileEntry]:
+    """Return the files of a manifest by path; a manifest never changes, so it is read once."""
     try:
-        document = json.loads(manifest.read_bytes())
+        document = json.loads(store.read(manifest))
     except OSError as error:
-        raise MissingArtifactError(f"the manifest {manifest.name} is not in the store") from error
-    return {file["path"]: (file["sha256"], file["size"]) for file in document["files"]}
+        raise MissingArtifactError(f"the manifest {manifest} is damaged or not in the store") from error
+    return {file["path"]: FileEntry(**file) for file in document["files"]}
 
 
 def _size(store: Store, digest: Sha256) -> int:
@@ -89,6 +91,7 @@ def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) ->
             DatasetVersion(
                 version=version.version,
                 manifest=version.manifest,
+                group=version.group_digest,
                 created_at=as_datetime(version.created_at),
                 sample_count=version.sample_count,
                 valid_count=version.valid_count,

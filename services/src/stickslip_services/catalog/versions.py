@@ -1,13 +1,15 @@
 """Versions as they are made. A version exists when its manifest's digest is in the database, and not before."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from sqlalchemy import Connection, insert, select, update
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.manifest import Manifest
+from sqlalchemy import Connection, func, insert, select, update
+from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal, seal_text
 from stickslip_schemas.responses import DatasetRef
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store
+from stickslip_schemas.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 
 from stickslip_services.database.tables import dataset_versions, datasets
 
@@ -19,6 +21,7 @@ class ManifestSummary:
     dataset: str
     version: int
     manifest: Sha256
+    group: Sha256
     kind: str
     spec_digest: Sha256
     sample_count: int
@@ -35,12 +38,14 @@ class CommittedVersion:
     rejected_count: int
 
 
-def read_version(store: Store, digest: Sha256, size: int) -> ManifestSummary:
+def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     """Read a manifest that a worker says it has published; raise ValueError or OSError where it is not one.
 
     A version whose files are not all there must not come to be, so they are looked for, too.
     """
-    manifest = Manifest.model_validate_json(store.read(digest))
+    content, group = store.read(output.manifest), store.read(output.group)
+    check_seal(content, group, store.read(sha256(seal_text(output.manifest, output.group))))
+    manifest = Manifest.model_validate_json(content)
     if dataset_id(manifest.spec) != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
         raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
     for file in manifest.files:
@@ -49,13 +54,29 @@ def read_version(store: Store, digest: Sha256, size: int) -> ManifestSummary:
     return ManifestSummary(
         dataset=manifest.dataset,
         version=manifest.version,
-        manifest=digest,
+        manifest=output.manifest,
+        group=output.group,
         kind=manifest.spec.kind,
         spec_digest=manifest.spec_digest,
         sample_count=manifest.sample_count,
         valid_count=manifest.valid_count,
-        bytes=size,
+        bytes=output.bytes,
     )
+
+
+def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutput) -> None:
+    """Raise CorruptArtifactError where an artifact that a worker says it has made is not in the store."""
+    named: dict[Sha256, int] = {}
+    if isinstance(output, SimulateOutput):
+        named[output.record.digest] = 1
+    elif isinstance(output, RenderOutput):
+        named |= {chunk.digest: chunk.offset + chunk.length for chunk in output.chunks.values()}
+        named |= {} if output.preview is None else {output.preview: 1}
+    else:
+        named |= {file.sha256: file.size for file in output.files}
+    for digest, size in named.items():
+        if not store.has(digest, size=size):
+            raise CorruptArtifactError(f"artifact {digest} must be in the store with at least {size} bytes")
 
 
 def find_reserved(connection: Connection, publish_task: int) -> tuple[str, int] | None:
@@ -78,7 +99,8 @@ def commit_version(
         .where(dataset_versions.c.publish_task == publish_task)
         .values(
             manifest=summary.manifest,
-            created_at=now,
+            group_digest=summary.group,
+            created_at=func.coalesce(dataset_versions.c.created_at, now),
             sample_count=summary.sample_count,
             valid_count=summary.valid_count,
             bytes=summary.bytes,
@@ -91,3 +113,32 @@ def find_committed(connection: Connection, publish_task: int) -> CommittedVersio
     row = connection.execute(select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)).one()
     reference = DatasetRef(dataset=row.dataset, version=row.version, manifest=row.manifest)
     return CommittedVersion(reference, row.sample_count, row.sample_count - row.valid_count)
+
+
+def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> frozenset[Sha256] | None:
+    """Return the digests of the files of a version that are not whole, in the store or in the version's directory.
+
+    None where the three files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
+    """
+    if group is None:
+        return None
+    seal = sha256(seal_text(manifest, group))
+    try:
+        document = Manifest.model_validate_json(store.read(manifest))
+        check_seal(store.read(manifest), store.read(group), store.read(seal))
+    except (OSError, ValueError):
+        return None
+    directory = store.dataset_path(document.dataset, document.version)
+    own = {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: seal}
+    files = own | {file.path: file.sha256 for file in document.files}
+    return frozenset(digest for path, digest in files.items() if not _is_whole(store, digest, directory / path))
+
+
+def _is_whole(store: Store, digest: Sha256, place: Path) -> bool:
+    """Tell whether an artifact is whole, under its own name and at its place in a version."""
+    try:
+        if not place.samefile(store.path(digest)) and sha256(place.read_bytes()) != digest:
+            return False
+    except OSError:
+        return False
+    return store.holds(digest)

@@ -17,8 +17,19 @@ from typing import Literal
 
 import httpx
 from pydantic import ValidationError
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
+from stickslip_schemas.chunks import CorruptChunkError, decode_chunk
 from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    SEALED_NAMES,
+    BrokenSealError,
+    Manifest,
+    check_seal,
+)
 from stickslip_schemas.store import write_durably
 from stickslip_schemas.tasks import FileEntry
 
@@ -51,7 +62,7 @@ class Fault:
     """What is wrong with a file of a dataset on disk."""
 
     path: str
-    fault: Literal["missing", "size", "sha256", "extra", "manifest"]
+    fault: Literal["missing", "size", "sha256", "extra", "manifest", "seal", "sample_key"]
     detail: str
 
 
@@ -69,14 +80,14 @@ def pull(
     `on_plan` hears how many files and bytes are to come, `on_bytes` of each piece that arrives. The manifest is written
     last: where it is, the dataset is whole.
     """
-    promised = client.version(dataset, version).manifest
-    manifest, content = client.manifest(dataset, version)
-    if sha256(content) != promised:
-        raise DamagedError(f"the manifest of {dataset}, version {version}, has not the digest that was promised")
+    manifest, sealed = _fetch_sealed(client, dataset, version)
     files = [(file, safe_path(target, file.path)) for file in manifest.files]
     target.mkdir(parents=True, exist_ok=True)
     missing = [(file, path) for file, path in files if not _is_whole(path, file)]
-    on_plan(len(missing), sum(file.size for file, _ in missing))
+    changed = {name: content for name, content in sealed.items() if _content(target / name) != content}
+    count = len(missing) + len(changed)
+    size = sum(file.size for file, _ in missing) + sum(map(len, changed.values()))
+    on_plan(count, size)
     root = f"/v1/datasets/{dataset}/versions/{version}/files/"
     stop = threading.Event()
     with ThreadPoolExecutor(CONNECTIONS) as pool:
@@ -88,9 +99,39 @@ def pull(
             stop.set()
             pool.shutdown(cancel_futures=True)
             raise
-    if not (target / MANIFEST_NAME).exists() or (target / MANIFEST_NAME).read_bytes() != content:
-        write_durably(target / MANIFEST_NAME, content)
-    return Pulled(len(files), len(missing), sum(file.size for file, _ in missing))
+    for name, content in changed.items():
+        write_durably(target / name, content)
+        on_bytes(len(content))
+    return Pulled(len(files) + len(sealed), count, size)
+
+
+def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Manifest, dict[str, bytes]]:
+    """Return the manifest, and the bytes of the three files that vouch for a version, the manifest last."""
+    promised = client.version(dataset, version)
+    if promised.group is None:
+        raise DamagedError(
+            f"version {version} of {dataset} was made before versions were sealed, and nothing vouches for its "
+            "manifest: submit its spec again to make a sealed version"
+        )
+    manifest, content = client.manifest(dataset, version)
+    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    group, seal = (client.request("GET", root + name).content for name in (GROUP_NAME, SEAL_NAME))
+    if (sha256(content), sha256(group)) != (promised.manifest, promised.group):
+        raise DamagedError(
+            f"{MANIFEST_NAME} or {GROUP_NAME} of {dataset}, version {version}, has not the digest that was promised"
+        )
+    try:
+        check_seal(content, group, seal)
+    except BrokenSealError as error:
+        raise DamagedError(f"{dataset}, version {version}: {error}") from error
+    return manifest, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content}
+
+
+def _content(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
 
 
 def safe_path(target: Path, path: str) -> Path:
@@ -104,26 +145,56 @@ def safe_path(target: Path, path: str) -> Path:
     whole = target.joinpath(*parts)
     if not whole.resolve().is_relative_to(target.resolve()):
         raise UnsafePathError(f"the file {path!r} would be written outside {target}; nothing was written")
-    if path == MANIFEST_NAME or path.endswith(PART):
+    if path in SEALED_NAMES or path.endswith(PART):
         raise UnsafePathError(f"the manifest names the file {path!r}, a name that is not its to give")
     return whole
 
 
 def verify(target: Path) -> list[Fault]:
     """Return all that is wrong with the dataset in `target`."""
+    sealed: dict[str, bytes] = {}
+    for name in SEALED_NAMES:
+        try:
+            sealed[name] = (target / name).read_bytes()
+        except FileNotFoundError:
+            return [Fault(name, "missing", "not there: no dataset, or a pull that was not finished")]
+        except OSError as error:
+            return [Fault(name, "missing", f"cannot be read: {error.strerror}")]
     try:
-        manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
-    except FileNotFoundError:
-        return [Fault(MANIFEST_NAME, "missing", "not there: no dataset, or a pull that was not finished")]
-    except (OSError, ValidationError) as error:
+        check_seal(*(sealed[name] for name in SEALED_NAMES))
+        manifest = Manifest.model_validate_json(sealed[MANIFEST_NAME])
+    except ValidationError as error:
         return [Fault(MANIFEST_NAME, "manifest", str(error).splitlines()[0])]
+    except BrokenSealError as error:
+        return [Fault(SEAL_NAME, "seal", str(error))]
     named = {file.path: file for file in manifest.files}
     with ThreadPoolExecutor(CONNECTIONS) as pool:
         faults = [fault for fault in pool.map(lambda file: _fault(target, file), manifest.files) if fault is not None]
     for path in _files_below(target):
-        if path not in named and path != MANIFEST_NAME:
+        if path not in named and path not in SEALED_NAMES:
             faults.append(Fault(path, "extra", "not in the manifest"))
+    if not faults:
+        faults = _sample_key_faults(target, manifest)
     return sorted(faults, key=lambda fault: fault.path)
+
+
+def _sample_key_faults(target: Path, manifest: Manifest) -> list[Fault]:
+    """Compare the array `sample_key` with the keys that the manifest lists by slot."""
+    array = next(array for array in layout(manifest.spec) if array.name == "sample_key")
+    size = manifest.spec.samples_per_shard
+    faults = []
+    for shard in range(-(-manifest.sample_count // size)):
+        keys = manifest.sample_keys[shard * size : (shard + 1) * size]
+        path = array.shard_path(shard)
+        try:
+            stored = bytes(decode_chunk((target / path).read_bytes()))
+        except (OSError, CorruptChunkError) as error:
+            faults.append(Fault(path, "sample_key", str(error)))
+            continue
+        if stored[: len(keys) * SAMPLE_KEY_BYTES] != bytes.fromhex("".join(keys)):
+            slots = f"slots {shard * size} to {shard * size + len(keys) - 1}"
+            faults.append(Fault(path, "sample_key", f"{slots} have other keys than the manifest says"))
+    return faults
 
 
 def _fault(target: Path, file: FileEntry) -> Fault | None:

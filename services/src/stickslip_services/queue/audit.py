@@ -49,8 +49,8 @@ def _task_faults(connection: Connection) -> list[str]:
             faults.append(f"task {row.seq} is {row.state} and charged to a job that is not live")
         if row.state == TaskState.pending and row.seq in runnable_tasks and row.job not in runnable_jobs:
             faults.append(f"task {row.seq} is pending for a job that may run and charged to one that may not")
-        if (row.state == TaskState.succeeded) != (row.output is not None):
-            faults.append(f"task {row.seq} is {row.state} and its output says otherwise")
+        if row.state == TaskState.succeeded and row.output is None:
+            faults.append(f"task {row.seq} has succeeded and has no output")
         if (row.state == TaskState.soft_failed) != (row.retry_at is not None):
             faults.append(f"task {row.seq} is {row.state} and its retry says otherwise")
         if held and row.waiting_on:
@@ -115,7 +115,7 @@ def _job_faults(connection: Connection) -> list[str]:
     for row in connection.execute(
         select(dataset_versions.c.manifest, tasks.c.state).join(tasks, tasks.c.seq == dataset_versions.c.publish_task)
     ):
-        if (row.manifest is not None) != (row.state == TaskState.succeeded):
+        if row.manifest is None and row.state == TaskState.succeeded:
             faults.append(f"a version with the manifest {row.manifest} has a publish task that is {row.state}")
     return faults
 

@@ -12,11 +12,11 @@ from stickslip_schemas.builds import Builds
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.layout import layout
+from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import PublishOutput, TaskResult
+from stickslip_schemas.tasks import PublishOutput
 from stickslip_schemas.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -30,7 +30,7 @@ from stickslip_schemas.worker_api import (
 )
 
 from stickslip_services.catalog.certificates import insert_certificate, store_certificate
-from stickslip_services.catalog.versions import ManifestSummary, read_version
+from stickslip_services.catalog.versions import ManifestSummary, check_output, damaged_files, read_version
 from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
@@ -53,6 +53,7 @@ from stickslip_services.queue.jobs import (
 from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
 from stickslip_services.queue.ledger import Ledger
 from stickslip_services.queue.planning import Plan, collector_at_rest, expand
+from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.stranded import find_stranded, note_stranded
@@ -70,6 +71,9 @@ from stickslip_services.settings import Settings
 
 _NO_BUILDS = Builds(**dict.fromkeys(Builds.model_fields, "0" * 64))
 """Stands in where simulations are only counted."""
+
+CHECKED_AT_ONCE = 64 * 2**20
+"""The largest dataset that is checked while the request that asks for it again waits [bytes]."""
 
 BUSY_POLL_SECONDS = 0.2
 IDLE_POLL_SECONDS = 1.0
@@ -122,7 +126,7 @@ class Coordinator:
             sample_count=spec.sample_count,
             simulation_count=plan.simulation_count,
             cached_count=cached,
-            bytes_estimate=spec.sample_count * sum(array.sample_bytes for array in layout(spec)),
+            bytes_estimate=bytes_estimate(spec),
             certificate=plan.certificate,
         )
 
@@ -153,6 +157,7 @@ class Coordinator:
                 if idempotency_key:
                     keep_replay(connection, idempotency_key, print_, job, shown.model_dump_json(), now)
             self.bell.ring()
+            self.check_made_datasets(at_most=CHECKED_AT_ONCE)
             return shown
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -231,29 +236,29 @@ class Coordinator:
         """Take results in."""
         worker = self._meet(batch.worker_id)
         versions: dict[str, ManifestSummary] = {}
-        reports = [self._with_manifest(report, versions) for report in batch.reports]
+        reports = [self._checked(report, versions) for report in batch.reports]
         with self._book() as book:
             taken = take_reports(book, worker.id, reports, versions)
             give_back(book, taken.released)
             fail_tries(book, taken.failures, self.settings)
+            for task, digests in taken.damaged:
+                make_again(book, task, digests)
         return ReportAnswer(verdicts=taken.verdicts)
 
-    def _with_manifest(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:
-        """Read the manifest that a publish report names; a report whose manifest does not hold is a failure."""
-        if report.result is None or not isinstance(report.result.output, PublishOutput):
+    def _checked(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:
+        """Return the report, or a failure where the store does not have what it says; read manifests on the way."""
+        if report.result is None or report.result.output is None:
             return report
         output = report.result.output
         try:
-            versions[report.task_id] = read_version(self.store, output.manifest, output.bytes)
+            if isinstance(output, PublishOutput):
+                versions[report.task_id] = read_version(self.store, output)
+            else:
+                check_output(self.store, output)
         except (OSError, ValueError) as error:
-            failure = TaskResult(
-                outcome="failed",
-                reason=Reason.storage_error,
-                message=f"the published manifest {output.manifest} does not hold: {error}"[:2000],
-                cpu_seconds=report.result.cpu_seconds,
-                wall_seconds=report.result.wall_seconds,
-            )
-            return report.model_copy(update={"result": failure})
+            message = f"the result does not hold: {error}"[:2000]
+            update = {"outcome": "failed", "reason": Reason.storage_error, "message": message, "output": None}
+            return report.model_copy(update={"result": report.result.model_copy(update=update)})
         return report
 
     def _meet(self, worker_id: str) -> RegisteredWorker:
@@ -272,6 +277,20 @@ class Coordinator:
         """Take back expired leases, let due retries go on, and let jobs that nobody serves say so."""
         self._take_back()
         self._note_stranded()
+        self.check_made_datasets(at_most=CHECKED_AT_ONCE)
+
+    def check_made_datasets(self, *, at_most: int | None = None) -> None:
+        """Check the datasets that jobs found made before; where a file is damaged or lost, it is made again.
+
+        Datasets of more than `at_most` bytes are left for a call without it: it reads all of them.
+        """
+        with self.database.read() as connection:
+            found = made_jobs(connection)
+        for made in found:
+            if at_most is None or made.bytes <= at_most:
+                damaged = damaged_files(self.store, made.manifest, made.group)
+                with self._book() as book:
+                    end_made(book, made, damaged)
 
     def _take_back(self) -> None:
         with self.database.read() as connection:

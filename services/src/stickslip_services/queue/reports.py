@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
-from sqlalchemy import bindparam, insert, select, update
+from sqlalchemy import bindparam, delete, insert, select, update
 from stickslip_schemas.events import TaskStateEvent
+from stickslip_schemas.keys import Sha256
 from stickslip_schemas.states import Reason, Stage, TaskState
 from stickslip_schemas.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.worker_api import Report, ReportVerdict
@@ -50,6 +51,8 @@ class Taken:
     verdicts: tuple[ReportVerdict, ...]
     released: tuple[HeldTask, ...]
     failures: tuple[tuple[HeldTask, Reason, str], ...]
+    damaged: tuple[tuple[int, tuple[Sha256, ...]], ...]
+    """Of failed tasks, the inputs that were damaged or missing."""
 
 
 def take_reports(
@@ -85,7 +88,8 @@ def take_reports(
             .values(reported_by=worker_id, reported_token=tasks.c.token)
         )
     failures = _take_results(book, ended, versions)
-    return Taken(tuple(verdicts), tuple(released), failures)
+    damaged = tuple((end.task.seq, end.result.damaged_inputs) for end in ended if end.result.damaged_inputs)
+    return Taken(tuple(verdicts), tuple(released), failures, damaged)
 
 
 def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
@@ -154,6 +158,7 @@ def _take_results(
     for end in settled:
         output = end.result.output
         if isinstance(output, RenderOutput) and output.preview is not None:
+            book.connection.execute(delete(previews).where(previews.c.task == end.task.seq))  # of an earlier run
             book.connection.execute(insert(previews).values(task=end.task.seq, digest=output.preview))
         elif isinstance(output, PublishOutput):
             _commit(book, end.task.seq, versions[task_id(end.task.stage, end.task.key)])

@@ -7,14 +7,12 @@ wait for it, where it failed or was cancelled the new job starts it again.
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
-from stickslip_services.catalog.versions import find_committed
 from stickslip_services.database.database import batches, insert_rows
 from stickslip_services.database.tables import (
     job_counts,
@@ -27,7 +25,7 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import Ending, Ledger, charge_waiting_tasks
+from stickslip_services.queue.ledger import Ledger, charge_waiting_tasks
 from stickslip_services.queue.planning import Plan
 from stickslip_services.queue.workers import NO_WORKER
 
@@ -58,7 +56,7 @@ def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None) -> int:
 
 
 def plan_job(book: Ledger, job: int, plan: Plan) -> None:
-    """Write the tasks of a job; if all of it is there already, the job ends here."""
+    """Write the tasks of a job. If its dataset was made before, it ends once that has been checked (`reopening`)."""
     last = _insert_plan(book, job, plan)
     publish_task = book.connection.scalar(select(tasks.c.seq).where(tasks.c.key == plan.publish_key))
     book.connection.execute(
@@ -66,12 +64,8 @@ def plan_job(book: Ledger, job: int, plan: Plan) -> None:
         .where(jobs.c.seq == job)
         .values(builds=plan.builds.model_dump_json(), publish_task=publish_task, reason=None, message="")
     )
-    if last is TaskState.succeeded and publish_task is not None:
-        version = find_committed(book.connection, publish_task)
-        ending = Ending.published(
-            version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
-        )
-        book.end_job(job, replace(ending, message=ending.message or "all of it was there already"))
+    if last is TaskState.succeeded:
+        set_job_state(book.connection, job, JobState.queued, book.now, message="all of it was made before: checking it")
         return
     charge_waiting_tasks(book.connection, job)  # tasks that it shares with paused jobs run for this one
     if _has_started_tasks(book.connection, job):

@@ -2,6 +2,7 @@
 
 import typer
 
+from stickslip_training.cli.cloth import cloth
 from stickslip_training.cli.datasets import info
 from stickslip_training.cli.reconstruct import reconstruct
 from stickslip_training.cli.rods import curvature, local_global
@@ -11,3 +12,4 @@ app.command()(info)
 app.command()(curvature)
 app.command("local-global")(local_global)
 app.command()(reconstruct)
+app.add_typer(cloth, name="cloth")

@@ -37,6 +37,7 @@ from stickslip_training.data.errors import (
     RejectedSampleError,
 )
 from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
+from stickslip_training.data.seal import read_sealed
 from stickslip_training.data.sources import open_source
 
 Split = Literal["train", "validation", "test"]
@@ -52,13 +53,18 @@ class DatasetReader:
         *,
         api_key: str | None = None,
         verify: bool = False,
+        check_shards: bool = True,
         cache_bytes: int = 256 * 2**20,
     ) -> None:
         """Open `source`: the directory of a version, or its URL (see `sources.HttpSource`).
 
-        `verify` checks the SHA-256 of every file first. Curves and labels come many samples to a chunk; decoded
-        chunks of curves are kept up to `cache_bytes`.
+        The manifest and the metadata are checked against their digests here. A file that is read whole is checked
+        when it is read, a shard in a directory before the first of its samples is; `check_shards=False` leaves the
+        latter out. Over HTTP, samples are parts of shards, and only `verify` checks them against the manifest: it
+        reads every file first. Curves and labels come many samples to a chunk; decoded chunks of curves are kept up
+        to `cache_bytes`.
         """
+        self._check_shards = check_shards
         self.source = open_source(source, api_key=api_key)
         try:
             self._open(cache_bytes, verify)
@@ -67,9 +73,8 @@ class DatasetReader:
             raise
 
     def _open(self, cache_bytes: int, verify: bool) -> None:
-        manifest = self.source.read_manifest()
+        self.manifest_digest, self._group, manifest = read_sealed(self.source)
         self.manifest = _parse_manifest(manifest)
-        self.manifest_digest = sha256(manifest)
         self.arrays: dict[str, ArrayLayout] = {array.name: array for array in layout(self.spec)}
         self._files = {file.path: file for file in self.manifest.files}
         self._shard_size = self.spec.samples_per_shard
@@ -184,7 +189,7 @@ class DatasetReader:
                 out[place] = self._group_chunk(array, shard)[position]
 
     def verify(self) -> None:
-        """Check the size and the SHA-256 of every file of the manifest."""
+        """Check the size and the SHA-256 of every file of the manifest; the others were checked when it was opened."""
         for file in self.manifest.files:
             if ".." in file.path.split("/"):
                 raise InvalidDatasetError(f"the manifest names {file.path}, which is not inside the dataset")
@@ -207,6 +212,8 @@ class DatasetReader:
     def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
         key = array.name, shard
         if key not in self._indexes:
+            if self._check_shards:
+                self._check_file(file)
             size = shard_index_size(self._shard_size)
             if size > file.size:
                 raise CorruptDataError(f"array {array.name}: {self._at(file)} is too short for a shard index")
@@ -234,7 +241,9 @@ class DatasetReader:
         first, end = shard * self._shard_size, min((shard + 1) * self._shard_size, len(self))
         file = self._file(array.shard_path(shard), f"array {array.name}, samples {first} to {end - 1}")
         out = np.empty((self._shard_size, *array.shape), dtype=array.dtype)
-        _decode(self.source.read(file), out, f"array {array.name}, samples {first} to {end - 1}, {self._at(file)}")
+        data = self.source.read(file)
+        self._check_digest(file, data)
+        _decode(data, out, f"array {array.name}, samples {first} to {end - 1}, {self._at(file)}")
         return out
 
     def _at(self, file: FileEntry) -> str:
@@ -263,8 +272,7 @@ class DatasetReader:
 
     def _check_metadata(self) -> None:
         """Check the Zarr metadata against the layout, and their digests against the manifest."""
-        group = self._read_metadata(GROUP_METADATA)
-        inline = consolidated(group)
+        inline = consolidated(self._group)
         for name, array in self.arrays.items():
             found = self._read_metadata(f"{name}/{GROUP_METADATA}") if inline is None else inline.get(name)
             check_array(found, array, sample_count=len(self), samples_per_shard=self._shard_size)
@@ -275,13 +283,20 @@ class DatasetReader:
         self._check_digest(file, data)
         return parse_metadata(data, self._at(file))
 
+    def _check_file(self, file: FileEntry) -> None:
+        """Check the SHA-256 of a file of which only a part will be read."""
+        self._compare(file, self.source.digest(file))
+
     def _check_digest(self, file: FileEntry, data: bytes) -> None:
-        digest = sha256(data)
-        if digest != file.sha256:
+        self._compare(file, sha256(data))
+
+    def _compare(self, file: FileEntry, digest: str | None) -> None:
+        if digest is not None and digest != file.sha256:
             raise CorruptDataError(f"{self._at(file)} has SHA-256 {digest}, and the manifest says {file.sha256}")
 
     def _check_slots(self) -> None:
         """Check that the manifest and the arrays `valid`, `split` and `sample_key` tell one story."""
+        self.label("sample_key")
         rejected = sorted(item.slot for item in self.manifest.rejections)
         if np.flatnonzero(~self.valid).tolist() != rejected:
             raise InvalidDatasetError(f"array valid must be false at the manifest's rejections, which are {rejected}")

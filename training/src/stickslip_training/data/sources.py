@@ -4,6 +4,7 @@ A source keeps nothing open that two processes could fight over: a directory is 
 read, and an HTTP client belongs to the process that made it. So a source can be pickled and survives a fork.
 """
 
+import hashlib
 import os
 import re
 import time
@@ -24,6 +25,14 @@ class Source(Protocol):
 
     def read_manifest(self) -> bytes:
         """Return the manifest's bytes."""
+        ...
+
+    def read_unlisted(self, name: str) -> bytes:
+        """Return all bytes of a file that the manifest does not list."""
+        ...
+
+    def digest(self, file: FileEntry) -> str | None:
+        """Return the SHA-256 of the file; None where that would mean to fetch all of it."""
         ...
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
@@ -59,6 +68,22 @@ class DirectorySource:
             return path.read_bytes()
         except (FileNotFoundError, NotADirectoryError):
             raise MissingFileError(f"{path} is not there: this is no committed dataset version") from None
+
+    def read_unlisted(self, name: str) -> bytes:
+        """Return all bytes of a file that the manifest does not list."""
+        path = Path(self._root, name)
+        try:
+            return path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError):
+            raise MissingFileError(f"{path} does not exist") from None
+
+    def digest(self, file: FileEntry) -> str | None:
+        """Return the SHA-256 of the file."""
+        try:
+            with Path(self._root, file.path).open("rb", buffering=0) as opened:
+                return hashlib.file_digest(opened, "sha256").hexdigest()
+        except (FileNotFoundError, NotADirectoryError):
+            raise MissingFileError(f"{self._root}/{file.path} is not there, and the manifest says it is") from None
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
         """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
@@ -121,6 +146,20 @@ class HttpSource:
             if response.status_code != 404:
                 raise SourceError(f"{url} answered {response.status_code}, and 200 was expected")
         raise MissingFileError(f"{' and '.join(self._manifests)} answered 404: this is no committed dataset version")
+
+    def read_unlisted(self, name: str) -> bytes:
+        """Return all bytes of a file that the manifest does not list."""
+        url = f"{self._files}/{name}"
+        response = self._get(url, {})
+        if response.status_code == 404:
+            raise MissingFileError(f"{url} does not exist")
+        if response.status_code != 200:
+            raise SourceError(f"{url} answered {response.status_code}, and 200 was expected")
+        return bytes(response.content)
+
+    def digest(self, file: FileEntry) -> str | None:
+        """Return None: a shard is not fetched whole for the sake of one sample."""
+        return None
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
         """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import metadata
 
 from stickslip_schemas.keys import content_key
 from stickslip_schemas.sources import digests, sources
 
 from stickslip_blender.blender import import_bpy
+from stickslip_blender.raster._raster import BUILD_HASH
 
 CUT = ("stickslip_schemas.kinds",)
 """The list of kinds decides on nothing by itself; the documents it leads to are in the content keys as a whole."""
@@ -28,10 +30,16 @@ def roots(kind: str) -> tuple[str, ...]:
 
 def build_digest(kind: str) -> str:
     """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
+    files = sources(roots(kind), cut=CUT)
     content = {
         "kind": kind,
-        "sources": digests(sources(roots(kind), cut=CUT)),
+        "sources": digests(files),
+        "raster": BUILD_HASH if _uses_raster(files) else None,
         "libraries": {library: metadata.version(library) for library in _LIBRARIES},
         **blender_version(),
     }
     return content_key("build/render", content)
+
+
+def _uses_raster(files: Iterable[str]) -> bool:
+    return any(file.startswith("stickslip_blender/raster/") for file in files)

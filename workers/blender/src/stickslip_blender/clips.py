@@ -1,41 +1,230 @@
-"""Clips of cloth: from a render task to a result, for every scene of cloth."""
+"""Clips of cloth: from a render task to a result, for every scene of cloth.
+
+One trace serves all textures (`stickslip_blender.multiplexed`) where an image gate finds it good enough. The gate
+renders one frame directly, with one texture, and compares means of 4 x 4 pixels: they have little sampling noise left,
+and all that is wrong with the composition. Where it fails, every clip is rendered directly.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import astuple
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from stickslip_schemas.cameras import load_rig
+import numpy.typing as npt
+from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.chunks import decode_chunk, encode_chunk
+from stickslip_schemas.keys import content_key
+from stickslip_schemas.tasks import RenderOutput, TaskResult
+from stickslip_schemas.textures import Texture
 
-from stickslip_blender.cloth import ClothRenderer, Light
+from stickslip_blender.build import build_digest
+from stickslip_blender.engine import CLOTH_SAMPLING, ClothSampling, Sampling
+from stickslip_blender.geometry import FLOOR, Geometry, Set
+from stickslip_blender.lights import drawn_light
+from stickslip_blender.looks import Look, grained, look_of
+from stickslip_blender.multiplexed import encode
+from stickslip_blender.preview import moving
+from stickslip_blender.raster import Textures
+from stickslip_blender.stage import ClothStage, Shot
+from stickslip_blender.substrates import drawn_substrate, floor_factor
+from stickslip_blender.textures import texture_image
 from stickslip_blender.workshop import Workshop, why_unfit
 
 if TYPE_CHECKING:
     from stickslip_schemas.cloth import ClothRender
-    from stickslip_schemas.tasks import RenderTask, TaskResult
+    from stickslip_schemas.tasks import RenderTask
 
-PREVIEW_FRAMES = 6
-"""Frames of a clip that its preview shows, side by side."""
+GATE = 32.0
+"""What composed pictures have to reach against direct ones, in means of 4 x 4 pixels of 8-bit sRGB [dB]."""
+GATE_TEXTURE = Texture.floral
+"""Of the gate: with dark, light and saturated places."""
+_GATE_SAMPLES = 16
+_BLOCK = 4
+
+_KEPT_TRACES = 4
+"""Traces that a process keeps: 9 MB each at 30 frames."""
+
+Clip = npt.NDArray[np.uint8]
 
 
-def render_clip(
-    look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[..., ClothRenderer]
+@dataclass(frozen=True)
+class Trace:
+    """The light of one clip, for all textures."""
+
+    light: npt.NDArray[np.float16]
+    """Linear, at the albedos of `multiplexed.ALBEDOS`, shape (frames, height, width, 3)."""
+    gate_db: float
+    """What the gate found [dB]; it fails below `GATE`."""
+
+    @property
+    def composed(self) -> bool:
+        """Whether pictures may be composed of it."""
+        return self.gate_db >= GATE
+
+
+class ClothRenderer:
+    """A stage with a cloth of one mesh, built once; everything but the mesh may change between clips."""
+
+    def __init__(
+        self, triangles: npt.ArrayLike, rest: npt.ArrayLike, make: Callable[[Any], Set], scratch: str | None = None
+    ) -> None:
+        """Build the stage that `make` makes of a rest shape (V, 2) [m], with a mesh of triangles (T, 3)."""
+        self.geometry = Geometry(triangles, rest, make(rest))
+        self.stage = ClothStage(self.geometry, scratch=scratch)
+
+    def close(self) -> None:
+        """Let go of what the stage holds outside Blender."""
+        self.stage.close()
+
+    def clip(
+        self, look: ClothRender, camera: Camera, positions: npt.ArrayLike, *, sampling: ClothSampling | None = None
+    ) -> ClipRenderer:
+        """Set the stage for a clip of positions (frames, V', 3) [m], at the instants that `look` names."""
+        track = self.geometry.checked(positions)
+        fabric = look_of(look.material)
+        self.geometry.surface.dress(hem=1e-3 * fabric.hem, creases=look.creases, seed=look.crease_seed)
+        light = drawn_light(look.lighting.value, look.light_seed)
+        substrate = drawn_substrate(look.substrate.value, look.light_seed)
+        self.stage.set_up(camera, light, substrate, fabric)
+        shots = [self.stage.shot(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
+        floor = floor_factor(substrate, camera, FLOOR)
+        chosen = CLOTH_SAMPLING[look.quality] if sampling is None else sampling
+        labels = {
+            "light_seed": look.light_seed,
+            "light": light.numbers,
+            "floor": substrate.numbers,
+            "lighting": look.lighting.value,
+            "substrate": look.substrate.value,
+            "creases": look.creases,
+        }
+        return ClipRenderer(self.stage, camera, shots, floor, fabric, chosen, look.light_seed, labels)
+
+
+@dataclass(frozen=True)
+class ClipRenderer:
+    """One clip on its stage."""
+
+    stage: ClothStage
+    camera: Camera
+    shots: Sequence[Shot]
+    floor: npt.NDArray[np.float32]
+    fabric: Look
+    sampling: ClothSampling
+    seed: int
+    labels: dict[str, Any]
+
+    def trace(self) -> Trace:
+        """Trace all frames once, and try on the middle one what composing makes of it."""
+        light = np.stack([self.stage.trace(shot, self.sampling, self.seed) for shot in self.shots])
+        middle = len(self.shots) // 2
+        return Trace(light, self._gate(self.shots[middle], light[middle]))
+
+    def _gate(self, shot: Shot, light: npt.NDArray[np.float16]) -> float:
+        picture = grained(texture_image(GATE_TEXTURE), self.fabric)
+        window = self.stage.window(shot)
+        whole = np.zeros(light.shape, dtype=np.float16)
+        whole[window.slices] = self.stage.direct(shot, picture, Sampling(_GATE_SAMPLES, "fast", self.seed + 1), window)
+        direct = self._finished(whole, shot)[window.slices]
+        (composed,) = self._composed(light, shot, Textures([picture])).pictures
+        return block_decibels(composed[window.slices], direct)
+
+    def clips(self, trace: Trace, textures: Sequence[Texture]) -> tuple[Clip, dict[str, Any]]:
+        """Return the clips of textures (textures, frames, height, width, 3), and labels that they share."""
+        pictures = [grained(texture_image(texture), self.fabric) for texture in textures]
+        packed = Textures(pictures)
+        frames, in_frame, in_sight = [], [], []
+        for shot, light in zip(self.shots, trace.light, strict=True):
+            composed = self._composed(light, shot, packed)
+            in_frame.append(composed.frame_share)
+            in_sight.append(composed.visible_share)
+            frames.append(composed.pictures if trace.composed else np.stack(list(self._direct(shot, pictures))))
+        labels = self.labels | {
+            "frame_share": float(np.mean(in_frame)),
+            "visible_share": float(np.mean(in_sight)),
+            "gate_db": trace.gate_db,
+            "composed": trace.composed,
+        }
+        return np.stack(frames, axis=1), labels
+
+    def _composed(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures) -> Any:
+        return self.stage.composer.compose(light, shot.points, self.camera, self.stage.substrate, self.floor, textures)
+
+    def _direct(self, shot: Shot, pictures: Sequence[Clip]) -> Iterator[Clip]:
+        for picture in pictures:
+            yield self._finished(
+                self.stage.direct(shot, picture, Sampling(self.sampling.window, "fast", self.seed)), shot
+            )
+
+    def _finished(self, light: npt.NDArray[np.float16], shot: Shot) -> Clip:
+        return encode(self.stage.composer.on_floor(light, shot.points, self.camera, self.floor))
+
+
+def block_decibels(one: Clip, other: Clip) -> float:
+    """Return the PSNR between the means of 4 x 4 pixels of two pictures (height, width, 3)."""
+    rows, columns = (size // _BLOCK * _BLOCK for size in one.shape[:2])
+    difference = one[:rows, :columns].astype(np.float64) - other[:rows, :columns]
+    blocks = difference.reshape(rows // _BLOCK, _BLOCK, columns // _BLOCK, _BLOCK, 3).mean(axis=(1, 3))
+    return float(10.0 * np.log10(255.0**2 / max(float((blocks**2).mean()), 1e-3)))
+
+
+def render_clips(
+    look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set], *, set_key: object = None
 ) -> TaskResult:
-    """Render a clip with the renderer that `make` builds."""
+    """Render the clips of a task on the stage that `make` makes of a rest shape.
+
+    `set_key` says what else the stage depends on.
+    """
     (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
     track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")
     if rejected := why_unfit("cloth", track, 0.0, (camera,)):
         return rejected
-    mesh = triangles.tobytes(), rest.tobytes()
     renderer = workshop.renderer(
-        (look.kind, look.quality, mesh),
-        lambda: make(triangles, rest, quality=look.quality, scratch=workshop.scratch),
+        (look.kind, set_key, triangles.tobytes(), rest.tobytes()),
+        lambda: ClothRenderer(triangles, rest, make, workshop.scratch),
     )
-    light = Light.drawn(look.light_seed)
-    shown = track[list(look.instants)]
-    video = renderer.render(shown, camera, texture=look.texture, light=light, instants=look.instants)
-    few = video[np.linspace(0, len(video) - 1, min(PREVIEW_FRAMES, len(video))).round().astype(int)]
-    labels = {"light_seed": look.light_seed, "light": list(astuple(light))}
-    return workshop.rendered("video", video, few if task.preview else None, labels)
+    clip = renderer.clip(look, camera, track[list(look.instants)])
+    trace = _trace(clip, look, task, workshop)
+    wanted = [Texture(name) for name in task.textures] or [look.texture]
+    videos, labels = clip.clips(trace, wanted)
+    if not task.textures:
+        return workshop.rendered("video", videos[0], moving(videos[0]) if task.preview else None, labels)
+    output = RenderOutput(
+        chunks={},
+        labels=labels,
+        clips={texture: workshop.chunk(video) for texture, video in zip(wanted, videos, strict=True)},
+        previews={texture: workshop.store.publish(moving(video)) for texture, video in zip(wanted, videos, strict=True)}
+        if task.preview
+        else {},
+    )
+    return TaskResult(outcome="succeeded", output=output)
+
+
+def _trace(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Trace:
+    """Return the trace of a clip: one that was made before, if it is still kept, or a new one."""
+    shared = {"record": task.record.model_dump(), "look": look.trace, "build": build_digest(look.kind)}
+    key = content_key("trace", shared)
+    kept = workshop.traces
+    if key not in kept:
+        stored = workshop.kept_trace(key)
+        if stored is None:
+            kept[key] = clip.trace()
+            workshop.keep_trace(key, _packed(kept[key]))
+        else:
+            kept[key] = _unpacked(stored, (len(clip.shots), clip.camera.height, clip.camera.width, 3))
+        while len(kept) > _KEPT_TRACES:
+            kept.popitem(last=False)
+    kept.move_to_end(key)
+    return kept[key]
+
+
+def _packed(trace: Trace) -> bytes:
+    """Return a trace as bytes: the gate's verdict, and the light."""
+    return np.float64(trace.gate_db).tobytes() + encode_chunk(trace.light)
+
+
+def _unpacked(data: bytes, shape: tuple[int, ...]) -> Trace:
+    light = np.empty(shape, dtype=np.float16)
+    decode_chunk(data[8:], light)
+    return Trace(light, float(np.frombuffer(data[:8])[0]))

@@ -24,15 +24,29 @@ class Sampling:
     """Of the sampling noise, the same for every frame: what is left of it does not flicker, and clips compress."""
 
 
+@dataclass(frozen=True)
+class ClothSampling:
+    """What a quality means to a clip of cloth, whose light is denoised."""
+
+    frame: int
+    """Paths per pixel in the whole frame."""
+    window: int
+    """Paths per pixel in the window that the cloth is in."""
+
+
 # Frozen: a change makes other pictures, and the build digest says so. benchmarks/render_rods.py measures them.
 SAMPLING = {
+    Quality.preview: Sampling(samples=4),
     Quality.draft: Sampling(samples=8),
     Quality.standard: Sampling(samples=32),
+    Quality.high: Sampling(samples=128),
 }
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
 CLOTH_SAMPLING = {
-    Quality.draft: Sampling(samples=8, denoiser="fast"),
-    Quality.standard: Sampling(samples=16, denoiser="fast"),
+    Quality.preview: ClothSampling(frame=1, window=3),
+    Quality.draft: ClothSampling(frame=2, window=8),
+    Quality.standard: ClothSampling(frame=2, window=16),
+    Quality.high: ClothSampling(frame=8, window=64),
 }
 REFERENCE = Sampling(samples=256, seed=1)
 """What pictures are compared with; its seed is another, so that it shares no noise with them."""

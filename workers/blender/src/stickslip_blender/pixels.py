@@ -15,13 +15,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
 from stickslip_blender.blender import import_bpy
+from stickslip_blender.exr import read_exr
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,9 @@ class FrameReader:
             self._path = Path(f"/proc/self/fd/{self._memory}")
         else:
             self._folder = tempfile.TemporaryDirectory(prefix="stickslip-frames-", dir=scratch)
-            self._path = Path(self._folder.name) / "frame.bmp"
+            self._path = Path(self._folder.name) / "frame"
         self._scene = scene
         image, render = scene.render.image_settings, scene.render
-        image.file_format = "BMP"
-        image.color_mode = "RGB"
         image.color_management = "FOLLOW_SCENE"
         render.use_stamp = False
         render.use_file_extension = False
@@ -86,12 +85,26 @@ class FrameReader:
 
         A window has the very bytes that it would have in the whole frame.
         """
+        with Image.open(io.BytesIO(self._rendered("BMP", window))) as image:
+            return np.asarray(image.convert("RGB"))
+
+    def read_light(self, window: Window | None = None) -> npt.NDArray[np.float16]:
+        """Render as `read` does: linear light, not clipped, shape (height, width, 3)."""
+        return read_exr(self._rendered("OPEN_EXR", window))
+
+    def _rendered(self, file_format: Literal["BMP", "OPEN_EXR"], window: Window | None) -> bytes:
+        settings = self._scene.render.image_settings
+        if settings.file_format != file_format:
+            settings.file_format = file_format
+            settings.color_mode = "RGB"
+            if file_format == "OPEN_EXR":
+                settings.color_depth = "16"
+                settings.exr_codec = "NONE"
         _set_window(self._scene.render, window)
         self._path.write_bytes(b"")  # so that a frame is never an old one
         with _quiet():
             import_bpy().ops.render.render(write_still=True)
-        with Image.open(io.BytesIO(self._path.read_bytes())) as image:
-            return np.asarray(image.convert("RGB"))
+        return self._path.read_bytes()
 
 
 def _set_window(render: Any, window: Window | None) -> None:

@@ -6,6 +6,7 @@ Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread wou
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ Field = npt.NDArray[np.float64]
 Rgb = tuple[int, int, int]  # sRGB
 
 
+@cache
 def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     """Return the picture of a texture, 8-bit sRGB, shape (SIZE, SIZE, 3); row 0 is the lower edge of the cloth."""
     fine = SIZE * _OVERSAMPLING
@@ -27,6 +29,7 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     picture = _DRAWN_BY[texture](u, v)
     boxes = picture.reshape(SIZE, _OVERSAMPLING, SIZE, _OVERSAMPLING, 3)
     mean: npt.NDArray[np.uint8] = np.rint(boxes.mean(axis=(1, 3))).astype(np.uint8)
+    mean.flags.writeable = False  # it is kept for the next who asks
     return mean
 
 
@@ -110,6 +113,50 @@ def _floral(u: Field, v: Field) -> Field:
     return picture
 
 
+def _argyle(u: Field, v: Field) -> Field:
+    """Draw diamonds of two colours, and fine lines across them."""
+    x, y = np.abs(_phase(u, 4) - 0.5), np.abs(_phase(v, 3) - 0.5)
+    column = np.mod(np.floor(u * 4), 2) == 1
+    diamond = _mix(column, (152, 60, 70), (40, 70, 80))
+    picture = _mix(x + y < 0.5, diamond, (222, 214, 196))
+    return _mix(
+        np.minimum(np.abs(_phase(u * 4 + v * 3, 1) - 0.5), np.abs(_phase(u * 4 - v * 3, 1) - 0.5)) < 0.03,
+        (250, 248, 240),
+        picture,
+    )
+
+
+def _camouflage(u: Field, v: Field) -> Field:
+    """Draw blots of three colours where sums of waves are high, seeded; the pattern repeats at the edges."""
+    random = np.random.Generator(np.random.PCG64(11))
+    picture = np.broadcast_to(np.asarray((108, 112, 76), dtype=np.float64), (*u.shape, 3))
+    for color in ((58, 64, 44), (150, 136, 96), (34, 34, 30)):
+        height = np.zeros_like(u)
+        for _ in range(14):
+            across, down = random.integers(-5, 6, 2)
+            height += np.cos(2.0 * np.pi * (across * u + down * v + random.random()))
+        picture = _mix(height > 2.6, color, picture)
+    return picture
+
+
+def _chevron(u: Field, v: Field) -> Field:
+    return _mix(_phase(v + np.abs(_phase(u, 5) - 0.5) / 5, 7) < 0.5, (232, 188, 64), (62, 66, 74))
+
+
+def _terrazzo(u: Field, v: Field) -> Field:
+    """Strew chips of five colours over off-white, seeded; the pattern repeats at the edges."""
+    picture = np.broadcast_to(np.asarray((226, 222, 214), dtype=np.float64), (*u.shape, 3))
+    random = np.random.Generator(np.random.PCG64(13))
+    chips: tuple[Rgb, ...] = ((188, 92, 70), (70, 104, 110), (222, 172, 96), (54, 56, 62), (150, 160, 130))
+    for number in range(90):
+        x, y, turn, size = random.random(), random.random(), random.uniform(0.0, np.pi), random.uniform(0.02, 0.05)
+        du, dv = np.mod(u - x + 0.5, 1.0) - 0.5, np.mod(v - y + 0.5, 1.0) - 0.5
+        along, across = du * np.cos(turn) + dv * np.sin(turn), dv * np.cos(turn) - du * np.sin(turn)
+        chip = np.abs(along) + 1.8 * np.abs(across + 0.3 * along) < size
+        picture = _mix(chip, chips[number % len(chips)], picture)
+    return picture
+
+
 _DRAWN_BY: dict[Texture, Callable[[Field, Field], Field]] = {
     Texture.checker: _checker,
     Texture.dots: _dots,
@@ -119,4 +166,8 @@ _DRAWN_BY: dict[Texture, Callable[[Field, Field], Field]] = {
     Texture.herringbone: _herringbone,
     Texture.houndstooth: _houndstooth,
     Texture.floral: _floral,
+    Texture.argyle: _argyle,
+    Texture.camouflage: _camouflage,
+    Texture.chevron: _chevron,
+    Texture.terrazzo: _terrazzo,
 }

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
@@ -11,16 +15,20 @@ import numpy.typing as npt
 from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import encode_chunk
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, write_durably
 from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
-
-from stickslip_blender.preview import side_by_side
 
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
     from stickslip_schemas.jobs import Render
 
+    from stickslip_blender.clips import Trace
+
 FRAME_MARGIN = 1.0
 """How far inside the frame a rod or a cloth has to stay [px]."""
+
+TRACE_BYTES = 4 * 2**30
+"""Room that the traces kept in a store may take: about 500 clips of 30 frames."""
+_DIGEST_BYTES = 32
 
 Array = npt.NDArray[Any]
 
@@ -43,7 +51,9 @@ class Workshop:
     """
 
     def __init__(self, store_root: str, scratch: str | None = None) -> None:
-        self._store = Store(store_root)
+        self.store = Store(store_root)
+        self.traces: OrderedDict[str, Trace] = OrderedDict()
+        """The last traces of cloth, by what they depend on: clips that differ in their texture share one."""
         self.scratch = scratch
         """Folder for frames on their way out of Blender; None: memory."""
         self._renderer: tuple[object, Renderer] | None = None
@@ -55,11 +65,41 @@ class Workshop:
             self._renderer[1].close()
             self._renderer = None
 
+    def kept_trace(self, key: str) -> bytes | None:
+        """Return a trace that any process kept in the store; None where there is none, or a damaged one."""
+        path = self._trace_path(key)
+        try:
+            data = path.read_bytes()
+            path.touch()  # the oldest are deleted first
+        except OSError:
+            return None
+        digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        return body if hashlib.sha256(body).digest() == digest else None
+
+    def keep_trace(self, key: str, data: bytes) -> None:
+        """Keep a trace in the store for textures to come; the oldest are deleted where all take too much room.
+
+        No result depends on it: where it cannot be written, only time is lost.
+        """
+        path = self._trace_path(key)
+        with suppress(OSError):
+            write_durably(path, hashlib.sha256(data).digest() + data)
+            files = sorted(path.parent.glob("[0-9a-f]*"), key=lambda file: file.stat().st_mtime)
+            room = TRACE_BYTES - sum(file.stat().st_size for file in files)
+            for file in files[:-1]:
+                if room >= 0:
+                    break
+                room += file.stat().st_size
+                file.unlink(missing_ok=True)
+
+    def _trace_path(self, key: str) -> Path:
+        return self.store.root / "traces" / key
+
     def record(self, record: RecordRef, *names: str) -> list[Array]:
         """Return one row of arrays of an artifact."""
         digest, arrays = self._records
         if digest != record.digest:
-            with np.load(io.BytesIO(self._store.read(record.digest)), allow_pickle=False) as file:
+            with np.load(io.BytesIO(self.store.read(record.digest)), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in names}
             self._records = record.digest, arrays
         rows = len(arrays[names[0]])
@@ -74,15 +114,19 @@ class Workshop:
             self._renderer = scene, build()
         return self._renderer[1]  # type: ignore[return-value]  # `scene` names what `build` makes
 
-    def rendered(self, name: str, pictures: Array, preview: Array | None, labels: dict[str, Any]) -> TaskResult:
-        """Publish pictures (n, height, width, 3), and some of them as a preview, and return the result."""
-        chunk = encode_chunk(pictures[None])
+    def rendered(self, name: str, pictures: Array, preview: bytes | None, labels: dict[str, Any]) -> TaskResult:
+        """Publish pictures (n, height, width, 3) of one sample, and a preview, and return the result."""
         output = RenderOutput(
-            chunks={name: ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
-            preview=None if preview is None else self._store.publish(side_by_side(preview)),
+            chunks={name: self.chunk(pictures)},
+            preview=None if preview is None else self.store.publish(preview),
             labels=labels,
         )
         return TaskResult(outcome="succeeded", output=output)
+
+    def chunk(self, pictures: Array) -> ChunkRef:
+        """Publish the pictures (n, height, width, 3) of one sample as a chunk."""
+        chunk = encode_chunk(pictures[None])
+        return ChunkRef(digest=self.store.publish(chunk), offset=0, length=len(chunk))
 
 
 def check_rig(render: Render) -> None:

@@ -6,9 +6,16 @@ import numpy as np
 from stickslip_schemas.chunks import decode_chunk
 from stickslip_schemas.keys import canonical_json
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    Manifest,
+    seal_text,
+    with_manifest_digest,
+)
 from stickslip_schemas.samples import SPLITS, dataset_id
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskResult
 
 from stickslip_workers.stages.metadata import metadata_files
@@ -24,6 +31,7 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     _check_complete(task, store)
     files = list(task.files)
     metadata = metadata_files(task.spec, dataset=task.dataset, version=task.version, sample_count=len(task.sample_keys))
+    group = metadata.pop(GROUP_NAME)
     for path, data in metadata.items():
         files.append(FileEntry(path=path, sha256=store.publish(data), size=len(data)))
     manifest = Manifest(
@@ -46,8 +54,13 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         store.link(file.sha256, directory / file.path)
     data = canonical_json(manifest.model_dump(mode="json")).encode()
     digest = store.publish(data)
+    group = with_manifest_digest(group, digest)
+    group_digest = store.publish(group)
+    seal = seal_text(digest, group_digest)
+    store.link(group_digest, directory / GROUP_NAME)
+    store.link(store.publish(seal), directory / SEAL_NAME)
     store.link(digest, directory / MANIFEST_NAME)
-    return PublishOutput(manifest=digest, bytes=manifest.size + len(data))
+    return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size + len(data) + len(group) + len(seal))
 
 
 def _check_complete(task: PublishTask, store: Store) -> None:
@@ -61,9 +74,10 @@ def _check_complete(task: PublishTask, store: Store) -> None:
         odd = sorted(given ^ expected) or ["one path twice"]
         raise ValueError(f"files must be those of {shards} shards; missing or unknown are {odd[:3]} and so on")
     for file in task.files:
-        size = store.path(file.sha256).stat().st_size
-        if size != file.size:
-            raise OSError(f"artifact {file.sha256} of {file.path} must have {file.size} bytes; it has {size}")
+        if not store.holds(file.sha256, size=file.size):
+            raise CorruptArtifactError(
+                f"artifact {file.sha256} of {file.path} must have {file.size} bytes and the digest that names it"
+            )
 
 
 def _split_counts(task: PublishTask, store: Store) -> dict[str, int]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult
+from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
 
 from stickslip_workers.failures import failure
 
@@ -21,12 +21,23 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     try:
         results = _run(tasks, store)
     except Exception as error:
-        results = [failure(error)] * len(tasks)
+        results = [_failure(error, task, store) for task in tasks]
     share = {
         "cpu_seconds": (time.process_time() - cpu) / len(tasks),
         "wall_seconds": (time.perf_counter() - wall) / len(tasks),
     }
     return [result.model_copy(update=share) for result in results]
+
+
+def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
+    """Return the artifacts that `task` reads and that are damaged or not in the store. Reads all of them."""
+    return tuple(digest for digest in input_digests(task) if not store.holds(digest))
+
+
+def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
+    """Return the result of a task that raised; it names all damaged inputs, so that they are made again at once."""
+    damaged = damaged_inputs(task, store)
+    return failure(error).model_copy(update={"damaged_inputs": damaged})
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:

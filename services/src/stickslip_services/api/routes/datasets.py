@@ -109,8 +109,8 @@ def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> R
 
 def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> FileEntry:
     with coordinator.database.read() as connection:
-        manifest = find_version(connection, dataset, version).manifest
-    return find_file(coordinator.store, manifest, dataset, version, path)
+        found = find_version(connection, dataset, version)
+    return find_file(coordinator.store, found, path)
 
 
 def _serve(request: Request, coordinator: CoordinatorDep, dataset: str, version: int, path: str) -> Response:

@@ -2,54 +2,60 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_blender.blender import import_bpy
-from stickslip_blender.clips import render_clip
-from stickslip_blender.cloth import ClothRenderer, add_object, box, new_material
+from stickslip_blender.clips import render_clips
+from stickslip_blender.geometry import Prop, box
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth_drag import ClothDragRender
     from stickslip_schemas.tasks import RenderTask, TaskResult
 
-_HOLDER = (0.004, 0.01, 0.01)  # [m], in the plane of the cloth as in the simulation
-_ROD = (0.003, 0.003, 0.5)  # [m]
+HOLDER = (0.004, 0.01, 0.01)
+"""Of the clip at a corner [m]: across the cloth, and in its plane as in the simulation."""
+ROD = (0.003, 0.003, 0.5)
+"""Of the rod that the clip hangs on [m]."""
+_AIM = 0.05  # [m], the height that the lamp points to, under the holders
+
+Array = npt.NDArray[np.float64]
 
 
 def render(look: ClothDragRender, task: RenderTask, workshop: Workshop) -> TaskResult:
-    """Render one clip of a dragged cloth."""
-    return render_clip(look, task, workshop, DragRenderer)
+    """Render the clips of a dragged cloth."""
+    return render_clips(look, task, workshop, Holders)
 
 
-class DragRenderer(ClothRenderer):
-    """The stage with two holders at the upper corners of the cloth."""
+class Holders:
+    """Two holders at the upper corners of the cloth; the lamp follows them."""
 
-    def add_props(self, scene: Any, rest: npt.NDArray[np.float64]) -> None:
-        """Add the holders, for a cloth whose held edge is the last one of its rest shape."""
-        low, high = rest.min(axis=0), rest.max(axis=0)
+    def __init__(self, rest: npt.ArrayLike) -> None:
+        """Find the corners of a cloth whose held edge is the last one of its rest shape (V, 2) [m]."""
+        flat = np.asarray(rest, dtype=np.float64)
+        low, high = flat.min(axis=0), flat.max(axis=0)
         corners = np.array([(low[0], high[1]), (high[0], high[1])])
-        self._held = np.abs(rest[:, None] - corners).sum(axis=2).argmin(axis=0)
-        inward = np.sign((low + high) / 2 - corners) * _HOLDER[1] / 2
+        self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
+        inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
         self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
-        self._holders = [_add_holder(scene) for _ in self._held]
+        vertices, faces = _holder()
+        self.props = tuple(Prop(f"holder-{n}", vertices, faces, (0.05, 0.05, 0.052), 0.45) for n in (1, 2))
 
-    def place_props(self, _instant: int, vertices: npt.NDArray[np.float64]) -> None:
+    def poses(self, _instant: int, vertices: Array) -> Array:
         """Let the holders follow the corners that they hold."""
-        for holder, middle in zip(self._holders, vertices[self._held] + self._grips, strict=True):
-            holder.location = middle
+        poses = np.tile(np.eye(4), (2, 1, 1))
+        poses[:, :3, 3] = vertices[self._held] + self._grips
+        return poses
+
+    def aim(self, _instant: int, vertices: Array) -> Array:
+        """Return a point below the middle of the holders."""
+        return np.array([vertices[self._held, 0].mean(), 0.0, _AIM])
 
 
-def _add_holder(scene: Any) -> Any:
-    """Add a clip of one centimetre and the rod it hangs on; it holds a square at a corner of the cloth."""
-    bpy = import_bpy()
-    metal = bpy.data.materials.get("metal") or new_material(
-        "metal", Base_Color=(0.05, 0.05, 0.052, 1.0), Roughness=0.45, Metallic=0.0
-    )
-    boxes = [box(_HOLDER, (0.0, 0.0, 0.0)), box(_ROD, (0.0, 0.0, _ROD[2] / 2))]
-    vertices = np.concatenate([corners for corners, _ in boxes])
-    faces = [tuple(8 * number + index for index in face) for number, (_, box) in enumerate(boxes) for face in box]
-    return add_object(scene, "holder", vertices, faces, metal)
+def _holder() -> tuple[Array, list[tuple[int, ...]]]:
+    """Return a clip of one centimetre, about its middle, and the rod it hangs on."""
+    boxes = [box(HOLDER, (0.0, 0.0, 0.0)), box(ROD, (0.0, 0.0, ROD[2] / 2))]
+    faces = [tuple(8 * number + index for index in face) for number, (_, sides) in enumerate(boxes) for face in sides]
+    return np.concatenate([corners for corners, _ in boxes]), faces

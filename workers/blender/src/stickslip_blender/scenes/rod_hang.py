@@ -21,6 +21,7 @@ from stickslip_blender.color import Color, silicone_color, to_linear
 from stickslip_blender.engine import SAMPLING, Sampling, new_scene, set_sampling
 from stickslip_blender.environment import SoftBox, panorama, set_environment
 from stickslip_blender.pixels import FrameReader, Window
+from stickslip_blender.preview import side_by_side
 from stickslip_blender.tube import tube_faces, tube_vertices
 from stickslip_blender.view import new_view, set_view
 from stickslip_blender.workshop import Workshop, why_unfit
@@ -54,7 +55,9 @@ def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskRes
         ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality, scratch=workshop.scratch)
     )
     views = renderer.render(line, cameras, color=color, radius=look.radius)
-    return workshop.rendered("views", views, views if task.preview else None, {"color": list(to_linear(color))})
+    return workshop.rendered(
+        "views", views, side_by_side(views) if task.preview else None, {"color": list(to_linear(color))}
+    )
 
 
 class RodRenderer:

@@ -1,0 +1,121 @@
+"""Simulate drop-and-drag for training, and pack meshes of the instants that clips show.
+
+    python benchmarks/training/cloth_runs.py RUNS [--fabrics NAME ...] [--runs 30] [--vertices 21] [--preset fast]
+        [--seed 0] [--pack FILE]
+
+Each run is a file of RUNS, and a call goes on where another stopped; two may share a folder. mu is a Sobol sequence of
+[0, 1.6] for each fabric, and every run has a seed of its own, so that both sides occur. `--pack` writes all runs of the
+folder into one file, as `stickslip_training.cloth.runs` reads it: positions in whole steps of 10 um.
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another count as CPU time
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+import numpy as np  # noqa: E402
+from scipy.stats import qmc  # noqa: E402
+from stickslip_schemas.clips import shown_frames  # noqa: E402
+from stickslip_sim_core import build_info, drop_and_drag, fabric_names  # noqa: E402
+
+FRAMES = 30  # of a clip
+MU = 1.6
+DROPPED = 17  # the first instant after the drop
+
+
+def frictions(fabric: str, runs: int, seed: int) -> list[float]:
+    """Return the mu of each run of a fabric: a scrambled Sobol sequence of its own."""
+    engine = qmc.Sobol(1, seed=np.random.default_rng((seed, fabric_names().index(fabric))))
+    count = 1 << (runs - 1).bit_length()
+    return [round(MU * float(x), 6) for x in engine.random(count)[:runs, 0]]
+
+
+def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int) -> dict[str, object]:
+    """Run one simulation, and return what is kept of it."""
+    started = time.process_time()
+    scene = drop_and_drag(fabric, mu, vertices=vertices, preset=preset, seed=seed)
+    held, free = scene.rest[:, 1].argmax(), scene.rest[:, 1].argmin()
+    edges = [np.isclose(scene.rest[:, 1], scene.rest[vertex, 1]) for vertex in (held, free)]
+    fell = scene.positions[DROPPED, edges[1], 0].mean() - scene.positions[DROPPED, edges[0], 0].mean()
+    about = {
+        "material": fabric,
+        "mu": mu,
+        "seed": seed,
+        "bias_side": scene.bias_side,
+        "landed_side": 1 if fell > 0 else -1,
+        "vertices": vertices,
+        "preset": preset,
+        "build": build_info().build_hash,
+        "valid": scene.valid,
+        "reason": scene.reason,
+        "cpu_s": round(time.process_time() - started, 2),
+    }
+    shown = scene.positions[list(shown_frames(FRAMES, 300))] if scene.valid else np.zeros((FRAMES, len(scene.rest), 3))
+    return {
+        "positions": np.round(shown / 1e-5).astype(np.int16),
+        "rest": scene.rest.astype(np.float32),
+        "triangles": scene.triangles.astype(np.int16),
+        "about": json.dumps(about),
+    }
+
+
+def pack(folder: Path, file: Path) -> None:
+    """Write the valid runs of a folder into one file; differences of consecutive instants are packed best."""
+    runs = []
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as run:
+            if json.loads(str(run["about"]))["valid"]:
+                runs.append({name: run[name] for name in run.files})
+    first = runs[0]
+    if any(not np.array_equal(run["triangles"], first["triangles"]) for run in runs):
+        raise ValueError(f"the runs in {folder} must have one mesh: pack a folder for each")
+    positions = np.stack([run["positions"] for run in runs])
+    differences = np.diff(positions, axis=1, prepend=np.int16(0))
+    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
+    np.savez_compressed(
+        file,
+        differences=np.moveaxis(bytes_apart, -1, 0),  # low bytes, high bytes, (2, runs, frames, vertices, 3)
+        rest=first["rest"],
+        triangles=first["triangles"],
+        instants=np.array(shown_frames(FRAMES, 300), np.int16),
+        about=np.array([str(run["about"]) for run in runs]),
+    )
+    print(f"{file}: {len(runs)} runs, {file.stat().st_size / 1e6:.2f} MB")
+
+
+def main() -> None:
+    """Simulate what the folder does not have yet."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--fabrics", nargs="+", default=list(fabric_names()))
+    parser.add_argument("--runs", type=int, default=30, help="of each fabric")
+    parser.add_argument("--vertices", type=int, default=21)
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pack", type=Path, help="simulate nothing, and write this file")
+    args = parser.parse_args()
+    if args.pack is not None:
+        pack(args.folder, args.pack)
+        return
+    args.folder.mkdir(parents=True, exist_ok=True)
+    for number in range(args.runs):
+        for fabric in args.fabrics:
+            path = args.folder / f"{fabric}-{args.vertices}-{args.preset}-{args.seed}-{number:03d}.npz"
+            claim = path.with_suffix(".claim")
+            try:
+                claim.touch(exist_ok=False)
+            except FileExistsError:
+                continue  # done, or another process is at it
+            mu = frictions(fabric, args.runs, args.seed)[number]
+            seed = int(np.random.SeedSequence((args.seed, fabric_names().index(fabric), number)).generate_state(1)[0])
+            run = simulate(fabric, mu, args.vertices, args.preset, seed % 2**31)
+            np.savez_compressed(path, **run)  # type: ignore[arg-type]  # its stub takes no objects
+            print(run["about"], flush=True)
+
+
+if __name__ == "__main__":
+    main()

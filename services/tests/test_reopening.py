@@ -1,0 +1,196 @@
+"""Artifacts that rot in the store: found when read, made again, and nothing fails for ever."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import RecordRef, RenderOutput, SimulateOutput, TaskResult
+from stickslip_services.client.pull import verify
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
+from stickslip_services.testing import ManualClock, PretendWorker, parsed, rods, show_job
+
+
+def submit(coordinator: Coordinator, **spec: Any) -> str:
+    return coordinator.submit(parsed(rods(**spec)), None).id  # type: ignore[union-attr]
+
+
+def rot(path: Path, rng: random.Random) -> None:
+    """Flip a bit of a file, cut it, or remove it."""
+    how = rng.randrange(3)
+    if how == 0:
+        path.unlink()
+        return
+    data = bytearray(path.read_bytes())
+    data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    path.write_bytes(data if how == 1 else data[: len(data) // 2])
+
+
+def artifacts(store: Store) -> list[Path]:
+    return sorted(path for path in (store.root / "artifacts").rglob("*") if path.is_file())
+
+
+def check(coordinator: Coordinator) -> None:
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+
+
+def finish(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, job: str) -> None:
+    """Work until the job has ended well, and check its dataset."""
+    for _ in range(12):
+        worker.work()
+        clock.advance(10)
+        coordinator.sweep()
+    shown = show_job(coordinator, job)
+    assert shown.state is JobState.succeeded, shown.message
+    assert shown.dataset is not None
+    assert verify(worker.store.dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
+    check(coordinator)
+
+
+def test_200_rotten_artifacts_are_mended(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
+    rng = random.Random(3)
+    gammas = [1.0, 2.0, 3.0]
+    finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
+    for round_ in range(20):
+        for path in rng.sample(artifacts(worker.store), 10):
+            rot(path, rng)
+        finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
+        if round_ % 5 == 4:  # the grid grows: what was made for the smaller one is read again
+            gammas = [*gammas, 4.0 + round_]
+            finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
+
+
+def test_only_what_is_damaged_is_made_again(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    finish(coordinator, worker, clock, submit(coordinator))
+    with coordinator.database.read() as connection:
+        (path,) = [
+            row[0]
+            for row in connection.exec_driver_sql(
+                "SELECT json_extract(output, '$.files[0].sha256') FROM tasks WHERE stage = 'pack' ORDER BY seq LIMIT 1"
+            )
+        ]
+    worker.store.path(path).write_bytes(b"x")
+    worker.ran.clear()
+    job = submit(coordinator)
+    assert "1 of its files were damaged or lost" in show_job(coordinator, job).message
+    finish(coordinator, worker, clock, job)
+    assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
+
+
+def test_a_rotten_trajectory_is_simulated_again(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    """It is two stages away from the pack task that needs it, and needed by a render that comes later."""
+    job = submit(coordinator)
+    worker.finish(*worker.lease(simulate=10))
+    (render, *others) = worker.lease(render=10)
+    worker.finish(*others)
+    worker.store.path(render.task.record.digest).unlink()  # type: ignore[union-attr]
+    assert worker.finish(render) == ["accepted"]
+    counts = show_job(coordinator, job).progress.stages
+    assert counts[Stage.simulate].counts == {TaskState.succeeded: 3, TaskState.pending: 1}
+    assert counts[Stage.render].counts[TaskState.soft_failed] == 1
+    check(coordinator)
+    clock.advance(5)
+    coordinator.sweep()
+    assert worker.lease(render=10) == ()  # it waits for its simulation
+    finish(coordinator, worker, clock, job)
+
+
+def test_a_pack_task_names_what_was_made_two_stages_before(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job = submit(coordinator)
+    worker.finish(*worker.lease(simulate=10))
+    worker.finish(*worker.lease(render=10))
+    packs = worker.lease(pack=10)
+    for slot in packs[0].task.slots:  # type: ignore[union-attr]
+        worker.store.path(slot.record.digest).write_bytes(b"")  # type: ignore[union-attr]
+        worker.store.path(slot.chunks["views"].digest).unlink()
+    worker.finish(*packs)
+    counts = show_job(coordinator, job).progress.stages
+    assert counts[Stage.simulate].counts[TaskState.pending] == 2
+    assert counts[Stage.render].counts[TaskState.pending] == 2
+    check(coordinator)
+    finish(coordinator, worker, clock, job)
+
+
+def test_a_disk_that_keeps_rotting_fails_the_job_and_a_resubmission_mends_it(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job = submit(coordinator, gamma=(1.0,), phi1=(1.0,))
+    for _ in range(10):
+        for lease in worker.lease(simulate=10):
+            worker.finish(lease)
+        for lease in worker.lease(render=10):
+            worker.store.path(lease.task.record.digest).unlink(missing_ok=True)  # type: ignore[union-attr]
+            worker.finish(lease)
+        clock.advance(10)
+        coordinator.sweep()
+    assert show_job(coordinator, job).state is JobState.failed
+    check(coordinator)
+    finish(coordinator, worker, clock, submit(coordinator, gamma=(1.0,), phi1=(1.0,)))
+
+
+def test_big_datasets_are_checked_by_the_coordinator_itself(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    finish(coordinator, worker, clock, submit(coordinator))
+    with coordinator.database.write() as connection:
+        connection.exec_driver_sql("UPDATE dataset_versions SET bytes = ?", (CHECKED_AT_ONCE + 1,))
+    job = submit(coordinator)
+    shown = show_job(coordinator, job)
+    assert (shown.state, shown.message) == (JobState.queued, "all of it was made before: checking it")
+    coordinator.sweep()
+    assert show_job(coordinator, job).state is JobState.queued
+    coordinator.check_made_datasets()
+    assert show_job(coordinator, job).state is JobState.succeeded
+    check(coordinator)
+
+
+@pytest.mark.parametrize("stage", ["simulate", "render", "pack"])
+def test_a_result_that_is_not_in_the_store_is_refused(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, stage: str
+) -> None:
+    job = submit(coordinator)
+    if stage != "simulate":
+        worker.finish(*worker.lease(simulate=10))
+    if stage == "pack":
+        worker.finish(*worker.lease(render=10))
+    (lease,) = worker.lease(**{stage: 1})
+    result = worker.result(lease.task)
+    output = result.output
+    if isinstance(output, SimulateOutput):
+        output = output.model_copy(update={"record": RecordRef(digest="0" * 64, row=0)})
+    elif isinstance(output, RenderOutput):
+        chunk = output.chunks["views"]
+        output = output.model_copy(update={"chunks": {"views": chunk.model_copy(update={"length": 10**6})}})
+    else:
+        worker.store.path(output.files[1].sha256).unlink()  # type: ignore[union-attr]
+    lie = TaskResult(outcome="succeeded", output=output)
+    assert worker.report((lease, lie)) == ["accepted"]  # as a failure
+    with coordinator.database.read() as connection:
+        query = "SELECT state, reason, message FROM tasks WHERE state = 'soft_failed'"
+        ((state, reason, message),) = connection.exec_driver_sql(query)
+    assert (state, reason) == (TaskState.soft_failed, Reason.storage_error)
+    assert "must be in the store" in message
+    finish(coordinator, worker, clock, job)
+
+
+def test_publishing_again_mends_an_artifact(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    digest = store.publish(b"right")
+    for wrong in (b"wrong", b"", b"right and more"):
+        store.path(digest).write_bytes(wrong)
+        assert not store.holds(digest)
+        assert store.publish(b"right") == digest
+        assert store.read(digest) == b"right"
+    inode = store.path(digest).stat().st_ino
+    store.publish(b"right")
+    assert store.path(digest).stat().st_ino == inode  # a whole one is left alone

@@ -1,0 +1,220 @@
+"""The commands `stickslip-train cloth ...`: friction and material of dragged cloth from video."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.data.reader import DatasetReader
+
+if TYPE_CHECKING:
+    from stickslip_training.cloth.evaluation import Errors, Scores
+    from stickslip_training.cloth.runs import Runs
+
+cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
+
+RunsArgument = Annotated[
+    str, typer.Argument(metavar="RUNS", help="a dataset that stores positions, or a packed file of simulations (.npz)")
+]
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.pt of `cloth train`")]
+
+_SHARES = (0.12, 0.25)
+"""Of the simulations of a packed file, for validation and test; a dataset has splits of its own."""
+
+
+@cloth.command()
+def train(
+    runs: RunsArgument,
+    out: Annotated[Path, typer.Option(help="directory for the model, the checkpoint and the report")],
+    steps: Annotated[int, typer.Option(help="of training, with 8 clips each")] = 1500,
+    seed: Annotated[int, typer.Option(help="of the weights and of all that is drawn")] = 0,
+    split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
+    threads: Annotated[int, typer.Option(help="of torch")] = 2,
+    device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
+) -> None:
+    """Train a network that tells material and friction, on pictures rendered from simulations while it trains."""
+    from stickslip_training.cloth.training import ClothTraining, save_friction, train_friction
+    from stickslip_training.engine.fit import EpochReport
+
+    console = Console()
+
+    def tell(epoch: EpochReport) -> None:
+        validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
+        console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
+
+    with errors_told():
+        settings = ClothTraining(steps=steps, seed=seed, threads=threads, device=device)
+        source, parts = _splits(runs, split_seed)
+        source["split_seed"] = split_seed
+        model = train_friction(
+            parts["train"], parts["validation"], settings, out=out, identity=source, resume=resume, on_epoch=tell
+        )
+        model.card.update(source)
+        save_friction(out / "friction.pt", model)
+        (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")
+    console.print(f"{out}: friction.pt, report.json, checkpoint.pt", soft_wrap=True)
+
+
+@cloth.command()
+def evaluate(
+    model: ModelArgument,
+    runs: RunsArgument,
+    out: Annotated[Path, typer.Option(help="directory for report.html, report.json and records.jsonl")],
+    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
+    renders: Annotated[int, typer.Option(help="clips of each simulation of a packed file")] = 6,
+    seed: Annotated[int, typer.Option(help="of the looks of clips of a packed file")] = 99,
+    split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
+) -> None:
+    """Measure how good a model is on simulations that it has not seen, and write a page about it."""
+    from stickslip_training.cloth.clips import read_clips
+    from stickslip_training.cloth.evaluation import predictions, score
+    from stickslip_training.cloth.report import write_html
+    from stickslip_training.cloth.training import load_friction, render_clips
+
+    with errors_told():
+        friction = load_friction(model)
+        if runs.endswith(".npz"):
+            source, parts = _splits(runs, split_seed)
+            clips, slots = render_clips(parts[split], renders, seed), None
+            notes = [
+                f"Pictures were rendered by the renderer that the network was trained with, {renders} a simulation."
+            ]
+        else:
+            with DatasetReader(runs) as reader:
+                source = {"manifest": reader.manifest_digest}
+                clips, slots = read_clips(reader, _split(split), friction.materials)
+            notes = [f"Clips of the split {split} of dataset {source['manifest'][:12]}."]
+        if (clips.material < 0).any():
+            raise ValueError(
+                f"materials of the clips must be known to the model: it knows {', '.join(friction.materials)}"
+            )
+        posterior = friction.estimate(clips)
+        scores = score(posterior, clips.truth())
+        out.mkdir(parents=True, exist_ok=True)
+        write_html(out / "report.html", "Friction from video", scores, posterior, clips, notes)
+        report = {"source": source, "split": split, "scores": scores.as_dict(), "notes": notes}
+        (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        numbers = range(len(clips)) if slots is None else slots.tolist()
+        lines = [
+            json.dumps({**answer, "true_mu": mu, "true_material": friction.materials[code], "simulation": int(run)})
+            for answer, mu, code, run in zip(
+                predictions(posterior, numbers), clips.mu.tolist(), clips.material, clips.run, strict=True
+            )
+        ]
+        (out / "records.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    console = Console()
+    console.print(_scores(scores))
+    console.print(f"{out}: report.html, report.json, records.jsonl", soft_wrap=True)
+
+
+@cloth.command()
+def predict(
+    dataset: DatasetArgument,
+    model: Annotated[Path, typer.Option(help="friction.pt of `cloth train`")],
+    split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
+) -> None:
+    """Tell material and friction of every clip of a dataset, with the interval that holds mu with 80 %."""
+    from stickslip_training.cloth.clips import read_clips
+    from stickslip_training.cloth.evaluation import predictions
+    from stickslip_training.cloth.training import load_friction
+
+    with errors_told():
+        friction = load_friction(model)
+        with DatasetReader(dataset) as reader:
+            clips, slots = read_clips(reader, None if split is None else _split(split), friction.materials)
+        answers = predictions(friction.estimate(clips), slots.tolist())
+    if as_json:
+        typer.echo(json.dumps(answers, indent=1))
+        return
+    table = Table()
+    for title in ("slot", "material", "mu", "80 %"):
+        table.add_column(title, justify="left" if title == "material" else "right")
+    for answer in answers:
+        name, probability = max(answer["material"].items(), key=lambda item: item[1])
+        mu = answer["mu"]
+        told = f"{mu['low']:.2f} to {mu['high']:.2f}"
+        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told)
+    Console().print(table)
+
+
+@cloth.command()
+def score(
+    predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS", help="what `cloth predict --json` prints")],
+    dataset: DatasetArgument,
+    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
+) -> None:
+    """Score a file of predictions, of any method, on the clips of a dataset."""
+    from stickslip_training.cloth.clips import check_kind, simulations
+    from stickslip_training.cloth.evaluation import score_predictions
+
+    with errors_told(), DatasetReader(dataset) as reader:
+        check_kind(reader)
+        slots = reader.slots(_split(split))
+        labels = zip(reader.label("material")[slots].tolist(), reader.label("mu")[slots].tolist(), strict=True)
+        groups = simulations(reader, slots).tolist()
+        truth = {
+            slot: (int(material), float(mu), group)
+            for slot, (material, mu), group in zip(slots.tolist(), labels, groups, strict=True)
+        }
+        answers = json.loads(predictions.read_text(encoding="utf-8"))
+        if not isinstance(answers, list):
+            raise ValueError(f"{predictions} must hold a list of answers, and holds a {type(answers).__name__}")
+        scores = score_predictions(answers, reader.categories("material"), truth)
+    Console().print(_scores(scores))
+
+
+def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
+    """Return what names the runs, and the runs of each split."""
+    from stickslip_schemas.keys import sha256
+
+    from stickslip_training.cloth.runs import load_runs, runs_of_dataset, split_runs
+    from stickslip_training.cloth.training import INSTANTS
+
+    if source.endswith(".npz"):
+        parts = split_runs(load_runs(source), _SHARES, seed)
+        named: dict[str, Any] = {"runs": sha256(Path(source).read_bytes())}
+        return named, dict(zip(("train", "validation", "test"), parts, strict=True))
+    with DatasetReader(source) as reader:
+        named = {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}
+        splits = {}
+        for split in ("train", "validation", "test"):
+            if len(reader.slots(_split(split))):
+                splits[split] = runs_of_dataset(reader, _split(split), INSTANTS)[0]
+        missing = {"train", "validation"} - set(splits)
+        if missing:
+            raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
+        return named, splits
+
+
+def _split(name: str) -> Any:
+    from stickslip_schemas.samples import SPLITS
+
+    if name not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")
+    return name
+
+
+def _scores(scores: "Scores") -> Table:
+    top = "" if scores.top_1 is None else f"Material: {scores.top_1.value:.1%} right. "
+    told = f"{scores.blind.clips} clips of {scores.blind.simulations} simulations"
+    table = Table(title=told, caption=f"{top}In brackets: 90 % intervals over simulations.", caption_justify="left")
+    table.add_column("")
+    for title in ("mean error", "< 0.1", "< 0.2", "in 80 %"):
+        table.add_column(title, justify="right")
+
+    def add(name: str, part: "Errors") -> None:
+        shares = [f"{each.value:.1%}" for each in (part.within_01, part.within_02, part.coverage)]
+        table.add_row(name, str(part.mae), *shares)
+
+    add("material not known", scores.blind)
+    if scores.given is not None:
+        add("material known", scores.given)
+    for name, part in scores.bands.items():
+        add(f"mu {name}", part)
+    return table

@@ -1,0 +1,1 @@
+"""Friction and material of dragged cloth from video, with how sure the answer is."""

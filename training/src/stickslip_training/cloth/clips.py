@@ -1,0 +1,62 @@
+"""The clips of a dataset as a network sees them."""
+
+import numpy as np
+import torch
+
+from stickslip_training.arrays import Array, Integers
+from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
+from stickslip_training.cloth.runs import landed_side
+from stickslip_training.cloth.training import Clips, frames_at
+from stickslip_training.data.reader import DatasetReader, Split
+
+_CHUNK = 8  # clips in memory at once
+
+
+def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str, ...]) -> tuple[Clips, Integers]:
+    """Return the crops of the clips of a split, and their slots; `materials` are those that the network knows.
+
+    A clip of another material has the code -1. Raises ValueError where the dataset is of another kind, has no clip, or
+    shows other instants than a network needs.
+    """
+    check_kind(reader)
+    slots = reader.slots(split)
+    if not len(slots):
+        raise ValueError(f"the dataset has no clip in the split {split}")
+    frames, instants = frames_at(tuple(reader.arrays["video"].attributes["instants"]))
+    names = reader.categories("viewpoint")
+    cameras = {camera.name: camera for camera in reader.manifest.cameras}
+    views = [cameras[names[code]] for code in reader.label("viewpoint")[slots].tolist()]
+    seen = Cameras.of(views)
+    crops = []
+    for start in range(0, len(slots), _CHUNK):
+        video = torch.from_numpy(reader.read("video", slots[start : start + _CHUNK])[:, frames])
+        place = holder_crops(seen[start : start + _CHUNK], instants)
+        crops.append(cut(grey(video), place))
+    known = np.array([materials.index(name) if name in materials else -1 for name in reader.categories("material")])
+    mu = reader.label("mu")[slots].astype(np.float64)
+    material = known[reader.label("material")[slots]]
+    clips = Clips(
+        torch.cat(crops), seen.rotation[:, 2], material, mu, _landed(reader, slots), simulations(reader, slots)
+    )
+    return clips, slots
+
+
+def check_kind(reader: DatasetReader) -> None:
+    """Raise ValueError where the stage is not the one whose motion the crops know."""
+    if reader.kind != "cloth_drag":
+        raise ValueError(f"kind of the dataset must be cloth_drag to measure friction: it is {reader.kind}")
+
+
+def simulations(reader: DatasetReader, slots: Integers) -> Integers:
+    """Return a number for each slot that is the same for the clips of one simulation: one fabric, mu and bias."""
+    names = [name for name in ("material", "mu", "bias", "areal_density", "bending_rigidity") if name in reader.arrays]
+    told: list[Array] = [reader.label(name)[slots].astype(np.float64) for name in names]
+    return np.unique(np.stack(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def _landed(reader: DatasetReader, slots: Integers) -> Integers:
+    """Return the side to which each cloth fell; where no vertices are stored, the side to which it was pushed."""
+    if "positions" not in reader.arrays:
+        return reader.label("bias_side")[slots].astype(np.int64)
+    rest = reader.read("rest", slots[:1])[0]
+    return np.concatenate([landed_side(reader.read("positions", [slot]), rest) for slot in slots.tolist()])

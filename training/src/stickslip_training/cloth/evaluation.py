@@ -1,0 +1,221 @@
+"""How good answers about friction are: the thesis's shares, and what it does not tell: calibration, bands, simulations.
+
+Clips of one simulation are not independent. Every uncertainty here is over simulations: those are drawn again with
+replacement [bootstrap], and all their clips with them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from stickslip_training.arrays import Array, Floats, Integers
+from stickslip_training.cloth.posterior import SHARE, Estimates, Posterior, estimates, quantile_of_truth
+
+BANDS = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.2), (1.2, 1.6))
+"""Of mu: below 0.3 or so there are two branches, and above 1 a difference of 0.1 moves edges by less than half
+a pixel."""
+
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+
+_DRAWS = 1000
+_ROUNDING = 1e-9  # 8 of the 15 neighbours in linspace(0, 1.5, 16) are less than 0.1 apart in float64, and 7 are not
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number and its 90 % interval over simulations."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Errors:
+    """Of mu, over some clips."""
+
+    clips: int
+    simulations: int
+    mae: Measure
+    """Mean absolute error of the median."""
+    within_01: Measure
+    """Share of the clips with an error below 0.1."""
+    within_02: Measure
+    coverage: Measure
+    """Share of the clips whose 80 % interval holds the truth."""
+    width: Measure
+    """Mean width of the interval."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """All that is told about the answers to some clips."""
+
+    blind: Errors
+    """Material not known."""
+    given: Errors | None
+    """Material known; None where the answers do not say what mu is then."""
+    top_1: Measure | None
+    """Share of the clips whose likeliest material is the true one."""
+    top_2: Measure | None
+    log_likelihood: Measure | None
+    """Mean of log p(m, mu), mu a density."""
+    bands: dict[str, Errors]
+    sides: dict[str, Errors]
+    reliability: dict[str, float]
+    """Share of the clips whose truth lies in the central interval of each level."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Of some clips."""
+
+    material: Integers
+    mu: Floats
+    landed: Integers
+    run: Integers
+    """Number of the simulation."""
+
+
+def score(posterior: Posterior, truth: Truth) -> Scores:
+    """Compare posteriors with the truth."""
+    blind = estimates(posterior.mu, posterior.bins)
+    rank = (posterior.material > posterior.material[np.arange(len(posterior)), truth.material][:, None]).sum(axis=1)
+    below = quantile_of_truth(posterior.mu, posterior.bins, truth.mu)
+
+    def share(values: Array) -> Measure:
+        return measure(values.astype(float), truth.run)
+
+    def part(chosen: Array) -> Errors:
+        return errors(_some(blind, chosen), truth.mu[chosen], truth.run[chosen])
+
+    bands = {
+        f"{low:g} to {high:g}": (truth.mu >= low) & (truth.mu < high + (high == BANDS[-1][1])) for low, high in BANDS
+    }
+    sides = {f"{side:+d}": truth.landed == side for side in (-1, 1)}
+    return Scores(
+        blind=errors(blind, truth.mu, truth.run),
+        given=errors(estimates(posterior.given(truth.material), posterior.bins), truth.mu, truth.run),
+        top_1=share(rank < 1),
+        top_2=share(rank < 2),
+        log_likelihood=measure(posterior.log_likelihood(truth.material, truth.mu), truth.run),
+        bands={name: part(chosen) for name, chosen in bands.items() if chosen.any()},
+        sides={name: part(chosen) for name, chosen in sides.items() if chosen.any()},
+        reliability={f"{level:g}": float((np.abs(below - 0.5) <= level / 2).mean()) for level in LEVELS},
+    )
+
+
+def errors(found: Estimates, mu: Floats, run: Integers) -> Errors:
+    """Return the errors of estimates of `mu`, (clips,), of the simulations `run`, (clips,)."""
+    off = np.abs(found.median - mu)
+    inside = (found.low - _ROUNDING <= mu) & (mu <= found.high + _ROUNDING)
+    return Errors(
+        clips=len(mu),
+        simulations=len(np.unique(run)),
+        mae=measure(off, run),
+        within_01=measure((off < 0.1 - _ROUNDING).astype(float), run),
+        within_02=measure((off < 0.2 - _ROUNDING).astype(float), run),
+        coverage=measure(inside.astype(float), run),
+        width=measure(found.high - found.low, run),
+    )
+
+
+def distance_to_interval(mu: Floats, reference: Floats, error: Floats) -> Floats:
+    """Return how far estimates lie outside reference +- error, the thesis's error on real videos [thesis, 4.5.2]."""
+    return np.maximum(np.abs(mu - reference) - error, 0.0)
+
+
+def median_of_videos(mu: Floats, group: Integers) -> tuple[Floats, Integers]:
+    """Return the median over the videos of each group, five of one cloth and substrate in the thesis, and the
+    groups."""
+    groups = np.unique(group)
+    return np.array([np.median(mu[group == each]) for each in groups]), groups
+
+
+def measure(values: Floats, run: Integers) -> Measure:
+    """Return the mean of `values` (clips,), and the 5 % and 95 % quantile of it over drawn simulations."""
+    _, number = np.unique(run, return_inverse=True)
+    totals = np.bincount(number, values)
+    counts = np.bincount(number)
+    drawn = np.random.default_rng(0).integers(len(counts), size=(_DRAWS, len(counts)))
+    means = totals[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    low, high = np.quantile(means, [0.05, 0.95])
+    return Measure(float(values.mean()), float(low), float(high))
+
+
+def _some(found: Estimates, chosen: Array) -> Estimates:
+    return Estimates(found.median[chosen], found.low[chosen], found.high[chosen])
+
+
+def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, Any]]:
+    """Return answers as `stickslip-train cloth predict --json` prints them."""
+    found = estimates(posterior.mu, posterior.bins, SHARE)
+    return [
+        {
+            "slot": int(slot),
+            "material": {name: round(float(p), 6) for name, p in zip(posterior.materials, row, strict=True)},
+            "mu": {"median": round(float(median), 6), "low": round(float(low), 6), "high": round(float(high), 6)},
+        }
+        for slot, row, median, low, high in zip(
+            slots, posterior.material, found.median, found.low, found.high, strict=True
+        )
+    ]
+
+
+def score_predictions(
+    answers: Sequence[Any], materials: Sequence[str], truth: dict[int, tuple[int, float, int]]
+) -> Scores:
+    """Score a file of predictions, anybody's: `truth` has material, mu and simulation of each slot.
+
+    Every slot of `truth` must be answered once. Raises ValueError, which names the answer, where one is not what
+    `predictions` returns.
+    """
+    found: dict[int, tuple[dict[str, float], tuple[float, float, float]]] = {}
+    for place, answer in enumerate(answers):
+        try:
+            slot = int(answer["slot"])
+            mu = tuple(float(answer["mu"][name]) for name in ("median", "low", "high"))
+            probabilities = {str(name): float(p) for name, p in answer["material"].items()}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ValueError(
+                f"answer {place} must have slot, material and mu with median, low and high: {error!r}"
+            ) from None
+        if slot not in truth:
+            raise ValueError(f"slot of answer {place} must be one of the test set, and is {slot}")
+        if slot in found:
+            raise ValueError(f"slot {slot} is answered twice, at {place} for the second time")
+        if not (np.isfinite(mu).all() and mu[1] <= mu[0] <= mu[2]):
+            raise ValueError(f"mu of answer {place} must be finite with low <= median <= high, and is {answer['mu']}")
+        unknown = set(probabilities) - set(materials)
+        if unknown or any(not 0 <= p <= 1 for p in probabilities.values()):
+            raise ValueError(f"material of answer {place} must give probabilities of {', '.join(materials)}")
+        found[slot] = (probabilities, (mu[0], mu[1], mu[2]))
+    missing = sorted(set(truth) - set(found))
+    if missing:
+        raise ValueError(f"every slot of the test set must be answered, and {len(missing)} are not, {missing[0]} first")
+    slots = sorted(truth)
+    material, true_mu, run = (np.array([truth[slot][i] for slot in slots]) for i in range(3))
+    median, low, high = (np.array([found[slot][1][i] for slot in slots]) for i in range(3))
+    told = Estimates(median, low, high)
+    certain = np.array([[found[slot][0].get(name, 0.0) for name in materials] for slot in slots])
+    rank = (certain >= certain[np.arange(len(slots)), material][:, None]).sum(axis=1) - 1
+    bands = {f"{a:g} to {b:g}": (true_mu >= a) & (true_mu < b + (b == BANDS[-1][1])) for a, b in BANDS}
+    return Scores(
+        blind=errors(told, true_mu, run),
+        given=None,
+        top_1=measure((rank < 1).astype(float), run),
+        top_2=measure((rank < 2).astype(float), run),
+        log_likelihood=None,
+        bands={n: errors(_some(told, c), true_mu[c], run[c]) for n, c in bands.items() if c.any()},
+        sides={},
+        reliability={f"{SHARE:g}": float(((low <= true_mu) & (true_mu <= high)).mean())},
+    )

@@ -1,0 +1,118 @@
+"""What a clip tells: a joint histogram over material and mu, and what is read off it.
+
+    p(m, mu) = p(m) p(mu | m)
+
+The histogram is the answer: its marginals are the thesis's two models, one blind to the material and one that is given
+it. Where there are two branches, a mean would lie where nothing is: mu is told as the median of its marginal, with the
+shortest interval that holds 80 % of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stickslip_training.arrays import Floats, Integers
+
+SHARE = 0.8
+"""Of the probability that an interval holds."""
+
+_FINE = 8  # steps within a bin: a histogram is constant there
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Equal bins of a quantity."""
+
+    low: float
+    high: float
+    count: int
+
+    @property
+    def edges(self) -> Floats:
+        """(count + 1,)"""
+        return np.linspace(self.low, self.high, self.count + 1)
+
+    @property
+    def centers(self) -> Floats:
+        """(count,)"""
+        return (self.edges[:-1] + self.edges[1:]) / 2
+
+
+MU_BINS = Bins(0.0, 1.6, 64)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """One number for each clip, and how far from it the truth may be."""
+
+    median: Floats
+    low: Floats
+    high: Floats
+    """(clips,) each: `low` to `high` is the shortest interval that holds the share of the probability asked for."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The histograms of some clips."""
+
+    materials: tuple[str, ...]
+    bins: Bins
+    joint: Floats
+    """(clips, materials, bins), each clip's adds up to 1."""
+
+    def __len__(self) -> int:
+        return len(self.joint)
+
+    @property
+    def material(self) -> Floats:
+        """Probabilities of the materials, (clips, materials)."""
+        return np.asarray(self.joint.sum(axis=2))
+
+    @property
+    def mu(self) -> Floats:
+        """Histogram of mu whatever the material, (clips, bins)."""
+        return np.asarray(self.joint.sum(axis=1))
+
+    def given(self, material: Integers) -> Floats:
+        """Return the histogram of mu with the material of each clip known, (clips, bins)."""
+        chosen = self.joint[np.arange(len(self)), material] + 1e-300
+        return np.asarray(chosen / chosen.sum(axis=1, keepdims=True))
+
+    def log_likelihood(self, material: Integers, mu: Floats) -> Floats:
+        """Return log p(m, mu) of the truth, (clips,), with mu a density."""
+        places = np.clip(
+            ((mu - self.bins.low) / (self.bins.edges[1] - self.bins.low)).astype(int), 0, self.bins.count - 1
+        )
+        density = self.joint[np.arange(len(self)), material, places] / (self.bins.edges[1] - self.bins.low)
+        return np.asarray(np.log(density + 1e-12))
+
+    @staticmethod
+    def mean(posteriors: "list[Posterior]") -> "Posterior":
+        """Return the mixture of the answers of several networks to the same clips."""
+        first = posteriors[0]
+        if any((other.materials, other.bins) != (first.materials, first.bins) for other in posteriors):
+            raise ValueError("networks of an ensemble must have the same materials and bins")
+        return Posterior(first.materials, first.bins, np.mean([other.joint for other in posteriors], axis=0))
+
+
+def estimates(histogram: Floats, bins: Bins, share: float = SHARE) -> Estimates:
+    """Return median and shortest interval of histograms (clips, bins)."""
+    edges = np.linspace(bins.low, bins.high, _FINE * bins.count + 1)
+    cumulated = np.zeros((len(histogram), len(edges)))
+    np.cumsum(np.repeat(histogram / _FINE, _FINE, axis=1), axis=1, out=cumulated[:, 1:])
+    cumulated /= cumulated[:, -1:]
+    median, low, high = (np.empty(len(histogram)) for _ in range(3))
+    for clip, c in enumerate(cumulated):
+        median[clip] = np.interp(0.5, c, edges)
+        ends = np.searchsorted(c, c + share - 1e-12)
+        starts = np.flatnonzero(ends < len(edges))
+        first = starts[np.argmin(edges[ends[starts]] - edges[starts])]
+        low[clip], high[clip] = edges[first], edges[ends[first]]
+    return Estimates(median, low, high)
+
+
+def quantile_of_truth(histogram: Floats, bins: Bins, truth: Floats) -> Floats:
+    """Return the share of the probability that lies below the truth, (clips,): uniform where all is calibrated."""
+    cumulated = np.concatenate([np.zeros((len(histogram), 1)), np.cumsum(histogram, axis=1)], axis=1)
+    rows = [np.interp(value, bins.edges, row / row[-1]) for value, row in zip(truth, cumulated, strict=True)]
+    return np.array(rows)

@@ -1,0 +1,291 @@
+"""Pictures of cloth meshes in torch, made while a network trains: any texture, view and light, drawn afresh.
+
+The mesh is refined to a grid of points, a little closer together than pixels of the crop. Each visible point adds its
+brightness to the four pixels about it, with bilinear weights and in the measure of the area that it stands for:
+
+    alpha = min(1, sum_i w_i a_i),   picture = sum_i w_i a_i c_i / sum_i w_i a_i  over the background by alpha
+
+so an edge moves through a pixel as smoothly as it does in a photograph. A point is visible where nothing on its pixel
+is nearer by more than `LAYER`. Light is one distant lamp and some from all around; there are no shadows: the floor is
+dark.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from stickslip_schemas.cameras import Camera
+
+from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
+
+POINTS = 56
+"""Points along a side of the refined mesh."""
+
+LAYER = 0.012
+"""[m]: points nearer than this behind the nearest one on a pixel are of the same layer."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """What clips look like; every tensor has one row a clip."""
+
+    texture: torch.Tensor
+    """(B, N, N): reflectance of the points of the cloth, 0 to 1."""
+    lamp: torch.Tensor
+    """(B, 3): direction to the lamp."""
+    ambient: torch.Tensor
+    """(B,): light from all around, over that of the lamp."""
+    exposure: torch.Tensor
+    """(B,)"""
+    floor: torch.Tensor
+    """(B,): brightness of what is not cloth."""
+    gamma: torch.Tensor
+    """(B,): exponent of brightness to grey level."""
+    blur: torch.Tensor
+    """(B,): standard deviation [px]."""
+    noise: torch.Tensor
+    """(B,): standard deviation of grey levels."""
+    shift: torch.Tensor
+    """(B, F, 2) [px]: what the registration of the holders is off."""
+    stretch: torch.Tensor
+    """(B,): the scale over that of the crop."""
+
+
+def draw_style(clips: int, frames: int, generator: torch.Generator) -> Style:
+    """Draw what clips look like."""
+
+    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
+        return low + (high - low) * torch.rand(clips, *shape, generator=generator)
+
+    azimuth, elevation = torch.deg2rad(uniform(-110, 50)), torch.deg2rad(uniform(32, 72))
+    lamp = torch.stack(
+        [torch.cos(elevation) * torch.cos(azimuth), torch.cos(elevation) * torch.sin(azimuth), torch.sin(elevation)], -1
+    )
+    wander = 0.25 * torch.randn(clips, frames, 2, generator=generator)
+    steady = 0.4 * torch.randn(clips, 1, 2, generator=generator)
+    return Style(
+        texture=draw_textures(clips, generator),
+        lamp=lamp,
+        ambient=uniform(0.1, 0.6),
+        exposure=uniform(0.6, 1.5),
+        floor=uniform(0.0, 0.04),
+        gamma=uniform(0.38, 0.6),
+        blur=uniform(0.0, 0.6),
+        noise=uniform(0.0, 0.02),
+        shift=wander * uniform(0.0, 1.0, 1, 1) + steady * uniform(0.0, 1.0, 1, 1),
+        stretch=1.0 + 0.005 * torch.randn(clips, generator=generator),
+    )
+
+
+def draw_textures(clips: int, generator: torch.Generator) -> torch.Tensor:
+    """Draw reflectances of cloth, (clips, POINTS, POINTS): plain, stripes, checks, dots, blots, and mixtures of
+    them."""
+    v, u = torch.meshgrid(torch.linspace(0, 1, POINTS), torch.linspace(0, 1, POINTS), indexing="ij")
+    made = []
+    for _ in range(clips):
+        r = torch.rand(16, generator=generator).tolist()
+        first, second = (_wave(u, v, r[5 * i : 5 * i + 5]) for i in (0, 1))
+        pattern = (
+            torch.full_like(u, 0.5),
+            first,
+            first * second,
+            torch.maximum(first, second),
+            0.5 * (first + second),
+            _blots(generator),
+        )[int(r[10] * 6)]
+        low, high = sorted((0.12 + 0.75 * r[11], 0.12 + 0.75 * r[12]))
+        dark = r[13] < 0.5
+        made.append(low + (high - low) * (pattern if dark else 1 - pattern))
+    return torch.stack(made)
+
+
+def _wave(u: torch.Tensor, v: torch.Tensor, r: list[float]) -> torch.Tensor:
+    """Return stripes, 0 to 1: of any direction, width and sharpness."""
+    angle = math.pi * r[0] if r[1] < 0.4 else math.pi / 2 * round(r[0])
+    wave = torch.sin(2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * math.cos(angle) + v * math.sin(angle)) + r[3]))
+    return torch.sigmoid((1 + 12 * r[4]) * (wave - 0.6 * (r[3] - 0.5)))
+
+
+def _blots(generator: torch.Generator) -> torch.Tensor:
+    coarse = int(torch.randint(5, 18, (1,), generator=generator))
+    noise = torch.rand(1, 1, coarse, coarse, generator=generator)
+    fine = torch.nn.functional.interpolate(noise, (POINTS, POINTS), mode="bicubic", align_corners=True)[0, 0]
+    return torch.sigmoid(12 * (fine - 0.5))
+
+
+def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> Cameras:
+    """Turn cameras about the stage's middle by angles (B,) [rad]: about the vertical, and up."""
+    middle = cameras.translation.new_tensor([0.15, 0.0, 0.05]).expand(len(azimuth), 3)
+    seen = (cameras.rotation @ middle[..., None])[..., 0] + cameras.translation
+    c, s, zero, one = torch.cos(azimuth), torch.sin(azimuth), torch.zeros_like(azimuth), torch.ones_like(azimuth)
+    around = torch.stack([c, s, zero, -s, c, zero, zero, zero, one], dim=-1).reshape(-1, 3, 3)
+    c, s = torch.cos(elevation), torch.sin(elevation)
+    up = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], dim=-1).reshape(-1, 3, 3)
+    rotation = up @ cameras.rotation @ around
+    return Cameras(rotation, seen - (rotation @ middle[..., None])[..., 0], cameras.focal, cameras.center)
+
+
+def render_crops(
+    positions: torch.Tensor,
+    cameras: Cameras,
+    instants: tuple[int, ...],
+    style: Style,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Render the holder-registered crops, grey levels (B, F, 72, 88), of meshes (B, F, side, side, 3) [m].
+
+    `generator` draws the noise; without it there is none.
+    """
+    crops = holder_crops(cameras, instants)
+    shade = shading(positions, cameras, style) * style.exposure[:, None, None, None]
+    pictures = []
+    for clip in range(len(positions)):  # one clip's points fit into a processor's cache, a batch's do not
+        one = slice(clip, clip + 1)
+        fine = _refined(torch.cat([positions[one], shade[one, ..., None]], dim=-1), POINTS)
+        colors = fine[..., 3] * style.texture[one, None]
+        shift, stretch = style.shift[one], style.stretch[one]
+        pictures.append(splat(fine[..., :3], colors, cameras[one], crops[one], shift=shift, stretch=stretch))
+    alpha, color = (torch.cat(parts) for parts in zip(*pictures, strict=True))
+    floor = style.floor[:, None, None, None]
+    light = alpha * color + (1.0 - alpha) * floor
+    picture = light.clamp(min=1e-5) ** style.gamma[:, None, None, None]
+    picture = _blurred(picture, style.blur)
+    if generator is not None:
+        picture = picture + style.noise[:, None, None, None] * torch.randn(picture.shape, generator=generator)
+    return picture.clamp(0.0, 1.0)
+
+
+def silhouettes(positions: torch.Tensor, camera: Camera, points: int = 160) -> torch.Tensor:
+    """Return how much of each pixel of a picture the cloth covers, (F, height, width), 0 to 1.
+
+    `positions` (F, side, side, 3) [m] are refined to `points` a side, which must be closer together than pixels.
+    """
+    fine = _refined(positions[None], points)
+    whole = Crops(torch.zeros(1, len(positions), 2), torch.ones(1, len(positions)), (0.0, 0.0))
+    size = camera.height, camera.width
+    return splat(fine, torch.ones(fine.shape[:-1]), Cameras.of([camera]), whole, size=size)[0][0]
+
+
+def splat_meshes(positions: torch.Tensor, cameras: Cameras, crops: Crops) -> torch.Tensor:
+    """Return how much of each pixel of the crops the cloth covers, (B, F, 72, 88), of meshes (B, F, side, side, 3)."""
+    covered = []
+    for clip in range(len(positions)):
+        one = slice(clip, clip + 1)
+        fine = _refined(positions[one], POINTS)
+        covered.append(splat(fine, torch.ones(fine.shape[:-1]), cameras[one], crops[one])[0])
+    return torch.cat(covered)
+
+
+def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
+    """Refine fields on meshes (B, F, side, side, n) to (B, F, points, points, n), smoothly."""
+    weights = _spline(fields.shape[2], points)
+    clips, frames, side, _, count = fields.shape
+    rows = weights @ fields.reshape(clips * frames, side, side * count)
+    fine = weights @ rows.reshape(clips * frames * points, side, count)
+    return fine.reshape(clips, frames, points, points, count)
+
+
+@cache
+def _spline(nodes: int, points: int) -> torch.Tensor:
+    """Return W, (points, nodes): W @ y are values of the Catmull-Rom spline through y, which goes on straight at its
+    ends."""
+    place = torch.linspace(0, nodes - 1, points, dtype=torch.float64)
+    cell = place.floor().clamp(max=nodes - 2).long()
+    t = place - cell
+    basis = torch.stack(
+        [
+            -0.5 * t + t**2 - 0.5 * t**3,
+            1 - 2.5 * t**2 + 1.5 * t**3,
+            0.5 * t + 2 * t**2 - 1.5 * t**3,
+            -0.5 * t**2 + 0.5 * t**3,
+        ],
+        dim=1,
+    )
+    padded = torch.zeros(points, nodes + 2, dtype=torch.float64)
+    padded.scatter_(1, cell[:, None] + torch.arange(4), basis)
+    weights = padded[:, 1:-1].clone()
+    for ghost, first, second in ((0, 0, 1), (-1, -1, -2)):  # y_ghost = 2 y_first - y_second
+        weights[:, first] += 2 * padded[:, ghost]
+        weights[:, second] -= padded[:, ghost]
+    return weights.float()
+
+
+def shading(positions: torch.Tensor, cameras: Cameras, style: Style) -> torch.Tensor:
+    """Return the light that vertices (B, F, side, side, 3) send to the camera per reflectance [Lambert]."""
+    across, along = torch.gradient(positions, dim=(2, 3))
+    normal = torch.nn.functional.normalize(torch.linalg.cross(across, along), dim=-1)
+    eye = -(cameras.rotation.transpose(1, 2) @ cameras.translation[..., None])[..., 0]
+    facing = torch.sign((normal * (eye[:, None, None, None] - positions)).sum(dim=-1))
+    lamp = (normal * style.lamp[:, None, None, None]).sum(dim=-1) * facing
+    return style.ambient[:, None, None, None] + lamp.clamp(min=0.0)
+
+
+def splat(
+    points: torch.Tensor,
+    colors: torch.Tensor,
+    cameras: Cameras,
+    crops: Crops,
+    *,
+    size: tuple[int, int] = (HEIGHT, WIDTH),
+    shift: torch.Tensor | None = None,
+    stretch: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return coverage and colour of each pixel, (B, F, *size), of points (B, F, N, N, 3) with colours (B, F, N, N).
+
+    `shift` (B, F, 2) and `stretch` (B,) are errors of the registration: see `Style`.
+    """
+    clips, frames = points.shape[:2]
+    height, width = size
+    pixels, depth = cameras.project(points)
+    if shift is not None and stretch is not None:
+        crops = crops.off_by(shift, stretch)
+    places = crops.of_pixels(pixels)
+    area = _areas(places)
+    # A border takes what is out of sight: one pixel before the picture, two after it.
+    wide, high = width + 3, height + 3
+    column = places[..., 0].clamp(-1.0, width)
+    row = places[..., 1].clamp(-1.0, height)
+    left, top = column.floor(), row.floor()
+    right, down = column - left, row - top
+    start = (torch.arange(clips * frames) * (wide * high)).reshape(clips, frames, 1, 1)
+    corner = start + (top.long() + 1) * wide + left.long() + 1
+    nearest = corner + (right > 0.5) + (down > 0.5) * wide
+    total = clips * frames * wide * high
+    buffer = torch.full((total,), math.inf).scatter_reduce_(0, nearest.reshape(-1), depth.reshape(-1), "amin")
+    weight = area * (depth <= buffer[nearest] + LAYER)
+    sums = torch.zeros(2, total)
+    for step, share in (
+        (0, (1 - right) * (1 - down)),
+        (1, right * (1 - down)),
+        (wide, (1 - right) * down),
+        (wide + 1, right * down),
+    ):
+        place, w = (corner + step).reshape(-1), weight * share
+        sums[0].index_add_(0, place, w.reshape(-1))
+        sums[1].index_add_(0, place, (w * colors).reshape(-1))
+    sums = sums.reshape(2, clips, frames, high, wide)[..., 1:-2, 1:-2]
+    return sums[0].clamp(max=1.0), sums[1] / sums[0].clamp(min=1e-6)
+
+
+def _areas(places: torch.Tensor) -> torch.Tensor:
+    """Return the area that each point of a grid stands for [px^2], (B, F, N, N); half of it at edges."""
+    across, along = torch.gradient(places, dim=(2, 3))
+    area = (across[..., 0] * along[..., 1] - across[..., 1] * along[..., 0]).abs()
+    edge = torch.ones(places.shape[2])
+    edge[0] = edge[-1] = 0.5
+    return area * edge[:, None] * edge
+
+
+def _blurred(pictures: torch.Tensor, deviation: torch.Tensor) -> torch.Tensor:
+    """Blur pictures (B, F, H, W), each clip by its own Gaussian of at most 1 px or so."""
+    x = torch.arange(-2.0, 3.0)
+    kernel = torch.exp(-0.5 * (x / deviation.clamp(min=1e-2)[:, None]) ** 2)
+    kernel = kernel / kernel.sum(dim=1, keepdim=True)
+    clips = len(pictures)
+    flat = pictures.permute(1, 0, 2, 3)
+    for shape in ((clips, 1, 5, 1), (clips, 1, 1, 5)):
+        padding = (0, 0, 2, 2) if shape[2] == 5 else (2, 2, 0, 0)
+        padded = torch.nn.functional.pad(flat, padding, mode="replicate")
+        flat = torch.nn.functional.conv2d(padded, kernel.reshape(shape), groups=clips)
+    return flat.permute(1, 0, 2, 3)

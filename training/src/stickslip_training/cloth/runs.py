@@ -1,0 +1,197 @@
+"""Simulated drop-and-drag as meshes: what clips are rendered from while a network trains.
+
+A packed file holds the instants that clips show of many runs with one mesh (`benchmarks/training/cloth_runs.py` writes
+it); a dataset that stores its meshes holds them, too.
+"""
+
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
+from stickslip_training.data.reader import DatasetReader, Split
+
+STEP = 1e-5
+"""Of the positions in a packed file [m]."""
+
+SLIDING = 60
+"""The instant, of 300, that tells the branch: on the first leg the free edge trails, or is pushed ahead of the
+holders."""
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Simulations of one mesh, a square grid of `side` x `side` vertices."""
+
+    positions: SingleFloats
+    """(runs, frames, side, side, 3) [m]: rows from the free edge up to the held one, columns along y."""
+    instants: tuple[int, ...]
+    """Of the frames, of 300 at 2.4 a second."""
+    materials: tuple[str, ...]
+    """Names of the codes in `material`."""
+    material: Integers
+    """(runs,)"""
+    mu: Floats
+    """(runs,)"""
+    landed: Integers
+    """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on the first leg."""
+
+    def __len__(self) -> int:
+        return len(self.mu)
+
+    def __getitem__(self, chosen: Array) -> "Runs":
+        """Return some of the runs."""
+        return Runs(
+            self.positions[chosen],
+            self.instants,
+            self.materials,
+            self.material[chosen],
+            self.mu[chosen],
+            self.landed[chosen],
+        )
+
+    @staticmethod
+    def joined(first: "Runs", second: "Runs") -> "Runs":
+        """Return the runs of both, which must have the same instants and materials."""
+        if (first.instants, first.materials) != (second.instants, second.materials):
+            raise ValueError("runs that are joined must have the same instants and materials")
+        names = ("positions", "material", "mu", "landed")
+        both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+        return Runs(instants=first.instants, materials=first.materials, **both)
+
+    @property
+    def side(self) -> int:
+        """Vertices along a side of the mesh."""
+        return int(self.positions.shape[2])
+
+
+def load_runs(path: str | Path) -> Runs:
+    """Read a packed file; raise ValueError where it is damaged, or none."""
+    try:
+        return _load(path)
+    except (BadZipFile, zlib.error, KeyError, EOFError) as error:
+        raise ValueError(f"{path} must be a packed file of simulations, and is damaged or is none: {error}") from error
+
+
+def _load(path: str | Path) -> Runs:
+    with np.load(path) as file:
+        low, high = file["differences"]
+        differences = np.stack([low, high], axis=-1).view(np.int16)[..., 0]
+        positions = np.cumsum(differences, axis=1, dtype=np.int16).astype(np.float32) * np.float32(STEP)
+        about = [json.loads(str(line)) for line in file["about"]]
+        rest, instants = file["rest"], tuple(map(int, file["instants"]))
+    materials = tuple(sorted({run["material"] for run in about}))
+    material = np.array([materials.index(run["material"]) for run in about])
+    return _runs(positions, rest, instants, materials, material, np.array([run["mu"] for run in about]))
+
+
+def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
+    """Return the simulations of a dataset that stores its meshes, and the slot of one sample of each.
+
+    Samples of one simulation are told by material, mu and the mesh at the last instant that is read.
+    """
+    for name in ("positions", "rest", "material", "mu"):
+        if name not in reader.arrays:
+            raise ValueError(
+                f"the dataset must have the array {name} to train from meshes: its spec says store_positions: false"
+            )
+    slots, meshes, seen = [], [], set()
+    for slot in reader.slots(split).tolist():
+        mesh = reader.read("positions", [slot])[0][list(instants)]
+        if (key := mesh[-1].tobytes()) not in seen:
+            seen.add(key)
+            slots.append(slot)
+            meshes.append(mesh)
+    if not slots:
+        raise ValueError(f"the dataset has no simulation in the split {split}")
+    chosen = np.array(slots)
+    rest = reader.read("rest", chosen[:1])[0]
+    material = reader.label("material")[chosen].astype(np.int64)
+    materials = reader.categories("material")
+    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, reader.label("mu")[chosen]), chosen
+
+
+def split_runs(runs: Runs, shares: tuple[float, float], seed: int) -> tuple[Runs, Runs, Runs]:
+    """Part runs into train, validation and test, every fabric by itself; `shares` are of validation and test.
+
+    The runs with the least and the largest mu of a fabric are always trained on: nothing can be learned beyond them.
+    """
+    split = np.zeros(len(runs), dtype=np.int64)
+    for code in np.unique(runs.material):
+        order = np.flatnonzero(runs.material == code)
+        order = order[np.argsort(runs.mu[order], kind="stable")]
+        inner = np.random.default_rng((seed, int(code))).permutation(order[1:-1])
+        counts = [round(share * len(order)) for share in shares]
+        split[inner[: counts[0]]] = 1
+        split[inner[counts[0] : sum(counts)]] = 2
+    train, validation, test = (runs[np.flatnonzero(split == part)] for part in range(3))
+    return train, validation, test
+
+
+def _runs(
+    positions: SingleFloats,
+    rest: SingleFloats,
+    instants: tuple[int, ...],
+    materials: tuple[str, ...],
+    material: Integers,
+    mu: Floats,
+) -> Runs:
+    grid = positions[:, :, grid_order(rest)].astype(np.float32)
+    landed = _landed(grid[:, _first(instants)])
+    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
+
+
+def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
+    """Return the side along x, +1 or -1, to which cloth fell: of positions at all instants, (runs, 300, V, 3) [m]."""
+    return _landed(positions[:, SLIDING][:, grid_order(rest)])
+
+
+def _landed(grid: SingleFloats) -> Integers:
+    return np.where((grid[:, 0] - grid[:, -1])[..., 0].mean(axis=1) > 0, 1, -1)
+
+
+def _first(instants: tuple[int, ...]) -> int:
+    """Return the frame that tells the branch."""
+    late = [frame for frame, instant in enumerate(instants) if instant >= SLIDING]
+    return late[0] if late else len(instants) - 1
+
+
+def grid_order(rest: SingleFloats) -> Integers:
+    """Return the vertices, (side, side), of the square grid that `rest` (V, 2) is; raise ValueError where it is
+    none."""
+    side = round(len(rest) ** 0.5)
+    order = np.lexsort(np.round(rest.T / 1e-6).astype(np.int64))
+    if side * side == len(rest):
+        grid = rest[order].reshape(side, side, 2)
+        steps = np.diff(grid[..., 1], axis=0), np.diff(grid[..., 0], axis=1)
+        if all(np.allclose(step, step.flat[0], atol=1e-6) and step.flat[0] > 0 for step in steps):
+            return order.reshape(side, side)
+    raise ValueError(f"rest must be a square grid of vertices to be rendered from: its {len(rest)} vertices are none")
+
+
+def between(runs: Runs, gap: float) -> list[tuple[int, int]]:
+    """Return pairs of runs of one fabric and one landed side that are neighbours in mu, no farther apart than `gap`.
+
+    The mesh of a friction between theirs is close to the mean of theirs: the steady states of a leg move with mu, and
+    keep their kind. Below `STEEP` they move fast, and two branches exist: neighbours there may be half as far apart.
+    """
+    pairs = []
+    for code in np.unique(runs.material):
+        for landed in (-1, 1):
+            chosen = np.flatnonzero((runs.material == code) & (runs.landed == landed))
+            chosen = chosen[np.argsort(runs.mu[chosen], kind="stable")]
+            for a, b in pairwise(chosen.tolist()):
+                largest = gap if runs.mu[a] >= STEEP else gap / 2
+                if runs.mu[b] - runs.mu[a] <= largest:
+                    pairs.append((a, b))
+    return pairs
+
+
+STEEP = 0.4
+"""mu below which a difference of 0.1 moves edges by several pixels."""

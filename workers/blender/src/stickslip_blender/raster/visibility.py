@@ -1,0 +1,93 @@
+"""Which triangle each sample of an image sees, and what is interpolated there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.cameras import Camera
+
+from stickslip_blender.pixels import Window
+from stickslip_blender.raster import _raster
+
+GRID = 12
+"""Samples across a pixel, and down: silhouettes are then within 0.0005 of their coverage."""
+
+Points = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Which triangle each sample of a window sees."""
+
+    points: Points
+    """Projected vertices: column, row [px] and depth [scene units], shape (V, 3)."""
+    triangles: Indices
+    """Shape (T, 3)."""
+    window: Window
+    grid: int
+    """Samples across a pixel."""
+    triangle: Indices
+    """By sample, -1 where there is none; shape (grid height, grid width)."""
+
+    def share_below(self, end: int) -> npt.NDArray[np.float32]:
+        """Return the share of each pixel's samples that see one of the first `end` triangles, (height, width)."""
+        hit = (self.triangle >= 0) & (self.triangle < end)
+        rows, columns = self.triangle.shape[0] // self.grid, self.triangle.shape[1] // self.grid
+        share: npt.NDArray[np.float32] = hit.reshape(rows, self.grid, columns, self.grid).mean(
+            axis=(1, 3), dtype=np.float32
+        )
+        return share
+
+    def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
+        """Interpolate values of vertices (V, k) in perspective at the pixel centres, `fill` where nothing is seen.
+
+        For a grid of one sample a pixel. Returns shape (height, width, k).
+        """
+        if self.grid != 1:
+            raise ValueError(f"grid must be 1, a sample in the middle of each pixel; got {self.grid}")
+        given = np.asarray(values, dtype=np.float64)
+        result = np.full((*self.triangle.shape, given.shape[1]), fill)
+        rows, columns = np.nonzero(self.triangle >= 0)
+        corners = self.triangles[self.triangle[rows, columns]]
+        place = np.column_stack([columns + self.window.left, rows + self.window.top])
+        weights = barycentric(self.points[corners][..., :2], place) / self.points[corners][..., 2]
+        weights /= weights.sum(axis=1, keepdims=True)
+        result[rows, columns] = np.einsum("nk,nkx->nx", weights, given[corners])
+        return result
+
+
+def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
+    """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at places (n, 2), in the image."""
+    a, b, c = (corners[:, k] for k in range(3))
+
+    def area(p: npt.NDArray[Any], q: npt.NDArray[Any], r: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        first, second = q - p, r - p
+        return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+    parts = np.stack([area(places, b, c), area(a, places, c), area(a, b, places)], axis=1)
+    weights: Points = parts / area(a, b, c)[:, None]
+    return weights
+
+
+def projected(camera: Camera, points: npt.ArrayLike) -> Points:
+    """Project world points (V, 3) to columns, rows [px] and depths [scene units], shape (V, 3)."""
+    pixels, depth = camera.project(points)
+    return np.ascontiguousarray(np.concatenate([pixels, depth[:, None]], axis=1))
+
+
+def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
+    """Return the part of the frame that projected points are in, with so many pixels around it."""
+    low, high = np.floor(points[:, :2].min(axis=0)) - margin, np.ceil(points[:, :2].max(axis=0)) + margin + 1
+    left, top = np.maximum(low, 0).astype(int)
+    right, bottom = np.minimum(high, (camera.width, camera.height)).astype(int)
+    return Window(int(left), int(top), int(right), int(bottom))
+
+
+def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
+    """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window."""
+    part = (window.left, window.top, window.right - window.left, window.bottom - window.top)
+    return Seen(points, triangles, window, grid, _raster.visible(points, triangles, part, grid))

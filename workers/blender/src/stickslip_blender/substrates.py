@@ -1,0 +1,138 @@
+"""What the cloth is dragged over: finishes drawn from a seed within the ranges of substrates.toml."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.cameras import Camera
+
+GRAIN_SIZE = 512
+"""Side of the picture of a floor's grain [texels]."""
+GRAIN_EXTENT = 0.5
+"""What the picture covers; it repeats [m]."""
+_SUBSAMPLES = 3
+HARD = ("aluminium", "aluminium-pet", "ceramic", "rough-glass", "smooth-glass", "polyester-mirror", "stainless-steel")
+"""The substrates of the thesis, 4.2.2."""
+
+
+@dataclass(frozen=True)
+class Substrate:
+    """One floor. Floors are traced grey and plain: `floor_factor` has their marks and colour."""
+
+    name: str
+    albedo: float
+    """Share of the light that it scatters, or as a metal reflects."""
+    roughness: float
+    """Of its gloss."""
+    metallic: float
+    """1 for a metal."""
+    specular: float
+    """Strength of a dielectric's gloss, 0.5 for an index of refraction of 1.5."""
+    grain: float
+    """Contrast of its marks: what moves over a floor without any does not seem to move."""
+    seed: int
+    """Of the marks."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factor of its colour, mean 1."""
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether things are seen in it."""
+        return self.roughness < 0.6
+
+    @property
+    def numbers(self) -> list[float]:
+        """What a dataset's label holds: albedo, roughness, metallic, specular, grain, tint."""
+        return [self.albedo, self.roughness, self.metallic, self.specular, self.grain, *self.tint]
+
+
+@cache
+def _ranges() -> dict[str, dict[str, Any]]:
+    text = files("stickslip_blender").joinpath("substrates.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def substrate_names() -> tuple[str, ...]:
+    """Name what `drawn_substrate` takes: the finishes, and `any` for one of the hard ones and the matt plate."""
+    return (*_ranges(), "any")
+
+
+def drawn_substrate(name: str, seed: int) -> Substrate:
+    """Draw a substrate of a finish."""
+    if name not in substrate_names():
+        raise ValueError(f"substrate must be one of {', '.join(substrate_names())}; got {name!r}")
+    random = np.random.Generator(np.random.PCG64([seed, 1]))
+    finish = str(random.choice(["matt", *HARD])) if name == "any" else name
+    ranges = _ranges()[finish]
+    tint = (1.0, 1.0, 1.0)
+    if finish == "cloth":
+        color = 0.15 + 0.85 * random.random(3)
+        tint = tuple((color / color.mean()).tolist())
+    return Substrate(
+        name=finish,
+        albedo=float(random.uniform(*ranges["albedo"])),
+        roughness=float(random.uniform(*ranges["roughness"])),
+        metallic=ranges["metallic"],
+        specular=ranges["specular"],
+        grain=ranges["grain"],
+        seed=int(random.integers(2**31)),
+        tint=tint,
+    )
+
+
+def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDArray[np.float32]:
+    """Return what the floor's marks and colour do to its light in each pixel, shape (height, width, 3).
+
+    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m].
+    """
+    offsets = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
+    rows = (np.arange(camera.height)[:, None] + offsets).ravel()
+    columns = (np.arange(camera.width)[:, None] + offsets).ravel()
+    u, v = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.asarray(camera.rotation)
+    reach = (height - camera.position[2]) / np.minimum(rays[..., 2], -1e-3)
+    place = (camera.position[:2] + reach[..., None] * rays[..., :2]) / GRAIN_EXTENT * GRAIN_SIZE
+    marks = _marks(substrate)
+    texel = np.floor(place).astype(int)
+    share = place - texel
+
+    def at(down: int, right: int) -> npt.NDArray[np.float64]:
+        found: npt.NDArray[np.float64] = marks[
+            (texel[..., 1] + down) % GRAIN_SIZE, (texel[..., 0] + right) % GRAIN_SIZE
+        ]
+        return found
+
+    low = at(0, 0) + share[..., 0] * (at(0, 1) - at(0, 0))
+    high = at(1, 0) + share[..., 0] * (at(1, 1) - at(1, 0))
+    fine = low + share[..., 1] * (high - low)
+    factor = fine.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(axis=(1, 3))
+    tinted: npt.NDArray[np.float32] = (factor[..., None] * np.asarray(substrate.tint)).astype(np.float32)
+    return tinted
+
+
+def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
+    """Return the factor of a square of the floor that repeats, shape (GRAIN_SIZE, GRAIN_SIZE)."""
+    random = np.random.Generator(np.random.PCG64(substrate.seed))
+    if substrate.name == "cloth":  # a plain weave, drawn four times too coarse to be seen at all
+        thread = np.arange(GRAIN_SIZE) // 4
+        over = (thread[:, None] + thread[None, :]) % 2
+        marks = np.where(over == 1, 0.5, -0.5) + 0.5 * _spots(random, 4.0)
+    else:
+        marks = 0.6 * _spots(random, 5.0) + 0.4 * _spots(random, 16.0)
+    factor: npt.NDArray[np.float64] = np.clip(1.0 + substrate.grain * marks, 0.2, 1.8)
+    return factor
+
+
+def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64]:
+    """Return smooth noise of unit deviation that repeats; `extent` of its spots [texels]."""
+    frequency = np.fft.fftfreq(GRAIN_SIZE)
+    decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))
+    noise = np.fft.ifft2(np.fft.fft2(random.standard_normal((GRAIN_SIZE, GRAIN_SIZE))) * decay).real
+    spots: npt.NDArray[np.float64] = noise / noise.std()
+    return spots
