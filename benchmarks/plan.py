@@ -46,7 +46,8 @@ def main() -> None:
             with httpx.Client(base_url=url, timeout=120) as client:
                 builds = {"sim_core": "a" * 64, "blender": "b" * 64, "packer": "c" * 64}
                 worker = {"name": "bench", "builds": builds, "kinds": ["rod_hang"], "slots": 1}
-                client.post("/v1/workers", json=worker).raise_for_status()
+                key = {"Authorization": f"Bearer {(Path(data) / 'worker-key').read_text().strip()}"}
+                client.post("/v1/workers", json=worker, headers=key).raise_for_status()
                 for name, start in (("first_seconds", 0.0), ("second_seconds", 500.0), ("same_again_seconds", 0.0)):
                     begin = time.perf_counter()
                     response = client.post("/v1/jobs", json=spec(samples, start=start))

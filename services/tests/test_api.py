@@ -21,7 +21,8 @@ def app(settings: Settings, clock: ManualClock) -> FastAPI:
 
 @pytest.fixture
 def client(app: FastAPI) -> Iterator[httpx.Client]:
-    with serving(app) as url, httpx.Client(base_url=url, timeout=30) as client:
+    headers = {"Authorization": f"Bearer {app.state.worker_key}"}
+    with serving(app) as url, httpx.Client(base_url=url, timeout=30, headers=headers) as client:
         yield client
 
 
@@ -35,7 +36,8 @@ def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
 def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, PretendWorker]]:
     """A coordinator for requests that are all refused."""
     app = make_app(Settings(data=tmp_path_factory.mktemp("untouched"), durable=False))
-    with serving(app) as url, httpx.Client(base_url=url, timeout=30) as client:
+    headers = {"Authorization": f"Bearer {app.state.worker_key}"}
+    with serving(app) as url, httpx.Client(base_url=url, timeout=30, headers=headers) as client:
         coordinator = app.state.coordinator
         yield client, PretendWorker(coordinator, coordinator.store).register()
 

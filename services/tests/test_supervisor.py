@@ -79,7 +79,8 @@ def test_up_starts_both_and_stops_both(up: Up) -> None:
     port = up.url.rsplit(":", 1)[1]
     assert port != "0"
     words = up.log.read_text().split()[1:]
-    expected = ["dispatch", "--url", up.url, "--store", str(up.data / "store"), "--name", "local", "--slots", "3"]
+    expected = ["dispatch", "--url", up.url, "--store", str(up.data / "store"), "--name", "local"]
+    expected += ["--key-file", str(up.data / "worker-key"), "--slots", "3"]
     assert words == expected
     pids = [*up.dispatchers(), up.coordinator()]
     second = Up(up.data.parent)

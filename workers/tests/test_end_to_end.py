@@ -56,7 +56,17 @@ class Services:
     def dispatch(self, log: str) -> subprocess.Popen[bytes]:
         name = "end-to-end"
         process = self._start(
-            log, "stickslip_workers", "dispatch", "--url", self.url, "--store", self.store, "--name", name
+            log,
+            "stickslip_workers",
+            "dispatch",
+            "--url",
+            self.url,
+            "--store",
+            self.store,
+            "--name",
+            name,
+            "--key-file",
+            self.store.parent / "worker-key",
         )
         self._wait_for_line(log, "registered as")
         return process

@@ -83,12 +83,15 @@ class Store:
         scratch.unlink(missing_ok=True)  # replace() does nothing where both names are one file already
 
 
-def write_durably(path: Path, data: bytes) -> None:
-    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename, fsync directory."""
+def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:
+    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename, fsync directory.
+
+    `mode` are its permissions, less those that the umask takes away.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = _scratch_path(path)
     try:
-        with scratch.open("wb") as file:
+        with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

@@ -16,22 +16,26 @@ import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
+from starlette.staticfiles import StaticFiles
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
+from stickslip_services.api.doors import DoorMiddleware, worker_key
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
-from stickslip_services.api.routes import certificates, datasets, health, jobs, tasks, workers
+from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, workers
 from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
+from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 
@@ -65,17 +69,20 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         version=__version__,
         description="Physically verified synthetic datasets of slender things.",
         lifespan=lifespan,
-        docs_url="/docs",
+        docs_url=None,
         redoc_url=None,
         openapi_url="/openapi.json",
     )
     app.state.coordinator = coordinator
     app.state.metrics = metrics
-    for module in (jobs, datasets, certificates, tasks, workers, health):
+    app.state.worker_key = worker_key(settings.worker_key_path)
+    for module in (jobs, datasets, certificates, tasks, workers, health, pages):
         app.include_router(module.router)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
+    app.add_middleware(DoorMiddleware, allowed_hosts=settings.allowed_hosts)
     app.add_middleware(RequestIdMiddleware)
     app.add_middleware(TimingMiddleware, observe=metrics.observe)
     return app
@@ -93,7 +100,8 @@ async def _for_ever(work: Callable[[], None], seconds: float) -> None:
 
 def openapi_text() -> str:
     """Return the OpenAPI document as it is committed."""
-    return json.dumps(make_app(Settings()).openapi(), indent=2, sort_keys=True) + "\n"
+    with TemporaryDirectory() as data:
+        return json.dumps(make_app(Settings(data=Path(data))).openapi(), indent=2, sort_keys=True) + "\n"
 
 
 class _Server(uvicorn.Server):

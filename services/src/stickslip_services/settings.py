@@ -21,6 +21,9 @@ class Settings(BaseSettings):
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 
+    allowed_hosts: tuple[str, ...] = ()
+    """Names, besides those of loopback, under which the coordinator may be asked: those of a proxy on this machine."""
+
     durable: bool = True
     """Wait for the disk at each commit. Without it a power cut may lose what was accepted; for tests."""
     lease_seconds: float = Field(default=30.0, gt=0)
@@ -51,6 +54,11 @@ class Settings(BaseSettings):
     def database_path(self) -> Path:
         """File of the database."""
         return self.data / "coordinator.sqlite3"
+
+    @property
+    def worker_key_path(self) -> Path:
+        """File of the key that workers show."""
+        return self.data / "worker-key"
 
     @property
     def store_root(self) -> Path:

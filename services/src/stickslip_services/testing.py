@@ -8,17 +8,20 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
+import numpy as np
 import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
-from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
+from stickslip_schemas.arrays import SAMPLE_KEY_BYTES, ArrayLayout
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.chunks import encode_chunk, encode_shard, encode_trajectory
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
@@ -27,6 +30,7 @@ from stickslip_schemas.tasks import (
     ChunkRef,
     FileEntry,
     PackOutput,
+    PackTask,
     PublishOutput,
     PublishTask,
     RecordRef,
@@ -129,6 +133,8 @@ class PretendWorker:
     judge: Callable[[Any], TaskResult | None] = lambda _task: None
     id: str = ""
     ran: list[str] = field(default_factory=list)
+    whole: bool = False
+    """Whether its datasets have all the arrays of their kind, filled with something, and not just two."""
 
     def register(self) -> "PretendWorker":
         """Present itself."""
@@ -194,6 +200,13 @@ class PretendWorker:
             preview = self.store.publish(b"\x89PNG" + data) if task.preview else None
             where = ChunkRef(digest=digest, offset=0, length=len(data))
             output = RenderOutput(chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
+        elif task.stage == "pack" and self.whole:
+            arrays = ((array.shard_path(task.shard), _encoded(array, task)) for array in layout(task.spec))
+            output = PackOutput(
+                files=tuple(
+                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data)) for path, data in arrays
+                )
+            )
         elif task.stage == "pack":
             data = b"".join(slot.sample_key.encode() for slot in task.slots) * 50
             entry = FileEntry(path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data))
@@ -254,6 +267,29 @@ class PretendWorker:
         return entries
 
 
+def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
+    """Return the file of an array whose values rise from sample to sample."""
+    size = task.spec.samples_per_shard
+    ramp = np.arange(prod(array.shape)).reshape(array.shape)
+    values = [((ramp + slot.slot) % 251).astype(array.dtype) for slot in task.slots if slot.valid]
+    if array.name == "sample_key":
+        keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]
+        values = keys
+    encode = encode_trajectory if array.is_trajectory else encode_chunk
+    if array.per_sample:
+        rows = iter(values)
+        chunks = [encode(next(rows)) if slot.valid else None for slot in task.slots]
+        return encode_shard([*chunks, *[None] * (size - len(chunks))])
+    if array.name == "valid":
+        values = [np.asarray(slot.valid) for slot in task.slots]
+    elif array.name != "sample_key" and len(values) < len(task.slots):
+        rows = iter(values)
+        values = [next(rows) if slot.valid else np.full(array.shape, array.fill, array.dtype) for slot in task.slots]
+    column = np.full((size, *array.shape), array.fill, dtype=array.dtype)
+    column[: len(values)] = values
+    return encode_chunk(column)
+
+
 @dataclass
 class RunningServer:
     """A coordinator as a process of its own."""
@@ -269,7 +305,8 @@ class RunningServer:
 
     def worker(self, **options: Any) -> PretendWorker:
         """Return a worker that has registered."""
-        return PretendWorker(HttpApi(self.url), self.store, **options).register()
+        key = (self.data / "worker-key").read_text().strip()
+        return PretendWorker(HttpApi(self.url, key), self.store, **options).register()
 
     def stop(self) -> None:
         """Stop it."""
@@ -282,8 +319,9 @@ class RunningServer:
 class HttpApi:
     """The four verbs of the worker API over HTTP."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, key: str) -> None:
         self._url = url
+        self._key = key
 
     def register(self, document: WorkerRegistration) -> WorkerSession:
         """Register a worker."""
@@ -303,6 +341,7 @@ class HttpApi:
 
     def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
         content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
+        headers["Authorization"] = f"Bearer {self._key}"
         response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
         response.raise_for_status()
         return answer.model_validate_json(response.content)

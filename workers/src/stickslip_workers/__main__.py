@@ -24,6 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     dispatch.add_argument("--url", required=True, help="base URL of the coordinator")
     dispatch.add_argument("--store", type=Path, required=True, help="root of the store")
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
+    dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
     dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
     dispatch.add_argument("--ray-address", help="an existing Ray cluster (default: a cluster of its own)")
     dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
@@ -59,10 +60,14 @@ def _dispatch(options: argparse.Namespace) -> int:
     if not options.blender_python.exists():
         logging.error("blender-python must be an interpreter; %s does not exist", options.blender_python)
         return 2
+    if options.key_file is not None and not options.key_file.is_file():
+        logging.error("key-file must be a file with the coordinator's worker key; %s does not exist", options.key_file)
+        return 2
     settings = Settings(
         url=options.url,
         store=options.store,
         name=options.name,
+        key=None if options.key_file is None else options.key_file.read_text(encoding="ascii").strip(),
         slots=options.slots,
         ray_address=options.ray_address,
         # Not resolved: a virtual environment is known by the path of its link.

@@ -42,10 +42,11 @@ class RefusedError(CoordinatorError):
 class CoordinatorClient:
     """A client, for any number of threads."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, key: str | None = None) -> None:
         # A proxy of the environment is for the world outside, not for a service beside this one.
         timeout = httpx.Timeout(30, connect=5)
-        self._http = httpx.Client(base_url=url.rstrip("/"), timeout=timeout, trust_env=False)
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        self._http = httpx.Client(base_url=url.rstrip("/"), timeout=timeout, headers=headers, trust_env=False)
 
     def register(self, registration: WorkerRegistration) -> WorkerSession:
         """Present the dispatcher."""

@@ -19,6 +19,8 @@ class Settings:
     """Root of the store: the same directory on every node."""
     name: str
     """Name of this dispatcher; a second one of the same name takes the first one's place."""
+    key: str | None = None
+    """What the coordinator wants to be shown by workers; None where it wants nothing."""
     slots: int | None = None
     """How many tasks run at once; by default the CPUs of the cluster."""
     ray_address: str | None = None

@@ -12,7 +12,7 @@ from stickslip_services.cli.common import console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.http import ClientError
 
-_SERVER_MODULES = ("alembic", "fastapi", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
+_SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
 
 
 class ServerNotInstalledError(ClientError):
@@ -44,6 +44,9 @@ def up(
     screen = console()
     status = supervisor.run(
         supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher),
-        on_ready=lambda url: screen.print(f"stickslip is up at [bold]{url}[/] (data in {escape(str(data))})"),
+        on_ready=lambda url: screen.print(
+            f"stickslip is up at [bold]{url}[/] (data in {escape(str(data))}). Open it in a browser, or submit a job: "
+            f"stickslip submit SPEC.yaml --watch --url {url}\nlogs: {escape(str(data / 'logs'))}; Ctrl-C stops it"
+        ),
     )
     raise typer.Exit(status)

@@ -191,7 +191,19 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
     if service.dispatcher is not None:
         program = shlex.split(service.dispatcher)
     slots = [] if service.slots is None else ["--slots", str(service.slots)]
-    return [*program, "dispatch", "--url", settings.url, "--store", str(settings.store_root), "--name", "local", *slots]
+    return [
+        *program,
+        "dispatch",
+        "--url",
+        settings.url,
+        "--store",
+        str(settings.store_root),
+        "--name",
+        "local",
+        "--key-file",
+        str(settings.worker_key_path),
+        *slots,
+    ]
 
 
 def _wait_until_ready(url: str, coordinator: _Child, signals: list[int]) -> bool:

@@ -27,7 +27,7 @@ def dataset_page(manifest: Manifest) -> str:
     """Return the page as HTML."""
     points = list(grid(manifest.spec))
     lost = [rejection.slot for rejection in manifest.rejections]
-    axes = [axis for axis in (_Axis.of(name, points) for name in manifest.spec.named_axes) if axis.size > 1]
+    axes = [axis for axis in (Axis.of(name, points) for name in manifest.spec.named_axes) if axis.size > 1]
     maps = "".join(_map(across, up, points, lost) for across, up in combinations(axes, 2))
     title = f"{escape(manifest.dataset)}, version {manifest.version}"
     return f"""<!doctype html>
@@ -95,7 +95,7 @@ def _listed(manifest: Manifest) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Axis:
+class Axis:
     """An axis of the grid in cells."""
 
     name: str
@@ -105,27 +105,30 @@ class _Axis:
     cell: dict[Any, int]
     """The cell of each value."""
 
+    def bounds(self, cell: int) -> str:
+        """Return which values a cell holds."""
+        return self.labels[cell] if len(self.labels) == self.size else f"{self.labels[cell]} to {self.labels[cell + 1]}"
+
     @staticmethod
-    def of(name: str, points: Sequence[dict[str, Any]]) -> "_Axis":
+    def of(name: str, points: Sequence[dict[str, Any]]) -> "Axis":
+        """Return an axis in at most `CELLS` cells."""
         values = sorted({point[name] for point in points})
         if len(values) <= CELLS:
-            return _Axis(name, tuple(map(_text, values)), len(values), {value: i for i, value in enumerate(values)})
+            return Axis(name, tuple(map(_text, values)), len(values), {value: i for i, value in enumerate(values)})
         if isinstance(values[0], str):  # names have no distances: as many in each cell
             starts = [values[i * len(values) // CELLS] for i in range(CELLS)]
-            return _Axis(
-                name, (*starts, values[-1]), CELLS, {v: i * CELLS // len(values) for i, v in enumerate(values)}
-            )
+            return Axis(name, (*starts, values[-1]), CELLS, {v: i * CELLS // len(values) for i, v in enumerate(values)})
         low, high = values[0], values[-1]
         bounds = tuple(_text(low + (high - low) * i / CELLS) for i in range(CELLS + 1))
         cells = {value: min(int(CELLS * (value - low) / (high - low)), CELLS - 1) for value in values}
-        return _Axis(name, bounds, CELLS, cells)
+        return Axis(name, bounds, CELLS, cells)
 
 
 def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float | int) else str(value)
 
 
-def _map(across: _Axis, up: _Axis, points: Sequence[dict[str, Any]], lost: Sequence[int]) -> str:
+def _map(across: Axis, up: Axis, points: Sequence[dict[str, Any]], lost: Sequence[int]) -> str:
     """Draw the share of samples lost in each cell of two axes, over all values of the others."""
 
     def cells(chosen: Sequence[dict[str, Any]]) -> Counter[tuple[int, int]]:
@@ -136,7 +139,7 @@ def _map(across: _Axis, up: _Axis, points: Sequence[dict[str, Any]], lost: Seque
     marks = []
     for (i, j), count in sorted(asked.items()):
         share = rejected[i, j] / count
-        told = f"{across.name} {_bounds(across, i)}, {up.name} {_bounds(up, j)}: {rejected[i, j]} of {count} lost"
+        told = f"{across.name} {across.bounds(i)}, {up.name} {up.bounds(j)}: {rejected[i, j]} of {count} lost"
         marks.append(
             f'<rect x="{_MARGIN + i * width:.1f}" y="{_SIDE - (j + 1) * height:.1f}" width="{width:.1f}" '
             f'height="{height:.1f}" fill="{_color(share)}" data-lost="{rejected[i, j]}">'
@@ -158,11 +161,7 @@ def _map(across: _Axis, up: _Axis, points: Sequence[dict[str, Any]], lost: Seque
     )
 
 
-def _bounds(axis: _Axis, cell: int) -> str:
-    return axis.labels[cell] if len(axis.labels) == axis.size else f"{axis.labels[cell]} to {axis.labels[cell + 1]}"
-
-
-def _ticks(axis: _Axis) -> list[tuple[float, str]]:
+def _ticks(axis: Axis) -> list[tuple[float, str]]:
     """Return the places, in cells, and texts of the first, the middle and the last label."""
     shift = 0.5 if len(axis.labels) == axis.size else 0.0
     last = len(axis.labels) - 1

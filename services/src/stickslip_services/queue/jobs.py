@@ -10,12 +10,13 @@ from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
-from stickslip_schemas.states import JobState, Reason, TaskState
+from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, make_page
-from stickslip_services.database.tables import idempotency_keys, jobs, previews, samples, tasks
+from stickslip_services.database.tables import idempotency_keys, job_stages, jobs, previews, samples, tasks
 from stickslip_services.errors import ConflictError, IdempotencyKeyReusedError, NotFoundError
+from stickslip_services.queue.eta import StageTimings
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
 from stickslip_services.queue.progress import read_progress, rejected_samples
@@ -179,6 +180,25 @@ def list_previews(connection: Connection, job: int) -> list[Preview]:
         .limit(1000)
     )
     return [Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}") for row in rows]
+
+
+def newest_previews(connection: Connection, job: int, count: int) -> list[Preview]:
+    """Return the previews of a job that came last, newest first."""
+    rows = connection.execute(
+        select(samples.c.slot, samples.c.labels, previews.c.digest)
+        .join(previews, previews.c.task == samples.c.render_task)
+        .join(tasks, tasks.c.seq == previews.c.task)
+        .where(samples.c.job == job)
+        .order_by(tasks.c.finished_at.desc(), samples.c.slot)
+        .limit(count)
+    )
+    return [Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}") for row in rows]
+
+
+def stage_durations(connection: Connection, job: int) -> dict[Stage, StageTimings]:
+    """Return the measured durations of the tasks that a job had to run, by stage."""
+    rows = connection.execute(select(job_stages).where(job_stages.c.job == job))
+    return {Stage(row.stage): StageTimings(row.wall_count, row.wall_sum, row.wall_squares) for row in rows}
 
 
 def is_preview(connection: Connection, digest: str) -> bool:

@@ -7,13 +7,14 @@ running finishes and is kept.
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from sqlalchemy import Connection, select, text, update
 from stickslip_schemas.events import TaskStateEvent
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.database import batches
-from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, cancel_tasks, live_jobs, release
 from stickslip_services.settings import Settings
@@ -106,6 +107,40 @@ def reproducer(name: str, settings: Settings) -> str:
     """Return the command that runs a task again, by itself, on a machine with a worker's environment."""
     fetch = f"curl -s {settings.url}/v1/tasks/{name} -o task.json"
     return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(str(settings.store_root))}"
+
+
+@dataclass(frozen=True, slots=True)
+class FailedTask:
+    """A task that has failed for good, or waits for another try."""
+
+    task_id: str
+    stage: Stage
+    tries: int
+    reason: str
+    message: str
+    reproducer: str
+
+
+def failed_tasks(connection: Connection, job: int, settings: Settings, count: int) -> list[FailedTask]:
+    """Return the tasks of a job that have failed, or are to be tried again, newest first."""
+    rows = connection.execute(
+        select(tasks.c.key, tasks.c.stage, tasks.c.tries, tasks.c.reason, tasks.c.message)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.state.in_((TaskState.failed, TaskState.soft_failed)))
+        .order_by(tasks.c.seq.desc())
+        .limit(count)
+    )
+    return [
+        FailedTask(
+            name := task_id(row.stage, row.key),
+            Stage(row.stage),
+            row.tries,
+            str(row.reason),
+            row.message,
+            reproducer(name, settings),
+        )
+        for row in rows
+    ]
 
 
 def _still_needed(book: Ledger, held: Sequence[HeldTask]) -> list[tuple[HeldTask, int]]:

@@ -11,9 +11,9 @@ from stickslip_schemas.states import Stage
 from stickslip_schemas.worker_api import WorkerRegistration
 
 from stickslip_services.clock import as_datetime
-from stickslip_services.database.tables import tasks, workers
+from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
-from stickslip_services.queue.ids import new_id
+from stickslip_services.queue.ids import new_id, task_id
 
 NO_WORKER = "no worker has registered yet; the job is planned when one does"
 
@@ -124,6 +124,32 @@ def leased_counts(connection: Connection) -> dict[str, int]:
     """Return how many tasks each worker holds."""
     query = select(tasks.c.owner, func.count()).where(text("tasks.owner IS NOT NULL")).group_by(tasks.c.owner)
     return dict(connection.execute(query).all())
+
+
+@dataclass(frozen=True, slots=True)
+class RunningTask:
+    """What a worker is at."""
+
+    task_id: str
+    stage: Stage
+    job: str | None
+    since: float | None
+    """When it was started [s since 1970]; None: it waits at the worker."""
+
+
+def running_tasks(connection: Connection) -> dict[str, list[RunningTask]]:
+    """Return the tasks on lease by worker, those that run longest first."""
+    rows = connection.execute(
+        select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
+        .outerjoin(jobs, jobs.c.seq == tasks.c.job)
+        .where(text("tasks.owner IS NOT NULL"))
+        .order_by(tasks.c.state.desc(), tasks.c.started_at)
+    )
+    found: dict[str, list[RunningTask]] = {}
+    for owner, key, stage, state, started_at, job in rows:
+        since = started_at if state == "running" else None
+        found.setdefault(owner, []).append(RunningTask(task_id(stage, key), Stage(stage), job, since))
+    return found
 
 
 def show_workers(connection: Connection, *, alive_since: float) -> list[responses.WorkerEntry]:

@@ -30,6 +30,8 @@ PageDep = Annotated[PageRequest, Depends(_page)]
 
 _TITLES = {
     400: "The body is not JSON",
+    401: "The key is missing or wrong",
+    403: "The request comes under a foreign name, or from a page of another site",
     404: "There is no such thing",
     409: "It cannot be done in the state that the thing is in",
     413: "The body is too large",
@@ -48,5 +50,5 @@ def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     schema = {"$ref": "#/components/schemas/Problem"}
     return {
         status: {"description": _TITLES[status], "content": {MEDIA_TYPE: {"schema": schema}}}
-        for status in sorted({*statuses, 500, 503})
+        for status in sorted({*statuses, 403, 500, 503})
     }

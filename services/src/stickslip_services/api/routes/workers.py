@@ -1,6 +1,6 @@
 """The worker API: a dispatcher registers, leases tasks, says that it lives, and reports."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Response
 from stickslip_schemas.responses import WorkerEntry
@@ -16,11 +16,14 @@ from stickslip_schemas.worker_api import (
 )
 
 from stickslip_services.api.bodies import JsonBody, body_schema
+from stickslip_services.api.doors import require_worker_key
 from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.workers import show_workers
 
 router = APIRouter(tags=["workers"])
+
+_KEY: dict[str, Any] = {"dependencies": [Depends(require_worker_key)]}
 
 CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
@@ -34,8 +37,9 @@ def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
 
 @router.post(
     "/v1/workers",
+    **_KEY,
     status_code=201,
-    responses=problem_responses(*BODY_PROBLEMS),
+    responses=problem_responses(401, *BODY_PROBLEMS),
     openapi_extra=body_schema("WorkerRegistration"),
 )
 def post_worker(
@@ -47,8 +51,9 @@ def post_worker(
 
 @router.post(
     "/v1/worker/lease",
+    **_KEY,
     response_model=LeaseBatch,
-    responses=problem_responses(404, 409, *BODY_PROBLEMS),
+    responses=problem_responses(401, 404, 409, *BODY_PROBLEMS),
     openapi_extra=body_schema("LeaseRequest"),
 )
 def post_lease(
@@ -61,7 +66,8 @@ def post_lease(
 
 @router.post(
     "/v1/worker/heartbeat",
-    responses=problem_responses(404, *BODY_PROBLEMS),
+    **_KEY,
+    responses=problem_responses(401, 404, *BODY_PROBLEMS),
     openapi_extra=body_schema("Heartbeat"),
 )
 def post_heartbeat(
@@ -73,7 +79,8 @@ def post_heartbeat(
 
 @router.post(
     "/v1/worker/report",
-    responses=problem_responses(404, *BODY_PROBLEMS),
+    **_KEY,
+    responses=problem_responses(401, 404, *BODY_PROBLEMS),
     openapi_extra=body_schema("ReportBatch"),
 )
 def post_report(

@@ -1,0 +1,188 @@
+"""The dashboard: every page answers, shows what it should, escapes what it is given, and changes jobs."""
+
+import asyncio
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.states import JobState
+from stickslip_services.api.routes.pages import _changes
+from stickslip_services.coordinator import make_app
+from stickslip_services.pages.pictures import line_plot, png
+from stickslip_services.settings import Settings
+from stickslip_services.testing import ManualClock, PretendWorker, failure, rejection, rods, serving, show_job
+
+
+@pytest.fixture
+def app(settings: Settings, clock: ManualClock) -> FastAPI:
+    return make_app(settings, clock=clock)
+
+
+@pytest.fixture
+def client(app: FastAPI) -> Iterator[httpx.Client]:
+    with serving(app) as url, httpx.Client(base_url=url, timeout=20, follow_redirects=True) as client:
+        yield client
+
+
+@pytest.fixture
+def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
+    return PretendWorker(app.state.coordinator, app.state.coordinator.store, whole=True).register()
+
+
+def submit(client: httpx.Client, **spec: Any) -> str:
+    response = client.post("/v1/jobs", json=rods(**spec))
+    assert response.status_code == 202, response.text
+    return str(response.json()["id"])
+
+
+def read(client: httpx.Client, path: str) -> str:
+    response = client.get(path)
+    assert response.status_code == 200, (path, response.text)
+    assert response.headers["content-type"].startswith("text/html")
+    assert "script-src 'self'" in response.headers["content-security-policy"]
+    assert not re.search(r"(src|href)=\"(https?:)?//", response.text), "everything comes from here"
+    return response.text
+
+
+def test_empty_pages_say_what_to_do(client: httpx.Client) -> None:
+    assert "stickslip submit spec.yaml" in read(client, "/")
+    assert "No worker is connected" in read(client, "/")
+    assert "There are no datasets yet" in read(client, "/datasets")
+    assert "stickslip certify" in read(client, "/certificates")
+    assert "stickslip up" in read(client, "/workers")
+    assert "/v1/jobs:validate" in read(client, "/docs")
+
+
+def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker) -> None:
+    job = submit(client, name="first", gamma=[1.0, 2.0, 3.0])
+    assert "first" in read(client, "/")
+    leases = worker.lease(simulate=1)
+    worker.start(*leases)
+    assert "simulate" in read(client, "/workers")
+    assert job in read(client, "/workers")
+    worker.finish(*leases)
+    worker.work()
+    page = read(client, f"/jobs/{job}")
+    assert "succeeded" in page
+    assert "stickslip pull ds-" in page
+    assert "samples_per_shard: 2" in page
+    assert page.count("/v1/previews/") == 6
+    assert "gamma 1, phi1 1: 1 of 1 done" in read(client, f"/ui/jobs/{job}/map")
+    path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)
+    assert path is not None
+    dataset = read(client, path[0])
+    assert dataset.count("/samples/") >= 6
+    assert "accepted" not in dataset  # nothing was lost
+    assert "DatasetReader" in dataset
+    assert "energy" in dataset
+    assert "6 of 6 samples" in dataset
+    thumbs = read(client, f"/ui{path[0]}/thumbs?gamma.from=1&gamma.to=1")
+    assert "2 of 6 samples" in thumbs
+    sample = read(client, f"{path[0]}/samples/3")
+    assert sample.count("<polyline") >= 3
+    assert "curvature" in sample
+    assert 'data-values="/ui' in sample
+    picture = client.get(f"/ui{path[0]}/samples/3/views/2.png")
+    assert (picture.headers["content-type"], picture.content[:8]) == ("image/png", b"\x89PNG\r\n\x1a\n")
+    points = client.get(f"/ui{path[0]}/samples/3/centerline.json").json()["points"]
+    assert np.shape(points) == (1, 150, 3)
+    for missing in ("samples/99", "samples/-1"):
+        assert client.get(f"{path[0]}/{missing}").status_code == 404
+    for missing in ("3/nothing.json", "3/views/9.png", "3/energy/0.png"):
+        assert client.get(f"/ui{path[0]}/samples/{missing}").status_code == 404
+    assert read(client, re.sub("/v1$", "", path[0])) == dataset
+
+
+def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> None:
+    worker.judge = lambda task: (
+        rejection("it fell <b>off</b>") if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
+    )
+    job = submit(client)
+    worker.work()
+    page = read(client, f"/jobs/{job}")
+    assert "it fell &lt;b&gt;off&lt;/b&gt;" in page
+    path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)
+    assert path is not None
+    assert "(50.0 %)" in read(client, path[0])
+    assert "This sample was rejected: solver diverged" in read(client, f"{path[0]}/samples/0")
+
+
+def test_what_failed_is_shown_with_its_reproducer(
+    client: httpx.Client, worker: PretendWorker, clock: ManualClock, app: FastAPI
+) -> None:
+    worker.judge = lambda _task: failure(message="it crashed at line 7")
+    job = submit(client, gamma=(1.0,), phi1=(1.0,))
+    for _ in range(4):
+        worker.work()
+        clock.advance(10)
+        app.state.coordinator.sweep()
+    page = read(client, f"/jobs/{job}")
+    assert "it crashed at line 7" in page
+    assert "python -m stickslip_workers replay" in page
+
+
+def test_names_cannot_break_out(client: httpx.Client) -> None:
+    name = "<script>alert(1)</script>"
+    response = client.post("/v1/jobs", json=rods(name=name))
+    if response.status_code == 422:  # names are restricted: nothing to escape
+        return
+    assert name not in read(client, "/")
+
+
+def test_buttons_change_jobs(client: httpx.Client, worker: PretendWorker, app: FastAPI) -> None:
+    job = submit(client)
+    coordinator = app.state.coordinator
+    for verb, state in (("pause", JobState.paused), ("resume", JobState.queued), ("cancel", JobState.cancelled)):
+        assert f"/ui/jobs/{job}/{verb}" in read(client, "/")
+        answer = client.post(f"/ui/jobs/{job}/{verb}")
+        assert (answer.status_code, answer.headers["hx-redirect"]) == (204, f"/jobs/{job}")
+        assert show_job(coordinator, job).state is state
+    again = client.post(f"/ui/jobs/{job}/resubmit").headers["hx-redirect"].rpartition("/")[2]
+    assert again != job
+    worker.work()
+    assert show_job(coordinator, again).state is JobState.succeeded
+    assert client.post(f"/ui/jobs/{job}/explode").status_code == 404
+    assert client.post("/ui/jobs/job-0/pause").status_code == 404
+
+
+def test_a_page_is_told_of_changes(app: FastAPI, client: httpx.Client) -> None:
+    async def first_change() -> bytes:
+        stream = _changes(app.state.coordinator)
+        assert await anext(stream) == b"retry: 2000\n\n"
+        change = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(0.05)
+        app.state.coordinator.bell.ring()
+        return await asyncio.wait_for(change, 5)
+
+    assert asyncio.run(first_change()) == b"event: change\ndata: {}\n\n"
+
+
+def test_assets_are_local_and_licensed(client: httpx.Client) -> None:
+    for name in ("app.css", "app.js", "htmx.min.js", "icon.svg"):
+        assert client.get(f"/static/{name}").status_code == 200
+    assert "Zero-Clause BSD" in client.get("/static/htmx-LICENSE.txt").text
+    assert sha256(client.get("/static/htmx.min.js").content)
+    assert client.get("/static/../app.py").status_code == 404
+
+
+def test_png_and_plot_hold_what_they_are_given() -> None:
+    import struct
+    import zlib
+
+    pixels = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    data = png(pixels)
+    assert struct.unpack(">II", data[16:24]) == (3, 2)
+    start = data.index(b"IDAT") + 4
+    (length,) = struct.unpack(">I", data[start - 8 : start - 4])
+    rows = np.frombuffer(zlib.decompress(data[start : start + length]), dtype=np.uint8).reshape(2, 10)
+    assert (rows[:, 0] == 0).all()
+    assert (rows[:, 1:].reshape(2, 3, 3) == pixels).all()
+    plot = line_plot([0.0, 1.0, 2.0], {"a<b": [1.0, float("nan"), 3.0]}, x_name="t", y_name="y")
+    assert plot.count(",") >= 2
+    assert "a&lt;b" in plot
+    assert "nan" not in plot
