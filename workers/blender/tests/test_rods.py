@@ -129,7 +129,7 @@ def test_a_scratch_folder_makes_the_same_bytes_and_is_left_empty(
 ) -> None:
     with RodRenderer(quality=Quality.draft, scratch=tmp_path) as renderer:
         assert np.array_equal(renderer.render(curl, rig, color=ORANGE), views)
-        assert len(list(tmp_path.rglob("*.bmp"))) == 1
+        assert len(list(tmp_path.rglob("frame*"))) == 1
     assert list(tmp_path.iterdir()) == []
 
 
