@@ -118,7 +118,7 @@ class Dispatcher:
         self._reports_due = 0.0
         self._task_seconds: dict[Stage, float] = {}
         self._simulation_seconds: float | None = None
-        self._renders_share = True
+        self._renders_share = False
         """Whether the last renders that were leased share traces."""
         self._next_lease = 0.0
         self._stopping = False
