@@ -2,12 +2,14 @@
 
 import json
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from stickslip_services.cli import app
+from stickslip_services.client import Client
 from stickslip_services.testing import PretendWorker, RunningServer, rejection, rods, start_server, wait_until
 from typer.testing import CliRunner, Result
 
@@ -61,8 +63,8 @@ def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningSer
     (dataset,) = json.loads(cli("datasets", "--json").stdout)
     assert f"{dataset['id']}:v1" in cli("datasets").stdout
     pulled = cli("pull", dataset["id"], tmp_path / "d")
-    assert "9 files loaded" in pulled.stdout, pulled.output
-    assert "0 files loaded" in cli("pull", f"{dataset['id']}:v1", tmp_path / "d").stdout
+    assert "9 files downloaded" in pulled.stdout, pulled.output
+    assert "0 files downloaded (0 B), 9 cached" in cli("pull", f"{dataset['id']}:v1", tmp_path / "d").stdout
     assert cli("verify", tmp_path / "d").exit_code == 0
     (tmp_path / "d" / "views/c/0/0").write_bytes(b"")
     wrong = cli("verify", tmp_path / "d")
@@ -140,3 +142,54 @@ def test_watching_survives_a_restart_of_the_coordinator(tmp_path: Path) -> None:
     again.stop()
     assert results[0].exit_code == 0, results[0].output
     assert results[0].stdout.count("is succeeded") == 1
+
+
+def test_pausing_and_resuming(cli: Any, tmp_path: Path, shared_server: RunningServer) -> None:
+    submitted = cli("submit", write(tmp_path / "spec.json", rods(gamma=(41.0,))))
+    job = submitted.stdout.strip()
+    assert f"stickslip watch {job}" in submitted.stderr
+    paused = cli("pause", job).stdout
+    assert "paused" in paused
+    assert f"stickslip resume {job}" in paused
+    assert "is queued" in cli("resume", job).stdout
+    assert "cancelled" in cli("cancel", job).stdout
+    assert "can be paused" in cli("pause", job).stderr
+    shared_server.worker(name="shown")
+    assert "shown" in cli("workers").stdout
+
+
+def test_without_a_coordinator_it_fails_at_once_and_validates_all_the_same(tmp_path: Path) -> None:
+    runner = CliRunner()
+    spec = write(tmp_path / "spec.yaml", rods())
+    env = {"STICKSLIP_URL": "http://127.0.0.1:1", "COLUMNS": "200"}
+    begin = time.monotonic()
+    for command in (["jobs"], ["submit", str(spec)], ["workers"], ["watch", "job-0"]):
+        done = runner.invoke(app, command, env=env)
+        assert done.exit_code == 1
+        assert "stickslip up" in done.stderr
+    assert time.monotonic() - begin < 5.0
+    valid = runner.invoke(app, ["validate", str(spec)], env=env)
+    assert valid.exit_code == 0, valid.output
+    assert "samples                    4" in valid.stdout
+    assert "No coordinator answers" in valid.stderr
+    wrong = write(tmp_path / "wrong.yaml", rods(gamma=(-1.0,)))
+    invalid = runner.invoke(app, ["validate", str(wrong)], env=env)
+    assert invalid.exit_code == 1
+    assert "axes.gamma" in invalid.stderr
+    assert "-1.0" in invalid.stderr
+
+
+def test_ctrl_c_leaves_the_job_alone(
+    cli: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_server: RunningServer
+) -> None:
+    job = cli("submit", write(tmp_path / "spec.json", rods(gamma=(51.0,)))).stdout.strip()
+
+    def interrupt(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Client, "events", interrupt)
+    done = cli("watch", job)
+    assert done.exit_code == 130
+    assert f"stickslip cancel {job}" in done.stderr
+    assert "queued" in cli("jobs").stdout
+    cli("cancel", job)

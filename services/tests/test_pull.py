@@ -202,7 +202,7 @@ def test_a_manifest_other_than_promised_is_refused(origin: tuple[str, str], tmp_
 
 def test_a_coordinator_that_is_away_is_waited_for() -> None:
     answers: Iterator[httpx.Response | Exception] = iter(
-        [httpx.ConnectError("refused"), httpx.Response(503), httpx.Response(200, json=[])]
+        [httpx.Response(503), httpx.ConnectError("refused"), httpx.ReadError("gone"), httpx.Response(200, json=[])]
     )
     slept: list[float] = []
 
@@ -214,10 +214,21 @@ def test_a_coordinator_that_is_away_is_waited_for() -> None:
 
     with Client(transport=httpx.MockTransport(answer), sleep=slept.append) as client:
         assert client.workers() == []
-    assert len(slept) == 2
+    assert len(slept) == 3
     always = httpx.MockTransport(lambda _request: httpx.Response(503))
     with Client(transport=always, patience=0) as client, pytest.raises(UnexpectedError, match="503"):
         client.workers()
+
+
+def test_a_coordinator_that_is_not_there_is_not_waited_for() -> None:
+    def refuse(_request: httpx.Request) -> httpx.Response:
+        raise httpx.ConnectError("refused")
+
+    slept: list[float] = []
+    transport = httpx.MockTransport(refuse)
+    with Client(transport=transport, sleep=slept.append) as client, pytest.raises(UnreachableError, match="refused"):
+        client.workers()
+    assert slept == []
 
 
 def test_a_problem_is_an_exception_with_all_it_says(origin: tuple[str, str]) -> None:

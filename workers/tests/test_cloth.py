@@ -189,11 +189,14 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
-            light = [float(value) for value in rng.random(5).astype(np.float32)]
-            labels = sample.labels | result.output.labels | {"light_seed": i, "light": light}
+            shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": (), "gate_db": ()}
+            seen = {name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()}
+            seen |= {"light_seed": i, "composed": True, "lighting": "drawn", "substrate": "ceramic"}
+            labels = sample.labels | result.output.labels | seen
             arrays["valid"][i] = True
-            for name in (*result.output.labels, "light_seed", "light"):
-                arrays[name][i] = 0 if name == "kernel" else labels[name]
+            codes = {"kernel": 0, "lighting": 0, "substrate": 3}
+            for name in (*result.output.labels, *seen):
+                arrays[name][i] = codes.get(name, labels[name])
             for name, values in Records(store)(result.output.record.digest).items():
                 if name in arrays:
                     arrays[name][i] = values[0]

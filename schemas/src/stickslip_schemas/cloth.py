@@ -73,6 +73,7 @@ class PresetName(StrEnum):
 
     certified = "certified"
     fast = "fast"
+    fine = "fine"
     thesis_high = "thesis-high"
     thesis_low_small_dt = "thesis-low-small-dt"
     thesis_low_big_dt = "thesis-low-big-dt"

@@ -21,6 +21,11 @@ def console() -> Console:
     return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
+def say(text: str) -> None:
+    """Tell people something that programs need not read, on standard error."""
+    typer.echo(text, err=True)
+
+
 def print_json(value: BaseModel | list[Any]) -> None:
     """Print documents as JSON."""
     if isinstance(value, BaseModel):

@@ -60,8 +60,8 @@ def pull_dataset(
             )
     there = done.files - done.downloaded_files
     screen.print(
-        f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files loaded "
-        f"({wording.size(done.downloaded_bytes)}), {there} there already"
+        f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files downloaded "
+        f"({wording.size(done.downloaded_bytes)}), {there} cached"
     )
 
 
@@ -89,5 +89,6 @@ def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset
     for fault in faults:
         shown.add_row(escape(fault.path), fault.fault, escape(fault.detail))
     screen.print(shown)
-    screen.print(f"{len(faults)} files are not as they should be", style="red")
+    files = "1 file is" if len(faults) == 1 else f"{len(faults)} files are"
+    screen.print(f"{files} missing, damaged or not part of the dataset. `stickslip pull` mends it.", style="red")
     raise typer.Exit(1)

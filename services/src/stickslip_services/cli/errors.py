@@ -25,7 +25,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         try:
             return command(*arguments, **options)
         except ProblemError as error:
-            _print(error.problem.detail if not error.problem.errors else error.problem.title)
+            _print(error.problem.detail if not error.problem.errors else "the document is not valid")
             for field in error.problem.errors:
                 place = field.pointer.lstrip("/").replace("/", ".") or "the document"
                 value = f", and it is {field.value}" if field.value else ""
@@ -33,7 +33,10 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
             if error.problem.request_id and error.problem.status >= 500:
                 _print_line(f"  request {escape(error.problem.request_id)}; the coordinator's log says more")
         except UnreachableError as error:
-            _print(f"{error}. Is it running? `stickslip up` starts one; --url or STICKSLIP_URL names another.")
+            _print(
+                f"{error}. Is a coordinator running there? `stickslip up` starts one on this machine; "
+                "--url or STICKSLIP_URL names another."
+            )
         except (CertifyError, ClientError, SpecFileError, SupervisorError) as error:
             _print(str(error))
         except OSError as error:

@@ -1,30 +1,47 @@
 """Jobs: validating, submitting, listing, watching, pausing and cancelling them."""
 
-import secrets
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import JobDetail
 from stickslip_schemas.states import TaskState
 
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli import wording
-from stickslip_services.cli.common import JobArgument, JsonOption, SpecArgument, UrlOption, console, print_json, table
+from stickslip_services.cli.common import (
+    JobArgument,
+    JsonOption,
+    SpecArgument,
+    UrlOption,
+    console,
+    print_json,
+    say,
+    table,
+)
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.cli.specs import read_spec
+from stickslip_services.cli.specs import check_spec, read_spec
 from stickslip_services.cli.watch import GOOD, watch
-from stickslip_services.client.http import Client
+from stickslip_services.client.http import Client, UnreachableError
 
 SHOWN_REJECTS = 50
 
 
 @shows_errors
 def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """Say what a job would be, without submitting it."""
-    with Client(url) as client:
-        answer = client.validate(read_spec(file))
+    """Check a spec and count what it asks for, without submitting it. Works without a coordinator, too."""
+    document = read_spec(file)
+    spec = check_spec(document, file)
+    try:
+        with Client(url) as client:
+            answer = client.validate(document)
+    except UnreachableError:
+        if as_json:
+            raise
+        return _validate_offline(spec, url)
     if as_json:
         return print_json(answer)
     cached = "unknown, as no worker has registered yet" if answer.cached_count is None else f"{answer.cached_count}"
@@ -35,6 +52,15 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
     shown.add_row("arrays before compression", wording.size(answer.bytes_estimate))
     shown.add_row("spec", answer.spec_digest)
     return console().print(shown)
+
+
+def _validate_offline(spec: JobSpec, url: str) -> None:
+    shown = Table.grid(padding=(0, 2))
+    shown.add_row("samples", f"{spec.sample_count}")
+    shown.add_row("arrays before compression", wording.size(bytes_estimate(spec)))
+    shown.add_row("spec", spec.content_digest)
+    console().print(shown)
+    say(f"the spec is valid. No coordinator answers at {url}, so nothing is known of cached tasks and certificates")
 
 
 @shows_errors
@@ -48,9 +74,11 @@ def submit(
 ) -> None:
     """Submit a job and print its id."""
     with Client(url) as client:
-        job = client.submit(read_spec(file), idempotency_key=idempotency_key or secrets.token_hex(16))
+        job = client.submit(read_spec(file), idempotency_key=idempotency_key)
         typer.echo(job.id)
-        if then_watch:
+        if not then_watch:
+            say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
+        else:
             raise typer.Exit(0 if watch(client, job.id, console()) in GOOD else 1)
 
 

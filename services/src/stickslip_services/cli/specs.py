@@ -7,6 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import ValidationError
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.problems import field_errors
 
 
 class SpecFileError(Exception):
@@ -51,6 +55,19 @@ def read_spec(path: Path) -> dict[str, Any]:
         raise SpecFileError(f"{path} must hold a mapping (kind: ..., axes: ...), and it holds {document!r:.100}")
     _check(document, "", path)
     return document
+
+
+def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
+    """Return the spec that a document describes; raise SpecFileError with everything that is wrong with it."""
+    try:
+        return job_spec_adapter.validate_python(document)
+    except ValidationError as error:
+        lines = [
+            f"  {field.pointer.lstrip('/').replace('/', '.') or 'the document'}: {field.rule}"
+            + (f", and it is {field.value}" if field.value else "")
+            for field in field_errors(error, document)
+        ]
+        raise SpecFileError("\n".join([f"{path} is not valid", *lines])) from error
 
 
 def _check(value: Any, place: str, path: Path) -> None:

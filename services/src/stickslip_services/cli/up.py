@@ -44,6 +44,9 @@ def up(
     screen = console()
     status = supervisor.run(
         supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher),
-        on_ready=lambda url: screen.print(f"stickslip is up at [bold]{url}[/] (data in {escape(str(data))})"),
+        on_ready=lambda url: screen.print(
+            f"stickslip is up at [bold]{url}[/] (data in {escape(str(data))}). Open it in a browser, or submit a job: "
+            f"stickslip submit SPEC.yaml --watch --url {url}\nlogs: {escape(str(data / 'logs'))}; Ctrl-C stops it"
+        ),
     )
     raise typer.Exit(status)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
@@ -12,6 +13,7 @@ from stickslip_schemas.responses import Progress as JobProgress
 from stickslip_schemas.states import JobState, Stage, TaskState
 
 from stickslip_services.cli import wording
+from stickslip_services.cli.common import say
 from stickslip_services.client.http import Client
 
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
@@ -27,6 +29,14 @@ class _Screen(Protocol):
 def watch(client: Client, job_id: str, console: Console) -> JobState:
     """Show a job until it ends; return how it did."""
     state = client.job(job_id).state
+    try:
+        return _follow(client, job_id, console, state)
+    except KeyboardInterrupt:
+        say(f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}")
+        raise typer.Exit(130) from None
+
+
+def _follow(client: Client, job_id: str, console: Console, state: JobState) -> JobState:
     with (_bars if console.is_terminal else _lines)(console) as screen:
         for event in client.events(job_id):
             match event:
@@ -38,7 +48,11 @@ def watch(client: Client, job_id: str, console: Console) -> JobState:
                 case TaskStateEvent():
                     screen.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
                 case DatasetPublishedEvent():
-                    screen.line(f"published [bold]{wording.dataset(event.dataset)}[/]")
+                    name = wording.dataset(event.dataset)
+                    screen.line(f"published [bold]{name}[/]")
+                    screen.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
+                    page = f"{client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}"
+                    screen.line(f"look at it: {page}")
     return state
 
 

@@ -1,6 +1,7 @@
 """A client of the coordinator: typed answers, problems as exceptions, patience while a coordinator restarts."""
 
 import json
+import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -93,6 +94,8 @@ class Client:
         self.url = url.rstrip("/")
         self.patience = patience
         self._sleep = sleep
+        self._was_answered = False
+        """A coordinator that has answered once may be restarting; one that never has is not there."""
         self._http = httpx.Client(
             base_url=self.url, timeout=httpx.Timeout(60.0, connect=5.0), transport=transport, trust_env=False
         )
@@ -113,9 +116,9 @@ class Client:
         """Ask what a job would be."""
         return self._get("POST", "/v1/jobs:validate", Validation, json=spec)
 
-    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str) -> JobDetail:
-        """Submit a job; with the same key it can be sent twice, and is where an answer was lost."""
-        headers = {"Idempotency-Key": idempotency_key}
+    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None) -> JobDetail:
+        """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
+        headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
         return self._get("POST", "/v1/jobs", JobDetail, json=spec, headers=headers)
 
     def job(self, job_id: str) -> JobDetail:
@@ -228,7 +231,7 @@ class Client:
         Every request of this client may be sent twice: what changes something is idempotent or has a key.
         """
         attempts = Retrying(
-            retry=retry_if_exception(_is_passing),
+            retry=retry_if_exception(self._is_passing),
             wait=wait_random_exponential(multiplier=0.25, max=3),
             stop=stop_after_delay(self.patience),
             sleep=self._sleep,
@@ -248,10 +251,17 @@ class Client:
 
     def _send(self, method: str, path: str, **options: Any) -> httpx.Response:
         response = self._http.request(method, path, **options)
+        self._was_answered = True
         if response.status_code == 503:
             response.raise_for_status()
         raise_for_problem(response)
         return response
+
+    def _is_passing(self, error: BaseException) -> bool:
+        """Tell whether an error may be gone in a moment."""
+        if isinstance(error, httpx.ConnectError) and not self._was_answered:
+            return False
+        return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
 
     def _get(self, method: str, path: str, model: type[T] | TypeAdapter[T], **options: Any) -> T:
         return _parsed(self.request(method, path, **options), model)
@@ -264,11 +274,6 @@ class Client:
             if answer.next_page_token is None:
                 return
             parameters["page_token"] = answer.next_page_token
-
-
-def _is_passing(error: BaseException) -> bool:
-    """Tell whether an error may be gone in a moment."""
-    return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
 
 
 def raise_for_problem(response: httpx.Response) -> None:

@@ -78,4 +78,5 @@ def _ticks(low: float, high: float) -> list[float]:
         return [low]
     step = 10.0 ** np.floor(np.log10((high - low) / 3))
     step *= next(factor for factor in (1, 2, 5, 10) if (high - low) / (step * factor) <= 6)
-    return [float(value) for value in np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step]
+    places = np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+    return [float(place * step) + 0.0 for place in places]  # + 0.0 turns -0 into 0

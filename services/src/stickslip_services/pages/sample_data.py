@@ -45,11 +45,11 @@ class SampleData:
         return np.concatenate([_column(path, array, size) for path in paths])[: self.manifest.sample_count]
 
     def named(self, array: ArrayLayout, value: Array) -> object:
-        """Return a label as people read it: the name of a code, a number, a list."""
+        """Return a label as people read it: the name of a code, a number, several numbers."""
         if array.categories:
             code = int(value)
             return array.categories[code] if 0 <= code < len(array.categories) else "none"
-        return value.item() if value.ndim == 0 else [round(float(item), 5) for item in value.ravel()]
+        return value.item() if value.ndim == 0 else ", ".join(f"{item:.4g}" for item in value.ravel())
 
 
 def _chunk(path: Path, array: ArrayLayout, position: int, slots: int) -> Array:

@@ -12,7 +12,7 @@ from stickslip_schemas.builds import Builds
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.layout import layout
+from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store
@@ -126,7 +126,7 @@ class Coordinator:
             sample_count=spec.sample_count,
             simulation_count=plan.simulation_count,
             cached_count=cached,
-            bytes_estimate=spec.sample_count * sum(array.sample_bytes for array in layout(spec)),
+            bytes_estimate=bytes_estimate(spec),
             certificate=plan.certificate,
         )
 

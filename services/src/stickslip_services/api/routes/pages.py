@@ -273,12 +273,20 @@ def _thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str,
         "next_start": start + SHOWN_THUMBS if start + SHOWN_THUMBS < len(chosen) else None,
         "kept_query": keep,
         "pictured": _pictured(data),
+        "picture_index": _telling_picture(data),
     }
 
 
 def _pictured(data: SampleData) -> str | None:
     """Return the array that holds pictures."""
     return next((name for name, array in data.arrays.items() if array.dimensions[-3:] == ("y", "x", "rgb")), None)
+
+
+def _telling_picture(data: SampleData) -> int:
+    """Return which picture stands for a sample: the middle of a clip, the first of several views."""
+    name = _pictured(data)
+    array = None if name is None else data.arrays[name]
+    return array.shape[0] // 2 if array is not None and array.dimensions[0] == "frame" else 0
 
 
 def _histograms(data: SampleData) -> list[dict[str, Any]]:
