@@ -10,15 +10,18 @@ SOURCES = $(addsuffix /src,schemas services training workers workers/blender) si
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
 CORE_SOURCES = $(shell find sim_core/src sim_core/cmake -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
+RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
+  $(addprefix workers/blender/,CMakeLists.txt pyproject.toml)
 # reconstruction.py calls render_rod_set.py with Blender's interpreter.
 # rod_families.py is imported, cloth_grid.py takes half an hour, and the last two need what others write, or train.
+# render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py cloth_grid.py curvature_methods.py \
-  natural_from_pictures.py),$(wildcard benchmarks/*.py))
-CPP_FILES = $(shell find sim_core/src -name "*.[ch]pp")
+  natural_from_pictures.py render_cloth.py render_trajectory.py),$(wildcard benchmarks/*.py))
+CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
 
 .PHONY: setup demo test check bench constraints clean
 
-setup: .venv/core.stamp .venv-blender/setup.stamp
+setup: .venv/core.stamp .venv-blender/raster.stamp
 
 .venv/setup.stamp: constraints.txt requirements.txt $(PYPROJECTS)
 	@tools/check_system.sh $(PYTHON)
@@ -39,7 +42,14 @@ setup: .venv/core.stamp .venv-blender/setup.stamp
 	@echo "setting up .venv-blender (a few minutes the first time)"
 	@test -x $(BLENDER_PY) || $(PYTHON) -m venv .venv-blender
 	@$(BLENDER_PY) -m pip install $(PIP_FLAGS) --requirement requirements-blender.txt --constraint constraints-blender.txt
-	@touch $@
+	@touch $@ .venv-blender/raster.stamp
+
+# As for the core: a changed source of the rasteriser builds it again.
+.venv-blender/raster.stamp: $(RASTER_SOURCES) | .venv-blender/setup.stamp
+	@if [ -n "$$(find $(RASTER_SOURCES) -newer $@ 2>&1)" ]; then \
+	  echo "building the rasteriser"; \
+	  $(BLENDER_PY) -m pip install $(PIP_FLAGS) --no-deps --editable workers/blender && touch $@; \
+	fi
 
 demo: setup
 	$(PY) examples/demo.py

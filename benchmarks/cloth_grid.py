@@ -50,7 +50,8 @@ def simulate(fabric: str, mu: float, vertices: int, preset: str) -> dict[str, ob
         "steps": scene.steps,
         "unconverged_steps": scene.unconverged_steps,
         "worst_residual": scene.worst_residual,
-        "side": scene.side,
+        "bias_side": scene.bias_side,
+        "landed_side": scene.landed_side,
         "crossed_frames": int((scene.self_intersections > 0).sum()),
         "ratio_error": ratio / mu - 1.0 if mu > 0.0 else ratio,
     }

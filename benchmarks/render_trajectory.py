@@ -1,6 +1,6 @@
 """Simulate a drop-and-drag for the benchmarks of rendering, which run in another interpreter.
 
-    .venv/bin/python benchmarks/render_trajectory.py OUT.npz [--material M] [--mu MU] [--mesh N]
+.venv/bin/python benchmarks/render_trajectory.py OUT.npz [--material M] [--mu MU] [--mesh N]
 """
 
 import argparse

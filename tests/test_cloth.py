@@ -65,7 +65,7 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
         assert np.array_equal(arrays["contact_force"][slot], run.contact_force.astype(np.float32))
         assert np.array_equal(arrays["holder_force"][slot], run.holder_force.astype(np.float32))
         assert np.array_equal(arrays["self_intersections"][slot], run.self_intersections)
-        for name in ("side", "bias", "steps", "unconverged_steps", "worst_residual"):
+        for name in ("bias_side", "landed_side", "bias", "steps", "unconverged_steps", "worst_residual"):
             assert arrays[name][slot] == getattr(run, name), name
     assert len(set(arrays["light_seed"].tolist())) == 4
 

@@ -45,7 +45,7 @@ def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int) -> d
         "material": fabric,
         "mu": mu,
         "seed": seed,
-        "bias_side": scene.side,
+        "bias_side": scene.bias_side,
         "landed_side": 1 if fell > 0 else -1,
         "vertices": vertices,
         "preset": preset,

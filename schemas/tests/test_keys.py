@@ -1,11 +1,28 @@
 """Content keys: pinned, and sensitive to exactly what a result depends on."""
 
+from dataclasses import replace
+
 import pytest
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.cloth import KERNELS
+from stickslip_schemas.fabrics import Material
 from stickslip_schemas.keys import canonical_json, content_key, derived_seed
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender, Viewpoint
+from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
-from stickslip_schemas.samples import Sample, dataset_id, pack_key, publish_key, samples
+from stickslip_schemas.samples import (
+    SPLITS,
+    Sample,
+    dataset_id,
+    pack_key,
+    publish_key,
+    render_key,
+    samples,
+    simulation_key,
+    split_of,
+)
+from stickslip_schemas.textures import Texture
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
@@ -151,5 +168,83 @@ PINNED: dict[str, object] = {
     "color_seed": 1423131992,
     "spec": "f9b8c3cfcafcc5fac6634f45c6f4652371cc8cd0843a906cd6364e98eabc7b32",
     "cloth_simulation": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
-    "cloth_render": "e08606046a31a0577257ccf870123298caa290a113452d0ecbd7c272ccb30101",
+    "cloth_render": "2cf39e9c1bd136f4b94f331fd73b60113fe6e3829e9937a935efd3586f55ead7",
 }
+
+
+def test_a_pack_key_holds_the_splits_and_the_arrays() -> None:
+    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": [1, 2], "phi0": 1, "phi1": 6}})
+    members = list(samples(spec, BUILDS))
+    moved = [replace(members[0], split=(members[0].split + 1) % 3), members[1]]
+    assert pack_key(spec, 0, moved, BUILDS) != pack_key(spec, 0, members, BUILDS)
+    document = {
+        "kind": "cloth_drag",
+        "materials": {"mine": {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}},
+        "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
+    }
+    one = job_spec_adapter.validate_python(document)
+    two = job_spec_adapter.validate_python(document | {"materials": {}})
+    members = list(samples(one, BUILDS))
+    assert [sample.key for sample in samples(two, BUILDS)] == [sample.key for sample in members]
+    assert pack_key(one, 0, members, BUILDS) != pack_key(two, 0, members, BUILDS)  # the codes of materials differ
+
+
+def test_codes_of_labels_are_pinned() -> None:
+    """A code is stored in datasets for good: a name may be added at the end, and none may move."""
+    assert {name: code for code, name in enumerate(Material)} == {
+        "11oz-black-denim": 0,
+        "camel-ponte-roma": 1,
+        "gray-interlock": 2,
+        "ivory-rib-knit": 3,
+        "navy-sparkle-sweat": 4,
+        "pink-ribbon-brown": 5,
+        "royal-target": 6,
+        "tango-red-jet-set": 7,
+        "white-dots-on-blk": 8,
+        "white-swim-solid": 9,
+    }
+    textures = ["checker", "dots", "stripes", "plaid", "gingham", "herringbone", "houndstooth", "floral"]
+    assert list(Texture)[:8] == textures
+    assert list(Viewpoint)[:3] == ["calibrated", "left", "right"]
+    assert list(SphereViewpoint) == ["front", "side", "high"]
+    assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
+    assert SPLITS == ("train", "validation", "test")
+
+
+def test_documents_of_samples_are_those_that_are_keyed() -> None:
+    """The fast way over texts and the plain way over models give the same keys, for every kind and optional axis."""
+    own = {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}
+    cloth = {"material": ["mine", "royal-target"], "mu": [0.3, 1.0], "texture": ["dots", "plaid"]}
+    documents = [
+        {"kind": "rod_hang", "axes": {"gamma": [1, 2.5], "phi0": [-1.0, 1], "phi1": 6}},
+        {
+            "kind": "cloth_drag",
+            "materials": {"mine": own},
+            "axes": cloth | {"viewpoint": "left", "bending": [0.5, 2.0], "substrate": ["matt", "ceramic"]},
+        },
+        {
+            "kind": "cloth_sphere",
+            "materials": {"mine": own},
+            "axes": cloth | {"viewpoint": "high", "angular_speed": 2.0},
+        },
+    ]
+    for document in documents:
+        spec = job_spec_adapter.validate_python(document)
+        for sample in samples(spec, BUILDS):
+            assert sample.simulation_key == simulation_key(sample.simulation, BUILDS)
+            assert sample.render is not None
+            assert sample.render_key == render_key(sample.render, sample.simulation_key, BUILDS)
+            assert sample.split == split_of(spec, sample.labels)
+            assert job_spec_adapter.validate_json(spec.model_dump_json()) == spec
+
+
+def test_textures_share_light_and_simulations_do_not() -> None:
+    axes = {"material": "royal-target", "mu": [0.3, 0.4], "texture": ["dots", "plaid"], "viewpoint": ["left", "right"]}
+    spec = job_spec_adapter.validate_python({"kind": "cloth_drag", "axes": axes})
+    lights: dict[tuple[str, str], set[int]] = {}
+    for sample in samples(spec, BUILDS):
+        assert isinstance(sample.render, ClothDragRender)
+        place = sample.simulation_key, sample.labels["viewpoint"]
+        lights.setdefault(place, set()).add(sample.render.light_seed)
+    assert all(len(seeds) == 1 for seeds in lights.values())
+    assert len(set().union(*lights.values())) == 4

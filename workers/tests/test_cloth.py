@@ -47,8 +47,10 @@ class Run:
     steps: int = 1200
     unconverged_steps: int = 3
     worst_residual: float = 2e-4
-    side: int = -1
+    bias_side: int = -1
+    landed_side: int = 1
     bias: float = 1e-5
+    kernel: str = "baseline"
     valid: bool = True
     reason: str = ""
 
@@ -110,7 +112,9 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> N
         "areal_density": fabric("gray-interlock").density,
         "bending_rigidity": np.diag(fabric("gray-interlock").rigidity).tolist(),
         "stretching_stiffness": fabric("gray-interlock").stretching[0].tolist(),
-        "side": -1,
+        "kernel": "baseline",
+        "bias_side": -1,
+        "landed_side": 1,
         "bias": 1e-5,
         "steps": 1200,
         "unconverged_steps": 3,
@@ -185,11 +189,14 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
-            light = [float(value) for value in rng.random(5).astype(np.float32)]
-            labels = sample.labels | result.output.labels | {"light_seed": i, "light": light}
+            shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": (), "gate_db": ()}
+            seen = {name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()}
+            seen |= {"light_seed": i, "composed": True, "lighting": "drawn", "substrate": "ceramic"}
+            labels = sample.labels | result.output.labels | seen
             arrays["valid"][i] = True
-            for name in (*result.output.labels, "light_seed", "light"):
-                arrays[name][i] = labels[name]
+            codes = {"kernel": 0, "lighting": 0, "substrate": 3}
+            for name in (*result.output.labels, *seen):
+                arrays[name][i] = codes.get(name, labels[name])
             for name, values in Records(store)(result.output.record.digest).items():
                 if name in arrays:
                     arrays[name][i] = values[0]
@@ -263,7 +270,7 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
         assert dataset["positions"].dims == ("sample", "instant", "vertex", "xyz")
     assert group["video"].attrs["instants"] == [0, 150]
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
-    assert manifest.cameras == load_rig("drag-3")
+    assert manifest.cameras == load_rig("drag")
     assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
 
 

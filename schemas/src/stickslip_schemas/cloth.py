@@ -42,10 +42,10 @@ class Lighting(StrEnum):
 
 
 class Substrate(StrEnum):
-    """Finishes of the floor: a matt black plate, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
 
-    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at the
-    end.
+    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
+    the end.
     """
 
     matt = "matt"
@@ -64,11 +64,16 @@ LightingAxis = Annotated[ListAxis[Lighting], SHORTHAND]
 SubstrateAxis = Annotated[ListAxis[Substrate], SHORTHAND]
 
 
+KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
+"""Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""
+
+
 class PresetName(StrEnum):
     """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
 
     certified = "certified"
     fast = "fast"
+    fine = "fine"
     thesis_high = "thesis-high"
     thesis_low_small_dt = "thesis-low-small-dt"
     thesis_low_big_dt = "thesis-low-big-dt"
@@ -126,10 +131,16 @@ class ClothRender(Render):
         """What the trace depends on, as JSON: all but the texture."""
         return self.model_dump(mode="json", exclude={"texture"})
 
+    @property
+    def variant(self) -> str:
+        """The texture, which no trace depends on."""
+        return self.texture.value
+
 
 class ClothSpec(JobSpec):
     """What the specs of all kinds of cloth have in common."""
 
+    variant_axis = "texture"
     instants: ClassVar[int]
     """How many instants of the motion a trajectory holds."""
     instants_per_second: ClassVar[float]
@@ -314,6 +325,7 @@ class ClothSpec(JobSpec):
     def solver_arrays(self) -> tuple[ArrayLayout, ...]:
         """Return what the solver says of its work."""
         return (
+            _codes("kernel", KERNELS),
             ArrayLayout("steps", "int32", (), (), "time steps of the solver", fill=-1),
             ArrayLayout("unconverged_steps", "int32", (), (), "steps that stopped short of the tolerance", fill=-1),
             ArrayLayout(

@@ -58,6 +58,16 @@ class Render(Document):
     rig_digest: Sha256
     quality: Quality
 
+    @property
+    def trace(self) -> dict[str, Any] | None:
+        """What renders have in common that can be made together, as JSON; None where none can."""
+        return None
+
+    @property
+    def variant(self) -> str:
+        """What tells renders apart that can be made together."""
+        return ""
+
 
 class SeedRule(NamedTuple):
     """A seed that a document draws from the job's seed and from some of the sample's parameters."""
@@ -81,6 +91,8 @@ class JobSpec(Document):
     render_type: ClassVar[type[Render]]
     simulation_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     render_seeds: ClassVar[tuple[SeedRule, ...]] = ()
+    variant_axis: ClassVar[str | None] = None
+    """The axis whose values differ between renders that can be made together, if there is one."""
 
     kind: str
     name: str | None = Field(

@@ -9,7 +9,6 @@ from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.states import Reason
-from stickslip_schemas.textures import Texture
 
 # --- where bytes are ------------------------------------------------------------------------------------------
 
@@ -59,19 +58,15 @@ class SimulateOutput(Document):
 
 
 class RenderTask(Document):
-    """Make the pictures of one sample, or those of all samples that share a trace; `preview` asks for small ones besides."""
+    """Make the pictures of one sample, or of all samples that share a trace; `preview` asks for small ones, too."""
 
     stage: Literal["render"] = "render"
     render: AnyRender
     record: RecordRef
     preview: bool = False
-    textures: tuple[Texture, ...] = Field(
+    textures: tuple[str, ...] = Field(
         default=(), description="textures to make clips of, one sample each; none: that of the render document"
     )
-    trace: Sha256 | None = Field(
-        default=None, description="artifact of an earlier trace of the same render document: nothing is traced again"
-    )
-    keep_trace: bool = Field(default=False, description="put the trace into the store, for textures to come")
 
 
 class RenderOutput(Document):
@@ -84,9 +79,8 @@ class RenderOutput(Document):
     chunks: dict[str, ChunkRef]
     preview: Sha256 | None = None
     labels: dict[str, Any]
-    clips: dict[Texture, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
-    previews: dict[Texture, Sha256] = Field(default_factory=dict)
-    trace: Sha256 | None = Field(default=None, description="artifact of the trace, where the task kept it")
+    clips: dict[str, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
+    previews: dict[str, Sha256] = Field(default_factory=dict)
 
 
 # --- pack and publish -----------------------------------------------------------------------------------------

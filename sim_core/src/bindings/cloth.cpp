@@ -1,10 +1,12 @@
 #include "bindings/cloth.hpp"
 
 #include <nanobind/eigen/dense.h>
+#include <nanobind/stl/function.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <functional>
 #include <tuple>
 
 #include "cloth/intersections.hpp"
@@ -21,6 +23,19 @@ namespace {
 using Table = Eigen::Matrix<double, 6, 4, Eigen::RowMajor>;
 using BodyTuple = std::tuple<int, double, Eigen::Vector3d, Eigen::Vector3d, Eigen::Matrix3d>;
 
+using MotionCallback = std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>>(double time)>;
+
+struct DriveNow {
+  Points3 gravity, held, slopes;
+  std::vector<Body> bodies;
+};
+
+std::vector<Body> bodies_of(const std::vector<BodyTuple>& tuples) {
+  std::vector<Body> bodies;
+  for (const auto& [shape, mu, size, origin, rotation] : tuples) bodies.push_back({shape, mu, size, origin, rotation});
+  return bodies;
+}
+
 }  // namespace
 
 void bind_cloth(nb::module_& m) {
@@ -34,10 +49,14 @@ void bind_cloth(nb::module_& m) {
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")
       .def_ro("converged", &StepReport::converged)
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
+      .def_ro("steps", &StepReport::steps)
+      .def_ro("unconverged", &StepReport::unconverged)
       .def_ro("substeps", &StepReport::substeps)
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
+      .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
+      .def_ro("halvings", &StepReport::halvings)
       .def_ro("contacts", &StepReport::contacts)
       .def_ro("sliding", &StepReport::sliding);
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
@@ -46,26 +65,41 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density,
              const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
              const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
-             int refactor_after, int halvings_max, const std::string& kernel) {
+             int refactor_after, int flips_max, int patience, int halvings_max, double step_error, int coarsest,
+             int finest, const std::string& kernel) {
             new (self) ClothSolver(rest, triangles, {density, {stretching}, rigidity}, held, clamped,
-                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, halvings_max},
-                                   kernel);
+                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, flips_max,
+                                    patience, halvings_max},
+                                   {step_error, coarsest, finest}, kernel);
           },
           "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
-          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "halvings_max"_a,
-          "kernel"_a = "")
+          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "flips_max"_a,
+          "patience"_a, "halvings_max"_a, "step_error"_a, "coarsest"_a, "finest"_a, "kernel"_a = "")
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a)
       .def(
           "step",
           [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
              const std::vector<BodyTuple>& bodies, double damping) {
-            std::vector<Body> list;
-            for (const auto& [shape, mu, size, origin, rotation] : bodies)
-              list.push_back({shape, mu, size, origin, rotation});
+            const std::vector<Body> list = bodies_of(bodies);
             nb::gil_scoped_release release;
             return self.step(dt, gravity, held, slopes, list, damping);
           },
           "dt"_a, "gravity"_a, "held"_a, "slopes"_a, "bodies"_a, "damping"_a)
+      .def(
+          "advance",
+          [](ClothSolver& self, double begin, double end, const MotionCallback& motion, double damping) {
+            DriveNow now;
+            nb::gil_scoped_release release;
+            return self.advance(begin, end, [&](double time) -> Drive {
+              nb::gil_scoped_acquire acquire;
+              auto [gravity, held, slopes, bodies] = motion(time);
+              now = {gravity, held, slopes, bodies_of(bodies)};
+              return {now.gravity, now.held, now.slopes, now.bodies, damping};
+            });
+          },
+          "begin"_a, "end"_a, "motion"_a, "damping"_a)
+      .def("last_dt", &ClothSolver::last_dt)
+      .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)
       .def("reactions", &ClothSolver::reactions)
@@ -80,6 +114,7 @@ void bind_cloth(nb::module_& m) {
           },
           "positions"_a, "slopes"_a)
       .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "slopes"_a, "v"_a)
+      .def("softest", &ClothSolver::softest, "positions"_a, "slopes"_a)
       .def("factor_error", &ClothSolver::factor_error, "positions"_a, "slopes"_a, "dt"_a)
       .def("phases",
            [](const ClothSolver& self) {

@@ -200,6 +200,10 @@ NB_MODULE(_sim_core, m) {
       .def_ro("isa", &sim_core::BuildInfo::isa, "Instruction set of the whole library.")
       .def_ro("rod_kernel", &sim_core::BuildInfo::rod_kernel,
               "Vectors of the rod solver on this processor; its bits are the same for all.")
+      .def_ro("cloth_kernel", &sim_core::BuildInfo::cloth_kernel,
+              "Level of the cloth kernels: the widest of this processor, or STICKSLIP_CLOTH_KERNEL. Levels differ in "
+              "the last "
+              "digits.")
       .def_ro("eigen", &sim_core::BuildInfo::eigen, "Version.");
   m.def("build_info", &sim_core::build_info, "Tell what the C++ core was built from.");
   m.def("solve_rods", &solve_rods, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "elements"_a, "points"_a,

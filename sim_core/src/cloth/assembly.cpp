@@ -8,6 +8,8 @@ namespace {
 
 // A matrix of bending is assembled again when its stiffening has changed by more.
 constexpr float stiffening_change = 0.03f;
+// s from which a triangle is a fold whose part of the matrix is worth its cost.
+constexpr double fold_smallest = 0.01;
 
 }  // namespace
 
@@ -47,7 +49,19 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Cl
             numbering.membrane.begin.data(),
             numbering.membrane.node.data(),
             blocks_.data(),
-            diagonal_.data()};
+            diagonal_.data(),
+            &folds_};
+  reserve_folds();
+}
+
+void Assembly::reserve_folds() {
+  const BendingData& data = bending_.data();
+  fold_begin_.assign(data.triangles + 1, 0);
+  fold_nodes_.assign(data.begin[data.triangles], 0);
+  fold_vectors_.assign(8L * data.begin[data.triangles], 0.0f);
+  fold_coefficients_.assign(2L * data.triangles, 0.0f);
+  folds_ = {numbering.free_nodes,     fold_smallest, 0, fold_begin_.data(), fold_nodes_.data(), fold_vectors_.data(),
+            fold_coefficients_.data()};
 }
 
 void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
@@ -55,7 +69,9 @@ void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   if (with_matrix) std::fill(blocks_.begin(), blocks_.end(), 0.0f);
   membrane_energy =
       kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, definite);
-  bending_energy = kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data());
+  folds_.smallest = exact ? 0.0 : fold_smallest;
+  bending_energy =
+      kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(), with_matrix ? &folds_ : nullptr);
   if (with_matrix) assemble_bending();
 }
 
@@ -66,7 +82,7 @@ void Assembly::assemble_bending() {
     change_max = std::max({change_max, std::abs(stiffening_[t] - assembled_stiffening_[t]),
                            scale * std::abs(stiffening_[t + 1] - assembled_stiffening_[t + 1])});
   }
-  if (!(change_max > stiffening_change)) return;
+  if (!exact && !(change_max > stiffening_change)) return;
   std::fill(scalars_.begin(), scalars_.end(), 0.0f);
   kernel.bending_matrix(bending_.data(), stiffening_.data(), scalars_.data());
   assembled_stiffening_ = stiffening_;
@@ -95,6 +111,7 @@ ClothMatrix Assembly::neighbour(const Buffer<double>& x) {
   out.bending_begin = numbering.compact_bending.begin.data();
   out.bending_node = numbering.compact_bending.node.data();
   out.bending = compact_scalars_.data();
+  out.folds = &no_folds_;
   return out;
 }
 

@@ -32,6 +32,8 @@ class Assembly {
   ClothMatrix matrix{};
   // Whether the matrix has the positive part of the stress only: that of a convex energy.
   bool definite = false;
+  // Whether the matrix is that of the state to rounding: else small folds are left out and old ones kept for a while.
+  bool exact = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
   // The table's stiffness at the positions x; it stays for the whole step.
@@ -48,6 +50,7 @@ class Assembly {
 
  private:
   void assemble_bending();
+  void reserve_folds();
 
   Membrane membrane_;
   Bending bending_, compact_bending_;
@@ -56,6 +59,9 @@ class Assembly {
   Buffer<float> scalars_, compact_scalars_, blocks_, definite_blocks_, diagonal_;
   Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)
   Buffer<double> unused_;
+  std::vector<int> fold_begin_, fold_nodes_;
+  Buffer<float> fold_vectors_, fold_coefficients_;
+  FoldData folds_{}, no_folds_{};
 };
 
 }  // namespace sim_core

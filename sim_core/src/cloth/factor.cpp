@@ -1,12 +1,15 @@
 #include "cloth/factor.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 namespace sim_core {
 namespace {
 
 // Contact stiffness in the factor over a node's own.
 constexpr float factor_share = 100.0f;
+// Factors that are kept.
+constexpr std::size_t pool_size = 3;
 
 }  // namespace
 
@@ -15,8 +18,11 @@ StaleFactor::StaleFactor(const Numbering& numbering)
       view_(storage_.view()),
       added_(6L * numbering.free_nodes, 0.0f) {}
 
-bool StaleFactor::stale(int excess_max, int krylov_max) const {
-  return !made_ || excess_ > excess_max || last_ >= krylov_max;
+bool StaleFactor::stale(const std::vector<int>& modes, const ClothSettings& settings) const {
+  if (!made_ || excess_ > settings.refactor_after || last_ >= settings.krylov_max) return true;
+  int flips = 0;
+  for (std::size_t i = 0; i < modes.size(); ++i) flips += modes[i] != modes_[i];
+  return flips > settings.flips_max;
 }
 
 // Contact as a penalty: k n n^T where a node slips, and against a turn of friction; k in all directions where it
@@ -42,6 +48,7 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
   }
   assembly.kernel.factor(view_, assembly.neighbour(x), {added_.data()});
   made_ = true;
+  modes_ = contact.mode;
   dt_ = dt;
   excess_ = fresh_ = -1;
 }
@@ -50,6 +57,27 @@ void StaleFactor::spent(int iterations) {
   last_ = iterations;
   if (fresh_ < 0) fresh_ = last_, excess_ = 0;
   excess_ += std::max(0, last_ - fresh_);
+}
+
+bool StaleFactor::fits(double dt) const { return made_ && std::abs(dt - dt_) <= 1e-9 * dt_; }
+
+FactorPool::FactorPool(const Numbering& numbering) : numbering_(numbering) {
+  factors_.push_back(std::make_unique<StaleFactor>(numbering));
+}
+
+StaleFactor& FactorPool::of(double dt) {
+  std::size_t place = 0;
+  while (place < factors_.size() && !factors_[place]->fits(dt)) ++place;
+  if (place == factors_.size()) {
+    if (place < pool_size) {
+      factors_.push_back(std::make_unique<StaleFactor>(numbering_));
+    } else {
+      --place;
+      factors_[place]->forget();
+    }
+  }
+  std::rotate(factors_.begin(), factors_.begin() + place, factors_.begin() + place + 1);
+  return *factors_.front();
 }
 
 }  // namespace sim_core

@@ -1,8 +1,12 @@
 // A Cholesky factor that is kept while it is worth keeping: the preconditioner of every linear solve.
 #pragma once
 
+#include <memory>
+#include <vector>
+
 #include "cloth/assembly.hpp"
 #include "cloth/fronts.hpp"
+#include "cloth/settings.hpp"
 #include "contact/state.hpp"
 
 namespace sim_core {
@@ -15,10 +19,10 @@ class StaleFactor {
   const Factor& view() const { return view_; }
   const FactorStorage& storage() const { return storage_; }
 
-  // A factor for steps of another length is of no use.
-  void expect(double dt) { made_ = made_ && dt == dt_; }
-  // Whether it has cost more than `excess_max` GMRES iterations beyond those of its first solve, or never was made.
-  bool stale(int excess_max, int krylov_max) const;
+  // Whether it is for steps of this length.
+  bool fits(double dt) const;
+  // Whether it never was made, has cost more GMRES iterations than a new one would, or is of other contacts.
+  bool stale(const std::vector<int>& modes, const ClothSettings& settings) const;
   void make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt);
   void spent(int iterations);
   void forget() { made_ = false; }
@@ -27,9 +31,24 @@ class StaleFactor {
   FactorStorage storage_;
   Factor view_;
   Buffer<float> added_;
+  std::vector<int> modes_;  // that it was made for
   bool made_ = false;
   double dt_ = 0.0;
   int last_ = 0, fresh_ = -1, excess_ = 0;  // iterations of the last solve, of the first, and beyond that
+};
+
+// Factors for the lengths of step of late: one that is known again is not made again.
+class FactorPool {
+ public:
+  explicit FactorPool(const Numbering& numbering);
+
+  // That for steps of dt, or one to be made in place of the one that was needed least recently.
+  StaleFactor& of(double dt);
+  StaleFactor& latest() { return *factors_.front(); }
+
+ private:
+  std::vector<std::unique_ptr<StaleFactor>> factors_;  // the latest first
+  const Numbering& numbering_;
 };
 
 }  // namespace sim_core

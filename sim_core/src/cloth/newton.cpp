@@ -12,14 +12,12 @@ using Eigen::Vector3d;
 
 // Contact stiffness of the law over a node's own.
 constexpr double contact_share = 0.1;
-// GMRES may stop earlier by this factor while nodes still change between open, stick and slip.
-constexpr double coarse = 6.0;
 
 }  // namespace
 
 Newton::Newton(Assembly& assembly, const ClothSettings& settings)
     : contact(assembly.numbering.free_nodes),
-      factor(assembly.numbering),
+      factors(assembly.numbering),
       residual(4L * assembly.numbering.nodes, 0.0),
       assembly_(assembly),
       settings_(settings),
@@ -63,21 +61,22 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   const int free_nodes = assembly_.numbering.free_nodes;
   predict(problem, x, from_rest);
   assembly_.set_diagonal(problem.dt, problem.damping);
-  factor.expect(problem.dt);
+  factors.of(problem.dt);
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
   Norms norms = look(problem, x);
-  bool changed = true;
+  const bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);
   std::vector<int> modes = contact.mode;
   double window[4];
   std::fill(window, window + 4, norms.squared);
   trial_ = best_ = x;
   double least = norms.squared;
   for (int iteration = 0; iteration < iterations; ++iteration) {
-    if (norms.largest <= settings_.tolerance) break;
+    // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
+    if (iteration > 0 && norms.largest <= settings_.tolerance) break;
     if (!std::isfinite(norms.squared)) break;
     ++report.newton;
-    correct(problem, x, changed, report);
+    correct(problem, x, report);
     // Along the line, non-monotone [Grippo et al. 1986].
     const double limit = *std::max_element(window, window + 4);
     double share = 1.0;
@@ -87,13 +86,14 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
       for (int i = 0; i < 4 * free_nodes; ++i) trial_[i] += share * change_[i];
       evaluate(trial_, true);
       next = look(problem, trial_);
-      if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5) break;
+      if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5 || (iteration == 0 && resumed)) break;
       share *= 0.5;
     }
-    changed = contact.mode != modes;
+    for (int i = 0; i < free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
     modes = contact.mode;
     std::swap(x, trial_);
     norms = next;
+    if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);
     window[iteration % 4] = norms.squared;
     if (norms.squared < least) least = norms.squared, best_ = x;
   }
@@ -106,8 +106,9 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
 }
 
 // Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
-void Newton::correct(const StepProblem& problem, const Buffer<double>& x, bool changed, StepReport& report) {
-  if (factor.stale(settings_.refactor_after, settings_.krylov_max)) {
+void Newton::correct(const StepProblem& problem, const Buffer<double>& x, StepReport& report) {
+  StaleFactor& factor = factors.latest();
+  if (factor.stale(contact.mode, settings_)) {
     const Stopwatch watch(phases.factorization);
     factor.make(assembly_, x, contact, problem.dt);
     ++report.factorizations;
@@ -117,8 +118,7 @@ void Newton::correct(const StepProblem& problem, const Buffer<double>& x, bool c
   double size = 0.0;
   for (float f : contact.force) size += static_cast<double>(f) * f;
   size = std::sqrt(size);
-  const double tolerance = std::max((changed ? coarse : 1.0) * settings_.krylov_tolerance,
-                                    0.3 * settings_.tolerance / std::max(size, 1e-300));
+  const double tolerance = std::max(settings_.krylov_tolerance, 0.3 * settings_.tolerance / std::max(size, 1e-300));
   const KrylovResult solved =
       assembly_.kernel.krylov(assembly_.matrix, factor.view(), contact.rows(), contact.force.data(), change_.data(),
                               work_.data(), settings_.krylov_max, std::min(tolerance, 0.5));

@@ -30,7 +30,7 @@ class Newton {
   Newton(const Newton&) = delete;
 
   ContactState contact;
-  StaleFactor factor;
+  FactorPool factors;
   Buffer<double> residual;  // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
   ClothPhases phases;
 
@@ -38,12 +38,14 @@ class Newton {
   // begins at the start of the step, not where the velocity leads.
   StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report);
 
+  // Where the velocity leads, or the start, out of the bodies.
+  void predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const;
+
   void evaluate(const Buffer<double>& x, bool with_matrix);
 
  private:
   Norms look(const StepProblem& problem, const Buffer<double>& x);
-  void predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const;
-  void correct(const StepProblem& problem, const Buffer<double>& x, bool changed, StepReport& report);
+  void correct(const StepProblem& problem, const Buffer<double>& x, StepReport& report);
   void subtract_corrections();
 
   Assembly& assembly_;

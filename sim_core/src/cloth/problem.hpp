@@ -39,7 +39,19 @@ struct BendingData {
   const int* slots;        // scalar slots of (i, j) and (j, i), -1 for held nodes
 };
 
-// K = mass + bending (x) 1 + membrane, over the free nodes.
+// The part of bending's matrix that sharp folds add: of each, with vectors a and b over the free nodes of its stencil,
+// aa a a^T + ab (a b^T + b a^T).
+struct FoldData {
+  int free_nodes;
+  double smallest;  // s from which a triangle is a fold
+  int count;
+  int* begin;           // (triangles + 1)
+  int* nodes;           // by entry
+  float* vectors;       // (entries, 2, 4): a and b, 1/m^2 times m and N m
+  float* coefficients;  // (triangles, 2): aa, ab
+};
+
+// K = mass + bending (x) 1 + membrane + folds, over the free nodes.
 struct ClothMatrix {
   int nodes;
   const int* bending_begin;  // (nodes + 1)
@@ -49,6 +61,7 @@ struct ClothMatrix {
   const int* membrane_node;
   float* membrane;  // (blocks, 3, 4): columns
   float* diagonal;  // (nodes): mass / dt^2 and damping, N/m
+  const FoldData* folds;
 };
 
 // State of a node in the linear problem of contact.
@@ -96,9 +109,9 @@ struct KrylovResult {
 
 struct ClothKernel {
   const char* name;
-  // Adds gradients and returns the energy. `blocks` may be null.
+  // Adds gradients and returns the energy. `blocks` and `folds` may be null.
   double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, bool project);
-  double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening);
+  double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening, FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
   void (*apply)(const ClothMatrix&, const float* x, float* y);
   void (*factor)(const Factor&, const ClothMatrix&, const FactorDiagonal&);

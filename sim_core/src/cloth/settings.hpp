@@ -9,13 +9,34 @@ struct ClothSettings {
   int krylov_max;    // of GMRES in one of those
   double krylov_tolerance;
   int refactor_after;  // GMRES iterations that a stale factor may cost
+  int flips_max;       // contacts that may change their mode before a factor is made anew
+  int patience;        // iterations of Newton's method after which a step is halved rather than pursued
   int halvings_max;    // of a step that does not converge
 };
 
 struct StepReport {
   bool converged = true;
-  double residual = 0.0;  // N: worst over the substeps
-  int substeps = 0, newton = 0, krylov = 0, factorizations = 0, contacts = 0, sliding = 0;
+  double residual = 0.0;           // N: worst over the substeps
+  int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
+  int substeps = 0, newton = 0, krylov = 0, factorizations = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0;
+
+  void add_work(const StepReport& other) {
+    newton += other.newton;
+    krylov += other.krylov;
+    factorizations += other.factorizations;
+    flips += other.flips;
+    halvings += other.halvings;
+  }
+  void add(const StepReport& other) {
+    add_work(other);
+    steps += other.steps;
+    unconverged += other.unconverged;
+    substeps += other.substeps;
+    converged = converged && other.converged;
+    if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
+    contacts = other.contacts;
+    sliding = other.sliding;
+  }
 };
 
 // CPU seconds by phase, since construction.

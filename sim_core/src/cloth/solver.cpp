@@ -3,23 +3,51 @@
 #include <algorithm>
 #include <cmath>
 
+#include "cloth/control.hpp"
 #include "cloth/kernels/choice.hpp"
 #include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
 
 namespace sim_core {
 
+namespace {
+
+// Solves with the matrix of the last evaluation, without contact.
+struct LinearSolve {
+  Assembly& assembly;
+  ContactState open;
+  StaleFactor factor;
+  Buffer<float> work;
+
+  LinearSolve(Assembly& assembly_in, const Buffer<double>& x, double dt)
+      : assembly(assembly_in),
+        open(assembly_in.numbering.free_nodes),
+        factor(assembly_in.numbering),
+        work((2 * krylov_max + 1) * 4L * assembly_in.numbering.free_nodes + 64, 0.0f) {
+    factor.make(assembly, x, open, dt);
+  }
+
+  void solve(const Buffer<float>& b, Buffer<float>& x) {
+    assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), b.data(), x.data(), work.data(), krylov_max,
+                           1e-3);
+  }
+};
+
+}  // namespace
+
 struct ClothSolver::Impl {
   Assembly assembly;
   Stepper stepper;
+  StepController controller;
   Newton& newton;
   const Numbering& numbering;
 
   Impl(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
        const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-       const std::string& kernel)
+       const StepControl& control, const std::string& kernel)
       : assembly(cloth_kernel_named(kernel), ClothMesh(rest, triangles), properties, held, clamped),
         stepper(assembly, settings),
+        controller(stepper, control),
         newton(stepper.newton),
         numbering(assembly.numbering) {}
 
@@ -42,20 +70,28 @@ struct ClothSolver::Impl {
 
 ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
                          const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-                         const std::string& kernel)
-    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, kernel)) {}
+                         const StepControl& control, const std::string& kernel)
+    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, control, kernel)) {}
 ClothSolver::~ClothSolver() = default;
 
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes) {
   impl_->load(positions, slopes, impl_->stepper.x);
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
   impl_->stepper.restart();
+  impl_->controller.restart();
 }
 
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
                              const std::vector<Body>& bodies, double damping) {
   return impl_->stepper.step(dt, {gravity, held, slopes, bodies, damping});
 }
+
+StepReport ClothSolver::advance(double begin, double end, const Motion& motion) {
+  return impl_->controller.advance(begin, end, motion);
+}
+
+double ClothSolver::last_dt() const { return impl_->stepper.last_dt(); }
+Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
 
 Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x); }
 Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.v); }
@@ -91,7 +127,9 @@ Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& sl
   Buffer<double> at = impl_->stepper.x;
   impl_->load(positions, slopes, at);
   assembly.definite = false;
+  assembly.exact = true;
   impl_->newton.evaluate(at, true);
+  assembly.exact = false;
   assembly.clear_diagonal();
   Buffer<float> in(4 * numbering.free_nodes), out(4 * numbering.free_nodes);
   for (int i = 0; i < numbering.free_nodes; ++i) {
@@ -105,6 +143,39 @@ Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& sl
   return result;
 }
 
+// Inverse iteration: v <- (K + M/T^2)^-1 M v tends to the softest mode, and 1/growth - 1/T^2 to its eigenvalue.
+double ClothSolver::softest(const Points3& positions, const Points3& slopes) {
+  constexpr double period = 0.3;  // T, s
+  constexpr int iterations = 40;
+  Assembly& assembly = impl_->assembly;
+  const int free_nodes = impl_->numbering.free_nodes;
+  Buffer<double> at = impl_->stepper.x;
+  impl_->load(positions, slopes, at);
+  assembly.read_table(at);
+  assembly.set_diagonal(period, 0.0);
+  assembly.definite = false;
+  impl_->newton.evaluate(at, true);
+  LinearSolve linear(assembly, at, period);
+  Buffer<float> v(4L * free_nodes + 64, 0.0f), y(v);
+  for (int i = 0; i < free_nodes; ++i) at_node(v, i).setConstant(1.0f + 0.1f * static_cast<float>(i % 7));
+  double value = 0.0;
+  for (int iteration = 0; iteration < iterations; ++iteration) {
+    double size = 0.0, growth = 0.0;
+    for (int i = 0; i < free_nodes; ++i) size += assembly.mass[i] * at_node(v, i).cast<double>().squaredNorm();
+    const float scale = static_cast<float>(1.0 / std::sqrt(size));
+    for (float& component : v) component *= scale;
+    Buffer<float> force = v;
+    for (int i = 0; i < free_nodes; ++i) at_node(force, i) *= static_cast<float>(assembly.mass[i]);
+    linear.solve(force, y);
+    for (int i = 0; i < free_nodes; ++i) {
+      growth += assembly.mass[i] * at_node(v, i).cast<double>().dot(at_node(y, i).cast<double>());
+    }
+    value = 1.0 / growth - 1.0 / (period * period);
+    v = y;
+  }
+  return value;
+}
+
 double ClothSolver::factor_error(const Points3& positions, const Points3& slopes, double dt) {
   Assembly& assembly = impl_->assembly;
   Newton& newton = impl_->newton;
@@ -114,8 +185,9 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
   assembly.set_diagonal(dt, 0.0);
   newton.evaluate(at, true);
   std::fill(newton.contact.mode.begin(), newton.contact.mode.end(), static_cast<int>(contact_open));
-  newton.factor.make(assembly, at, newton.contact, dt);
-  newton.factor.forget();
+  StaleFactor& factor = newton.factors.latest();
+  factor.make(assembly, at, newton.contact, dt);
+  factor.forget();
   Buffer<float> v(4 * free_nodes), b(4 * free_nodes);
   unsigned state = 1;
   for (int i = 0; i < free_nodes; ++i) {
@@ -125,7 +197,7 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
     }
   }
   assembly.kernel.apply(assembly.neighbour(at), v.data(), b.data());
-  assembly.kernel.solve(newton.factor.view(), free_nodes, b.data(), b.data());
+  assembly.kernel.solve(factor.view(), free_nodes, b.data(), b.data());
   double wrong = 0.0, size = 0.0;
   for (std::size_t i = 0; i < v.size(); ++i) {
     wrong += (v[i] - b[i]) * (v[i] - b[i]);
@@ -136,8 +208,8 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
 
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }
 ClothPhases ClothSolver::phases() const { return impl_->newton.phases; }
-double ClothSolver::factor_flops() const { return impl_->newton.factor.storage().flops; }
-std::size_t ClothSolver::factor_floats() const { return impl_->newton.factor.storage().panels.size(); }
+double ClothSolver::factor_flops() const { return impl_->newton.factors.latest().storage().flops; }
+std::size_t ClothSolver::factor_floats() const { return impl_->newton.factors.latest().storage().panels.size(); }
 std::string ClothSolver::kernel() const { return impl_->assembly.kernel.name; }
 
 }  // namespace sim_core

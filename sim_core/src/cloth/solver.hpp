@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "cloth/control.hpp"
 #include "cloth/properties.hpp"
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
@@ -20,7 +21,7 @@ class ClothSolver {
   // prescribed; `clamped`: boundary edges whose outward slope is prescribed.
   ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-              const std::string& kernel = "");
+              const StepControl& control, const std::string& kernel = "");
   ~ClothSolver();
 
   void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes);
@@ -29,6 +30,12 @@ class ClothSolver {
   // order from step to step. `damping`: mass-proportional, 1/s.
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
                   const std::vector<Body>& bodies, double damping);
+
+  // From `begin` to `end` by steps of the controller's choice; all intervals are equally long.
+  StepReport advance(double begin, double end, const Motion& motion);
+  // Of the last step: its length [s], and the change of the cloth's momentum over it [N].
+  double last_dt() const;
+  Eigen::Vector3d momentum_rate() const;
 
   Points3 positions() const;
   Points3 velocities() const;
@@ -45,6 +52,8 @@ class ClothSolver {
   Energies energies(const Points3& positions, const Points3& slopes);
   // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
   Points3 stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v);
+  // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.
+  double softest(const Points3& positions, const Points3& slopes);
   // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
   double factor_error(const Points3& positions, const Points3& slopes, double dt);
 

@@ -8,8 +8,8 @@
 namespace sim_core {
 namespace {
 
-// Iterations after which a step is halved rather than pursued, and up to which steps may grow again.
-constexpr int patience = 20, easy = 12;
+// Iterations up to which steps may grow again, of those that a step may take.
+constexpr double easy = 0.6;
 
 }  // namespace
 
@@ -20,7 +20,13 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings)
       assembly_(assembly),
       settings_(settings),
       start_(x),
-      inertial_(x) {}
+      inertial_(x),
+      predicted_(x) {}
+
+void Stepper::restart() {
+  started_ = false;
+  newton.contact.forget();
+}
 
 // Sets where inertia leads, and the ends of what is held, for the part from `begin` to `end` of the step.
 void Stepper::drive_nodes(double begin, double end, double part, const Drive& drive) {
@@ -58,25 +64,74 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
   StepOutcome outcome{false, 0.0};
   if (depth >= depth_hint_) {
     assembly_.definite = depth > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
-    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience, report);
+    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : settings_.patience, report);
     if (!outcome.converged && deepest) outcome = newton.solve(problem, x, true, settings_.newton_max, report);
   }
   if (!outcome.converged && !deepest) {
     if (depth >= depth_hint_) depth_hint_ = depth + 1;
     x = from;
+    ++report.halvings;
     const double middle = 0.5 * (begin + end);
     advance(begin, middle, depth + 1, dt, drive, report);
     advance(middle, end, depth + 1, dt, drive, report);
     return;
   }
   hardest_ = std::max(hardest_, report.newton - iterations);
-  ++report.substeps;
   report.converged = report.converged && outcome.converged;
-  if (!(outcome.residual <= report.residual)) report.residual = outcome.residual;  // a NaN stays
-  for (int i = 0; i < assembly_.numbering.nodes; ++i) at_node(v, i) = (at_node(x, i) - at_node(start_, i)) / part;
+  take(part, outcome.residual, report);
 }
 
-StepReport Stepper::step(double dt, const Drive& drive) {
+// Makes the state that was solved for that of the cloth.
+void Stepper::take(double dt, double residual, StepReport& report) {
+  newton.contact.keep(dt);
+  ++report.substeps;
+  if (!(residual <= report.residual)) report.residual = residual;  // a NaN stays
+  momentum_rate_.setZero();
+  for (int i = 0; i < assembly_.numbering.nodes; ++i) {
+    const Eigen::Vector3d before = at_node(v, i);
+    at_node(v, i) = (at_node(x, i) - at_node(start_, i)) / dt;
+    momentum_rate_ += assembly_.mass[i] / dt * (at_node(v, i) - before);
+  }
+  last_dt_ = dt;
+}
+
+bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
+  check(dt, drive);
+  drive_nodes(0.0, 1.0, dt, drive);
+  assembly_.read_table(start_);
+  assembly_.definite = false;
+  const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
+  newton.predict(problem, predicted_, false);
+  tried_ = newton.solve(problem, x, false, settings_.patience, report);
+  tried_dt_ = dt;
+  return tried_.converged;
+}
+
+void Stepper::accept(const Drive& drive, StepReport& report) {
+  take(tried_dt_, tried_.residual, report);
+  ++report.steps;
+  bodies_before_ = drive.bodies;
+  count_contacts(report);
+}
+
+void Stepper::reject() { x = start_; }
+
+double Stepper::missed() const {
+  double largest = 0.0;
+  for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+    largest = std::max(largest, (at_node(x, i) - at_node(predicted_, i)).squaredNorm());
+  }
+  return std::sqrt(largest);
+}
+
+void Stepper::count_contacts(StepReport& report) const {
+  for (int mode : newton.contact.mode) {
+    report.contacts += mode != contact_open;
+    report.sliding += mode == contact_slip;
+  }
+}
+
+void Stepper::check(double dt, const Drive& drive) {
   const Numbering& numbering = assembly_.numbering;
   if (!(dt > 0.0) || !std::isfinite(dt)) refuse("dt: must be finite and > 0");
   if (drive.gravity.rows() != numbering.vertices) refuse("gravity: must have a row for each vertex");
@@ -90,15 +145,18 @@ StepReport Stepper::step(double dt, const Drive& drive) {
   if (!started_) bodies_before_ = drive.bodies;
   started_ = true;
   if (bodies_before_.size() != drive.bodies.size()) refuse("bodies: must keep their number");
+}
+
+StepReport Stepper::step(double dt, const Drive& drive) {
+  check(dt, drive);
   StepReport report;
   hardest_ = 0;
   advance(0.0, 1.0, 0, dt, drive, report);
   bodies_before_ = drive.bodies;
-  if (hardest_ <= easy && depth_hint_ > 0) --depth_hint_;
-  for (int mode : newton.contact.mode) {
-    report.contacts += mode != contact_open;
-    report.sliding += mode == contact_slip;
-  }
+  if (hardest_ <= easy * settings_.patience && depth_hint_ > 0) --depth_hint_;
+  ++report.steps;
+  report.unconverged += !report.converged;
+  count_contacts(report);
   return report;
 }
 

@@ -25,16 +25,34 @@ class Stepper {
   Newton newton;
 
   // Bodies are where they are in the first step from here.
-  void restart() { started_ = false; }
+  void restart();
   StepReport step(double dt, const Drive& drive);
 
+  // One attempt at a step, as a whole and within the settings' patience, to be accepted or rejected: then nothing has
+  // happened.
+  bool attempt(double dt, const Drive& drive, StepReport& report);
+  void accept(const Drive& drive, StepReport& report);
+  void reject();
+  // Largest distance of a free node from where it was predicted in the last attempt, m.
+  double missed() const;
+
+  // Of the last step: its length [s], and the change of momentum over it [N].
+  double last_dt() const { return last_dt_; }
+  const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
+
  private:
+  void check(double dt, const Drive& drive);
+  void take(double dt, double residual, StepReport& report);
+  void count_contacts(StepReport& report) const;
   void advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report);
   void drive_nodes(double begin, double end, double part, const Drive& drive);
 
   Assembly& assembly_;
   ClothSettings settings_;
-  Buffer<double> start_, inertial_;
+  Buffer<double> start_, inertial_, predicted_;
+  StepOutcome tried_{false, 0.0};
+  double tried_dt_ = 0.0, last_dt_ = 0.0;
+  Eigen::Vector3d momentum_rate_ = Eigen::Vector3d::Zero();
   std::vector<Body> bodies_before_;
   bool started_ = false;
   int depth_hint_ = 0, hardest_ = 0;  // halvings that steps need of late, and Newton iterations of the worst part

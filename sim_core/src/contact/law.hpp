@@ -43,8 +43,11 @@ struct ContactRow {
   double error_squared;        // N^2: by how far the law is missed
 };
 
-bool presses(const ContactSight& sight);
 ContactRow open_row(const Eigen::Vector3d& force);
 ContactRow closed_row(const ContactSight& sight);
+
+// The rows of a branch that is chosen, whatever the law says at the iterate.
+ContactRow sticking_row(const ContactSight& sight);
+ContactRow slipping_row(const ContactSight& sight, const Eigen::Vector3d& direction, double turning);
 
 }  // namespace sim_core

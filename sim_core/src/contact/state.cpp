@@ -59,6 +59,28 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
   return norms;
 }
 
+void ContactState::keep(double dt) { kept_ = {mode, touched, direction, turning, dt}; }
+
+void ContactState::forget() { kept_.dt = 0.0; }
+
+bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
+                          const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) {
+  if (!(kept_.dt > 0.0)) return false;
+  for (std::size_t i = 0; i < mode.size(); ++i) {
+    const int node = static_cast<int>(i), body = kept_.touched[i];
+    if (kept_.mode[i] == contact_open || body < 0) continue;
+    const Gap gap = gap_of(at_end[body], at_node(x, node));
+    const ContactSight seen = sight(node, body, gap, x, start, residual, at_start, at_end);
+    touched[i] = body;
+    at_node(normal, node) = gap.normal.cast<float>();
+    // Friction turns the more easily the further a node slips, and it slips in proportion to dt.
+    write(node, kept_.mode[i] == contact_stick ? sticking_row(seen)
+                                               : slipping_row(seen, at_node(kept_.direction, node).cast<double>(),
+                                                              static_cast<double>(kept_.turning[i]) * kept_.dt / dt));
+  }
+  return true;
+}
+
 ContactSight ContactState::sight(int node, int body, const Gap& gap, const Buffer<double>& x,
                                  const Buffer<double>& start, const Buffer<double>& residual,
                                  const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {

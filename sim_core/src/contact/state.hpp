@@ -30,6 +30,14 @@ class ContactState {
   Norms sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
              const std::vector<Body>& at_start, const std::vector<Body>& at_end);
 
+  // Puts the nodes that were in contact at the end of the last step back into the mode and direction they had, for the
+  // first linear problem of a step of dt: at a predicted state the law would sort many of them wrongly.
+  bool resume(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
+              const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt);
+  // Keeps the modes, directions and stiffnesses of a step that ended, for the next; or none.
+  void keep(double dt);
+  void forget();
+
   ContactRows rows() const;
 
  private:
@@ -37,6 +45,13 @@ class ContactState {
                      const Buffer<double>& residual, const std::vector<Body>& at_start,
                      const std::vector<Body>& at_end) const;
   void write(int node, const ContactRow& row);
+
+  struct Kept {
+    std::vector<int> mode, touched;
+    Buffer<float> direction, turning;
+    double dt = 0.0;  // 0: nothing is kept
+  };
+  Kept kept_;
 };
 
 }  // namespace sim_core

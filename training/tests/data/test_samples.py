@@ -52,7 +52,7 @@ def test_a_clip(clips):
     with pytest.raises(ValueError, match="label must be one of material, texture, viewpoint, and is 'mu'"):
         item.name("mu")
     assert item["mu"] == np.float32(0.4)
-    assert item["side"] == clips.arrays["side"][10]
+    assert item["landed_side"] == clips.arrays["landed_side"][10]
     assert "positions" not in item
 
 

@@ -45,7 +45,8 @@ void check(const Points& points, const Triangles& triangles, const WindowTuple& 
   if (width < 1 || height < 1 || grid < 1 || grid > 64)
     throw std::invalid_argument("window and grid: sizes must be at least 1, and grid at most 64");
   for (std::size_t i = 0; i < points.shape(0); ++i) {
-    if (!(points(i, 2) > 0.0)) throw std::invalid_argument("points: depth must be above 0, and is not at point " + std::to_string(i));
+    if (!(points(i, 2) > 0.0))
+      throw std::invalid_argument("points: depth must be above 0, and is not at point " + std::to_string(i));
   }
   const auto count = static_cast<std::int32_t>(points.shape(0));
   const std::int32_t* indices = triangles.data();
@@ -85,10 +86,8 @@ auto albedo(const Seen& seen, const Points& points, const Triangles& triangles, 
   if (texels.shape(0) != texels.shape(1) || texels.shape(0) < 2 || count < 1 ||
       texels.shape(2) < static_cast<std::size_t>(3 * count))
     throw std::invalid_argument("texels: must be of shape (size, size, channels), channels at least 3 count");
-  const raster::Textures textures{{texels.data(), texels.size()},
-                                  static_cast<int>(texels.shape(0)),
-                                  static_cast<int>(texels.shape(2)),
-                                  count};
+  const raster::Textures textures{
+      {texels.data(), texels.size()}, static_cast<int>(texels.shape(0)), static_cast<int>(texels.shape(2)), count};
   raster::Albedo result;
   {
     nb::gil_scoped_release release;

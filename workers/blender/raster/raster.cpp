@@ -123,10 +123,12 @@ constexpr int lanes = 8;
 typedef float Lanes __attribute__((vector_size(lanes * sizeof(float))));
 
 // sRGB to linear light, above the linear toe a polynomial.
-#define RASTER_DECODED(c)                                                                                         \
-  ((c) <= 0.04045f ? (c) * (1.0f / 12.92f)                                                                        \
-                   : 0.00101080102f + (c) * (0.0301503654f + (c) * (0.538876185f + (c) * (0.611357191f +           \
-                                      (c) * (-0.241147234f + (c) * 0.0597738063f)))))
+#define RASTER_DECODED(c)           \
+  ((c) <= 0.04045f                  \
+       ? (c) * (1.0f / 12.92f)      \
+       : 0.00101080102f +           \
+             (c) * (0.0301503654f + \
+                    (c) * (0.538876185f + (c) * (0.611357191f + (c) * (-0.241147234f + (c) * 0.0597738063f)))))
 
 // One place on the textures.
 struct Place {
@@ -179,8 +181,8 @@ Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> ver
     const auto [x, y, q] = corners(samples, vertices, triangle);
     const auto inside = barycentric(x, y);
     const TextureCoordinate &a = coordinates[triangle.a], &b = coordinates[triangle.b], &c = coordinates[triangle.c];
-    lookups[number] = {sum(inside, a.u * q[0], b.u * q[1], c.u * q[2]),
-                       sum(inside, a.v * q[0], b.v * q[1], c.v * q[2]), sum(inside, q[0], q[1], q[2])};
+    lookups[number] = {sum(inside, a.u * q[0], b.u * q[1], c.u * q[2]), sum(inside, a.v * q[0], b.v * q[1], c.v * q[2]),
+                       sum(inside, q[0], q[1], q[2])};
   }
   std::vector<float> sums(textures.channels);
   std::vector<Place> places(static_cast<std::size_t>(grid) * grid);

@@ -41,15 +41,15 @@ struct Textures {
   int size, channels, count;
 };
 
-// Return the triangle seen at each sample, row by row, (grid height) x (grid width); -1 where there is none. The nearest
-// triangle wins, and of two at the same depth the first.
+// Return the triangle seen at each sample, row by row, (grid height) x (grid width); -1 where there is none. The
+// nearest triangle wins, and of two at the same depth the first.
 std::vector<std::int32_t> visible(std::span<const Projected> vertices, std::span<const Triangle> triangles,
                                   Window window, int grid);
 
 // What the pixels of a window see of the triangles before `end`; those from `end` on only hide.
 struct Albedo {
-  std::vector<float> coverage;   // share of a pixel's samples, (height) x (width)
-  std::vector<float> mean;       // linear, of the samples that see a triangle, height x width x count x 3; 0 elsewhere
+  std::vector<float> coverage;  // share of a pixel's samples, (height) x (width)
+  std::vector<float> mean;      // linear, of the samples that see a triangle, height x width x count x 3; 0 elsewhere
   std::vector<std::int32_t> hits;  // samples that see each triangle before `end`
 };
 

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,23 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 from pydantic import ValidationError
+from stickslip_blender import clips
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.cloth import ClothRenderer, Light
+from stickslip_blender.clips import GATE
 from stickslip_blender.color import silicone_color, to_linear
-from stickslip_blender.rods import RodRenderer
-from stickslip_schemas.cameras import Camera, load_rig, rig_digest
+from stickslip_blender.lights import drawn_light
+from stickslip_blender.scenes.rod_hang import RodRenderer
+from stickslip_blender.stage import ClothStage
+from stickslip_blender.substrates import drawn_substrate
+from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import decode_chunk
+from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import is_sha256
+from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import CorruptArtifactError, Store
-from stickslip_schemas.tasks import RenderOutput, TaskResult
+from stickslip_schemas.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.textures import Texture
 
 LONG_WAY_DOWN = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.1), 150)  # a tenth too long for the rig
@@ -143,7 +148,8 @@ def test_what_is_not_the_samples_fault_is_raised(actor: RenderActor, store: Stor
 _CRASH = """
 import json, os, signal, sys
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.cloth import ClothRenderer, Light
+from stickslip_blender import clips
+from stickslip_blender.clips import GATE
 from stickslip_blender.pixels import FrameReader
 FrameReader.read = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
@@ -170,8 +176,8 @@ def test_a_crash_of_blender_leaves_everything_as_it_was(
 
 def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> None:
     description = actor.describe()
-    assert is_sha256(description["build"])
-    assert description["kinds"] == ["rod_hang", "cloth_drag"]
+    assert set(description["builds"]) == set(KINDS)
+    assert all(map(is_sha256, description["builds"].values()))
     assert set(description["versions"]) == {"bpy", "blender_build"}
     assert RenderActor(str(tmp_path / "elsewhere")).describe() == description
 
@@ -187,51 +193,122 @@ def trajectory(store: Store, make_sheet: Callable[..., Any]) -> Callable[..., st
         sheet = make_sheet(5, reach=reach)
         track = np.repeat(sheet.track + np.float32([shift, 0.0, 0.0]), 75, axis=0)
         file = io.BytesIO()
-        np.savez(file, mesh=track[None], rest=sheet.rest[None], triangles=sheet.triangles[None])
+        np.savez(file, positions=track[None], rest=sheet.rest[None], triangles=sheet.triangles[None])
         return store.publish(file.getvalue())
 
     return publish
 
 
-def _clip(record: str, *, preview: bool = False, **look: Any) -> dict[str, Any]:
+def _clip(record: str, *, preview: bool = False, frames: int = 3, **look: Any) -> dict[str, Any]:
+    more = {name: look.pop(name) for name in ("textures",) if name in look}
     render = {
         "kind": "cloth_drag",
-        "rig": "drag-3",
-        "rig_digest": rig_digest("drag-3"),
+        "rig": "drag",
+        "rig_digest": rig_digest("drag"),
+        "material": "gray-interlock",
         "texture": "plaid",
         "viewpoint": "left",
-        "frames": 3,
-        "quality": "draft",
+        "instants": list(shown_frames(frames, 300)),
+        "quality": "preview",
         "light_seed": 9,
+        "crease_seed": 4,
     }
-    return {"stage": "render", "render": render | look, "record": {"digest": record, "row": 0}, "preview": preview}
+    task = {"stage": "render", "render": render | look, "record": {"digest": record, "row": 0}, "preview": preview}
+    return task | more
 
 
-def test_a_trajectory_becomes_a_clip_and_a_preview(
-    actor: RenderActor, store: Store, trajectory: Callable[..., str], make_sheet: Callable[..., Any]
-) -> None:
-    result = TaskResult.model_validate(actor.render(_clip(trajectory(), preview=True)))
-    assert isinstance(result.output, RenderOutput)
-    light = Light.drawn(9)
-    assert result.output.labels == {"light_seed": 9, "light": list(astuple(light))}
-    chunk = result.output.chunks["video"]
+def _video(store: Store, chunk: ChunkRef, frames: int) -> Any:
     data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
-    video = np.frombuffer(data, dtype=np.uint8).reshape(3, 224, 224, 3)
-    sheet = make_sheet(5)
-    camera = load_rig("drag-3")[1]
-    with ClothRenderer(sheet.triangles, sheet.rest, quality=Quality.draft) as renderer:
-        expected = renderer.render(sheet.track[[0, 1, 2]], camera, texture=Texture.plaid, light=light)
-    assert np.array_equal(video, expected)  # frames 0, 100 and 200 of 300
-    assert result.output.preview is not None
-    with Image.open(io.BytesIO(store.read(result.output.preview))) as preview:
-        assert np.array_equal(np.asarray(preview), np.concatenate(list(video), axis=1))
+    return np.frombuffer(data, dtype=np.uint8).reshape(frames, 224, 224, 3)
+
+
+def _output(result: dict[str, Any]) -> RenderOutput:
+    output = TaskResult.model_validate(result).output
+    assert isinstance(output, RenderOutput)
+    return output
+
+
+def test_a_trajectory_becomes_a_clip_a_preview_and_labels(
+    actor: RenderActor, store: Store, trajectory: Callable[..., str]
+) -> None:
+    output = _output(actor.render(_clip(trajectory(), preview=True, creases=0.5, substrate="ceramic")))
+    video = _video(store, output.chunks["video"], 3)
+    assert len({frame.tobytes() for frame in video}) == 3
+    light, floor = drawn_light("drawn", 9), drawn_substrate("ceramic", 9)
+    labels = dict(output.labels)
+    assert labels.pop("gate_db") >= GATE
+    assert 0.02 < labels.pop("frame_share") < 0.3
+    assert 0.5 < labels.pop("visible_share") <= 1.0
+    assert labels == {
+        "light_seed": 9,
+        "light": light.numbers,
+        "floor": floor.numbers,
+        "lighting": "drawn",
+        "substrate": "ceramic",
+        "creases": 0.5,
+        "composed": True,
+    }
+    assert output.preview is not None
+    with Image.open(io.BytesIO(store.read(output.preview))) as preview:
+        assert (preview.format, preview.n_frames, preview.size) == ("WEBP", 3, (160, 160))
+
+
+def test_a_clip_has_the_same_bytes_however_its_trace_was_made(
+    actor: RenderActor, store: Store, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Alone; with others; from a trace in the store; by an actor that has rendered something else."""
+    cloth = trajectory()
+    alone = _output(actor.render(_clip(cloth, frames=1)))
+    other = RenderActor(str(store.root))
+    other.render(_clip(cloth, frames=1, viewpoint="right", substrate="polyester-mirror"))
+    several = _output(other.render(_clip(cloth, frames=1, textures=["floral", "plaid"], preview=True)))
+    other.close()
+    assert several.clips[Texture.plaid] == alone.chunks["video"]
+    assert set(several.previews) == {"floral", "plaid"}
+    third = RenderActor(str(store.root))
+    monkeypatch.setattr(ClothStage, "trace", None)  # from here on nothing can be traced
+    later = _output(third.render(_clip(cloth, frames=1, textures=["plaid", "dots"])))
+    third.close()
+    assert later.clips[Texture.plaid] == alone.chunks["video"]
+    assert later.labels == several.labels == alone.labels
+
+
+def test_nothing_is_traced_again_for_another_texture(
+    actor: RenderActor, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    traced: list[int] = []
+    trace = ClothStage.trace
+
+    def count(self: ClothStage, *arguments: Any) -> Any:
+        traced.append(1)
+        return trace(self, *arguments)
+
+    monkeypatch.setattr(ClothStage, "trace", count)
+    cloth = trajectory()
+    clips = [_output(actor.render(_clip(cloth, frames=2, texture=texture))).chunks for texture in ("dots", "checker")]
+    assert len(traced) == 2
+    assert clips[0] != clips[1]
+    actor.render(_clip(cloth, frames=2, light_seed=10))
+    assert len(traced) == 4
+
+
+def test_what_fails_the_gate_is_rendered_directly(
+    actor: RenderActor, store: Store, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloth = trajectory()
+    composed = _output(actor.render(_clip(cloth, frames=1)))
+    monkeypatch.setattr(clips, "GATE", 99.0)
+    direct = _output(actor.render(_clip(cloth, frames=1)))
+    assert (composed.labels["composed"], direct.labels["composed"]) == (True, False)
+    one, other = (_video(store, output.chunks["video"], 1).astype(float) for output in (composed, direct))
+    assert 0.0 < np.abs(one - other).mean() < 4.0
 
 
 def test_rods_and_cloths_take_turns(
     actor: RenderActor, record: str, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built: list[str] = []
-    for renderer in (RodRenderer, ClothRenderer):
+    for renderer in (RodRenderer, ClothStage):
 
         def count(self: Any, *arguments: Any, _init: Any = renderer.__init__, **options: Any) -> None:
             built.append(type(self).__name__)
@@ -240,12 +317,14 @@ def test_rods_and_cloths_take_turns(
         monkeypatch.setattr(renderer, "__init__", count)
     cloth = trajectory()
     first = actor.render(_clip(cloth, frames=1))
-    actor.render(_clip(cloth, frames=1, viewpoint="right", texture="dots"))
-    assert built == ["ClothRenderer"]  # built once for all looks of a mesh
+    actor.render(_clip(cloth, frames=1, viewpoint="right", material="11oz-black-denim", substrate="any", creases=1.0))
+    assert built == ["ClothStage"]  # built once for all looks of a mesh
     rod = actor.render(_task(record))
     again = actor.render(_clip(cloth, frames=1))
-    assert built == ["ClothRenderer", "RodRenderer", "ClothRenderer"]
-    assert again["output"] == first["output"]
+    assert built == ["ClothStage", "RodRenderer"]  # its trace is still there
+    another = actor.render(_clip(cloth, frames=1, light_seed=2))
+    assert built == ["ClothStage", "RodRenderer", "ClothStage"]
+    assert again["output"] == first["output"] != another["output"]
     assert rod["outcome"] == "succeeded"
 
 

@@ -1,27 +1,18 @@
 """The build digest is over what is rendered with, and nothing else."""
 
-import shutil
-import subprocess
-import sys
-from pathlib import Path
-
-import stickslip_blender
-from stickslip_blender.build import build_digest
-
-_SAY = "from stickslip_blender.build import build_digest; print(build_digest())"
+import pytest
+from stickslip_blender import build
+from stickslip_blender.build import CUT, build_digest, roots
+from stickslip_schemas.sources import sources
 
 
-def _digest_of_copy(folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", _SAY], capture_output=True, text=True, check=True, env={"PYTHONPATH": str(folder)}
-    )
-    return done.stdout.strip()
+def test_the_rasteriser_is_in_the_build_of_cloth_and_not_of_rods(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {kind: build_digest(kind) for kind in ("cloth_drag", "rod_hang")}
+    monkeypatch.setattr(build, "BUILD_HASH", "another")
+    assert build_digest("cloth_drag") != before["cloth_drag"]
+    assert build_digest("rod_hang") == before["rod_hang"]
 
 
-def test_the_digest_does_not_depend_on_the_place_but_on_every_source(tmp_path: Path) -> None:
-    copy = tmp_path / "stickslip_blender"
-    shutil.copytree(Path(stickslip_blender.__file__).parent, copy)
-    assert _digest_of_copy(tmp_path) == build_digest()
-    with (copy / "rods.py").open("a") as file:
-        file.write("# changed\n")
-    assert _digest_of_copy(tmp_path) != build_digest()
+def test_data_files_are_in_the_build() -> None:
+    files = sources(roots("cloth_drag"), cut=CUT)
+    assert {"stickslip_blender/fabrics.toml", "stickslip_blender/substrates.toml"} <= set(files)

@@ -31,13 +31,16 @@ def roots(stage: str, name: str) -> tuple[str, ...]:
 def build(stage: str, name: str) -> str:
     """Return the digest of everything that decides on what a stage makes for a kind."""
     libraries = {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
-    core = "" if stage == "pack" else _core()
+    core = "" if stage == "pack" else _core(kind(name).kernel())
     files = digests(sources(roots(stage, name), cut=CUT))
     return content_key(f"build/{stage}", {"kind": name, "sources": files, "core": core, "libraries": libraries})
 
 
 def solver_build(module: str) -> str:
-    """Return the digest of a solver: a module of sim_core, all that it imports, and the compiled core."""
+    """Return the digest of a solver: a module of sim_core, all that it imports, and the compiled core.
+
+    The level of its kernels is not part of it: levels differ by less than a certificate can see.
+    """
     return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=CUT))})
 
 
@@ -50,10 +53,10 @@ def kind_builds(name: str) -> dict[str, str]:
     }
 
 
-def _core() -> str:
-    import stickslip_sim_core
+def _core(kernel: str = "") -> str:
+    from stickslip_sim_core import build_info
 
-    return str(stickslip_sim_core.build_info().build_hash)
+    return f"{build_info().build_hash} {kernel}"
 
 
 def versions() -> dict[str, str]:

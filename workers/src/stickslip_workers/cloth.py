@@ -1,5 +1,6 @@
 """What the kinds of cloth share: from a simulation document to a fabric, and from a run to a record and labels."""
 
+import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -47,6 +48,17 @@ class ClothRun(Protocol):
     @property
     def reason(self) -> str: ...
 
+    @property
+    def kernel(self) -> str: ...
+
+
+def kernel_level() -> str:
+    """Return the level of the kernels that cloth is solved with here: the pinned one, or the widest there is."""
+    from stickslip_sim_core._sim_core import cloth_kernels
+    from stickslip_sim_core.cloth.solver import KERNEL_VARIABLE
+
+    return os.environ.get(KERNEL_VARIABLE) or cloth_kernels()[-1]
+
 
 def fabric_of(simulation: "ClothSimulation") -> "Fabric":
     """Return the fabric of a simulation: a measured one or the user's own, times its factors."""
@@ -93,6 +105,7 @@ def result_of(
         "areal_density": fabric.density,
         "bending_rigidity": np.diag(fabric.rigidity).tolist(),
         "stretching_stiffness": fabric.stretching[0].tolist(),
+        "kernel": run.kernel,
         "steps": int(run.steps),
         "unconverged_steps": int(run.unconverged_steps),
         "worst_residual": float(run.worst_residual),

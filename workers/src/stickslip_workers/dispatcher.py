@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import SimulateTask, Task, TaskResult
+from stickslip_schemas.tasks import RenderTask, SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
 from stickslip_workers.backoff import Backoff
@@ -32,6 +32,7 @@ from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import Settings
 from stickslip_workers.stages.run import AnyTask, damaged_inputs
+from stickslip_workers.together import apart, together, trace_of
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,9 @@ AHEAD_SECONDS = 2.0
 MOST_AHEAD = 16
 """Tasks that wait here, for each slot: enough for so long, but one at least and not more than so many. A request costs
 the coordinator about 10 ms whatever it asks for."""
+
+RENDERS_TOGETHER = 12
+"""Renders of one trace that one call makes at most; so many are leased ahead, for they cost little more than one."""
 
 LARGEST_BATCH = max(kind(name).batch for name in kind_names())
 """How many simulations to ask for at once: one call takes them all."""
@@ -114,6 +118,8 @@ class Dispatcher:
         self._reports_due = 0.0
         self._task_seconds: dict[Stage, float] = {}
         self._simulation_seconds: float | None = None
+        self._renders_share = True
+        """Whether the last renders that were leased share traces."""
         self._next_lease = 0.0
         self._stopping = False
 
@@ -212,7 +218,7 @@ class Dispatcher:
             ]
         else:
             pool.give_back(assignment.process, resident)
-            results = _read_results(answer, len(assignment.leases))
+            results = _read_results(answer, assignment.leases)
         seconds = time.monotonic() - assignment.started_at
         self._task_seconds[assignment.stage] = 0.8 * self._task_seconds.get(assignment.stage, seconds) + 0.2 * seconds
         if assignment.stage is Stage.simulate:
@@ -273,7 +279,7 @@ class Dispatcher:
 
     def _assign(self, leases: list[Lease], stage: Stage, process: Process) -> None:
         if stage is Stage.render:
-            ref = process.actor.call.remote("render", leases[0].task.model_dump(mode="json"))
+            ref = process.actor.call.remote("render", together(_renders(leases)).model_dump(mode="json"))
         else:
             tasks = _tasks.dump_json([lease.task for lease in leases]).decode()
             ref = process.actor.call.remote("run", tasks)
@@ -347,6 +353,8 @@ class Dispatcher:
         self._book.add(batch.leases)
         for lease in batch.leases:
             self._queues[Stage(lease.task.stage)].append(lease)
+            if isinstance(lease.task, RenderTask):
+                self._renders_share = trace_of(lease.task) is not None
         return bool(batch.leases)
 
     def _wanted(self) -> dict[Stage, int]:
@@ -358,6 +366,8 @@ class Dispatcher:
             ahead = self._ahead(stage)
             if idle > 0 or queued <= ahead // 2:  # not for one at a time
                 wanted[stage] = ahead + idle
+        if wanted.get(Stage.render, 0) > 0 and self._renders_share:
+            wanted[Stage.render] *= RENDERS_TOGETHER
         if wanted and not self._queues[Stage.simulate]:
             short = self._simulation_seconds is not None and self._simulation_seconds <= LONG_SIMULATION
             wanted[Stage.simulate] = LARGEST_BATCH if short else self._slots
@@ -416,8 +426,14 @@ class Dispatcher:
 
 
 def _next_batch(queue: deque[Lease]) -> list[Lease]:
-    """Take what one process can do together from the front of `queue`: simulations of one kind, or one task."""
+    """Take what one process can do together from `queue`: simulations of a kind, renders of a trace, or one task."""
     batch = [queue.popleft()]
+    if isinstance(batch[0].task, RenderTask) and (trace := trace_of(batch[0].task)) is not None:
+        others = [lease for lease in queue if isinstance(lease.task, RenderTask) and trace_of(lease.task) == trace]
+        batch += others[: RENDERS_TOGETHER - 1]
+        for lease in batch[1:]:
+            queue.remove(lease)
+        return batch
     simulated = _simulated_kind(batch[0])
     limit = 1 if simulated is None else kind(simulated).batch
     while queue and len(batch) < limit and _simulated_kind(queue[0]) == simulated:
@@ -425,17 +441,28 @@ def _next_batch(queue: deque[Lease]) -> list[Lease]:
     return batch
 
 
-def _read_results(answer: Any, count: int) -> list[TaskResult]:
-    """Return the results of `count` tasks: the renderer answers with a dict, the stages with JSON."""
+def _read_results(answer: Any, leases: list[Lease]) -> list[TaskResult]:
+    """Return the result of each lease: the renderer answers with a dict, the stages with JSON."""
     try:
-        return [TaskResult.model_validate(answer)] if isinstance(answer, dict) else _results.validate_json(answer)
+        if isinstance(answer, dict):
+            return apart(_renders(leases), TaskResult.model_validate(answer))
+        return _results.validate_json(answer)
     except ValidationError as error:
-        return [failure(error)] * count
+        return [failure(error)] * len(leases)
+
+
+def _renders(leases: list[Lease]) -> list[RenderTask]:
+    return [lease.task for lease in leases if isinstance(lease.task, RenderTask)]
 
 
 def _batch_count(stage: Stage, queue: deque[Lease]) -> int:
     """Return about how many calls the tasks of `queue` take."""
-    return -(-len(queue) // LARGEST_BATCH) if stage is Stage.simulate else len(queue)
+    if stage is Stage.simulate:
+        return -(-len(queue) // LARGEST_BATCH)
+    if stage is Stage.render:
+        traces = [trace_of(task) for task in _renders(list(queue))]
+        return traces.count(None) + len(set(traces) - {None})
+    return len(queue)
 
 
 def _simulated_kind(lease: Lease) -> str | None:

@@ -9,14 +9,19 @@ from pydantic import Field, TypeAdapter
 
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulation, ClothDragSpec
+from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender, ClothSphereSimulation, ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation, RodHangSpec
 
-KINDS: dict[str, type[JobSpec]] = {"rod_hang": RodHangSpec, "cloth_drag": ClothDragSpec}
+KINDS: dict[str, type[JobSpec]] = {
+    "rod_hang": RodHangSpec,
+    "cloth_drag": ClothDragSpec,
+    "cloth_sphere": ClothSphereSpec,
+}
 """The class of the specs of each kind, by name."""
 
-AnyJobSpec = Annotated[RodHangSpec | ClothDragSpec, Field(discriminator="kind")]
-AnySimulation = Annotated[RodHangSimulation | ClothDragSimulation, Field(discriminator="kind")]
-AnyRender = Annotated[RodHangRender | ClothDragRender, Field(discriminator="kind")]
+AnyJobSpec = Annotated[RodHangSpec | ClothDragSpec | ClothSphereSpec, Field(discriminator="kind")]
+AnySimulation = Annotated[RodHangSimulation | ClothDragSimulation | ClothSphereSimulation, Field(discriminator="kind")]
+AnyRender = Annotated[RodHangRender | ClothDragRender | ClothSphereRender, Field(discriminator="kind")]
 
 job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
 """Validates and dumps the spec of any kind."""

@@ -96,7 +96,10 @@ class ClothDragSpec(ClothSpec):
         return (
             *self.clip_arrays(tuple(Viewpoint)),
             *self.physical_arrays(),
-            ArrayLayout("side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
+            ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
+            ArrayLayout(
+                "landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"
+            ),
             ArrayLayout(
                 "bias",
                 "float64",

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import JobSpec
@@ -91,6 +91,7 @@ def expand(spec: JobSpec, builds: Builds, *, certificate: Sha256 | None = None, 
     previewed = preview_slots(spec.sample_count, previews)
     pack_keys: list[str] = []
     packs: dict[bytes, PlannedTask] = {}
+    renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by trace: those that can be made together
     for shard, members in enumerate(batches(keyed_points(spec, builds), spec.samples_per_shard)):
         last: dict[bytes, None] = {}  # an ordered set: a grid may have one sample in two slots
         for point in members:
@@ -100,15 +101,19 @@ def expand(spec: JobSpec, builds: Builds, *, certificate: Sha256 | None = None, 
                 tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.simulate, point.simulation_text)
             if point.render_key is not None and point.render_text is not None:
                 key = render = bytes.fromhex(point.render_key)
-                if render not in tasks_by_key:
+                shared = (value for axis, value in point.labels.items() if axis != spec.variant_axis)
+                group = renders.setdefault((simulate, *shared), {})
+                if render not in group:
                     preview = point.slot in previewed
-                    tasks_by_key[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview)
+                    group[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview)
             last[key] = None
             plan.samples.append(PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text))
         name = pack_key(spec, shard, members, builds)
         pack_keys.append(name)
         payload = json.dumps({"shard": shard})
         packs[bytes.fromhex(name)] = PlannedTask(_PACK, builds.pack, payload, tuple(last))
+    for group in renders.values():
+        tasks_by_key.update(group)
     tasks_by_key.update(packs)
     publish = bytes.fromhex(publish_key(spec, pack_keys, builds, certificate))
     payload = json.dumps({} if certificate is None else {"certificate": certificate})

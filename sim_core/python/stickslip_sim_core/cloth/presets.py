@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ class SolverSettings:
     """Longest step [s], at most 1; scenes shorten it so that frames fall on steps."""
 
     tolerance: float = 1e-4
-    """Largest residual force of a node in a converged step, in weights of a node; at most 1."""
+    """Largest residual force of a node in a converged step, in weights of 25 mm^2 of the cloth; at most 1."""
 
     newton_max: int = 40
     """Iterations of Newton's method in a step that is not halved any more, 1 ... 1000."""
@@ -28,14 +29,29 @@ class SolverSettings:
     krylov_max: int = 40
     """Iterations of GMRES in one of those, 1 ... 40: the solver keeps a vector for each."""
 
-    krylov_tolerance: float = 0.03
+    krylov_tolerance: float = 0.005
     """Residual over right-hand side at which GMRES stops, below 1."""
 
     refactor_after: int = 15
     """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
 
+    flips_max: int = 32
+    """Contacts that may change between open, stick and slip before the factor is made anew."""
+
+    patience: int = 10
+    """Iterations of Newton's method after which a step is halved rather than pursued, 1 ... 1000."""
+
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
+
+    step_error: float | None = 1e-4
+    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: `time_step`."""
+
+    coarsest: int = 4
+    """Steps that a frame of a scene takes at least, a power of two up to 1024."""
+
+    finest: int = 128
+    """Steps that a frame takes at most, before one that does not converge is halved: a power of two."""
 
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
@@ -43,33 +59,47 @@ class SolverSettings:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("name: must not be empty")
-        for name, high in (("time_step", 1.0), ("tolerance", 1.0), ("krylov_tolerance", 1.0)):
+        for name, high in (("time_step", 1.0), ("tolerance", 1.0), ("krylov_tolerance", 1.0), ("step_error", 1.0)):
             value = getattr(self, name)
+            if name == "step_error" and value is None:
+                continue
             if not (np.isfinite(value) and 0.0 < value <= high):
                 raise ValueError(f"{name}: must be above 0 and at most {high:g}, got {value}")
         for name, low, high in (
             ("newton_max", 1, 1000),
             ("krylov_max", 1, 40),
             ("refactor_after", 0, 10_000),
+            ("flips_max", 0, 1_000_000),
+            ("patience", 1, 1000),
             ("halvings_max", 0, 20),
         ):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise ValueError(f"{name}: must be an integer, {low} ... {high}, got {value}")
+        for name in ("coarsest", "finest"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or value not in [2**power for power in range(11)]:
+                raise ValueError(f"{name}: must be a power of two, 1 ... 1024, got {value}")
+        if self.coarsest > self.finest:
+            raise ValueError(f"finest: must be at least coarsest, {self.coarsest}, got {self.finest}")
         if not 0.0 <= self.unconverged_share_max <= 1.0:
             raise ValueError(f"unconverged_share_max: must be 0 ... 1, got {self.unconverged_share_max}")
 
+
+_CUT_OFF: dict[str, Any] = {"halvings_max": 0, "step_error": None, "unconverged_share_max": 1.0}
 
 PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
     {
         settings.name: settings
         for settings in (
             SolverSettings("certified", 0.02),
-            SolverSettings("fast", 0.04, tolerance=2e-4),
+            SolverSettings("fast", 0.04, tolerance=4e-4, step_error=3e-4, finest=64),
+            # For meshes of 81 vertices a side and more, and where frames are compared.
+            SolverSettings("fine", 0.01, tolerance=5e-5, step_error=5e-5, coarsest=8, finest=256),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
-            SolverSettings("thesis-high", 0.0005),
-            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, unconverged_share_max=1.0),
-            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, unconverged_share_max=1.0),
+            SolverSettings("thesis-high", 0.0005, step_error=None),
+            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, **_CUT_OFF),
+            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, **_CUT_OFF),
         )
     }
 )

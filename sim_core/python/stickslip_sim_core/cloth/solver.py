@@ -1,7 +1,7 @@
 """Pieces of cloth that move in contact with bodies: the thin face of the C++ solver."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +15,12 @@ from stickslip_sim_core.cloth.presets import SolverSettings
 
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that names the level of the kernels."""
+
+MU_MAX = 10.0
+"""Largest coefficient of friction."""
+
+RESIDUAL_PATCH = 0.005**2
+"""Area whose weight residuals are measured in, whatever the mesh [m^2]."""
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -31,8 +37,8 @@ class Body:
     rotation: Floats = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.mu) and self.mu >= 0.0):
-            raise ValueError(f"mu: must be finite and >= 0, got {self.mu}")
+        if not 0.0 <= self.mu <= MU_MAX:
+            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {self.mu}")
 
     def as_tuple(self) -> tuple[int, float, Floats, Floats, Floats]:
         """Return what the C++ core takes."""
@@ -72,6 +78,10 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
     return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
 
 
+Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
+"""What drives a cloth at a time [s]: gravity (V, 3), positions of held vertices (K, 3), bodies."""
+
+
 class Cloth:
     """A piece of cloth, its state, and the settings by which it is stepped.
 
@@ -82,7 +92,7 @@ class Cloth:
         held: (K,) vertices whose positions are prescribed.
         clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
             outward normal of the rest plane.
-        force_scale: Force that residuals are measured in [N]; None is the weight of a node.
+        force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the cloth.
         kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
             that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
 
@@ -106,9 +116,9 @@ class Cloth:
         edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
         self.slopes = np.zeros((len(edges), 3))
         check_mesh(mesh.rest, mesh.triangles)
-        node_weight = fabric.density * mesh.spacing**2 * GRAVITY
-        self.force_scale = node_weight if force_scale is None else force_scale
-        """Force that residuals are measured in [N]: the weight of a node, unless another is given."""
+        patch_weight = fabric.density * RESIDUAL_PATCH * GRAVITY
+        self.force_scale = patch_weight if force_scale is None else force_scale
+        """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given."""
         self._solver = ClothSolver(
             mesh.rest,
             mesh.triangles,
@@ -122,14 +132,19 @@ class Cloth:
             krylov_max=preset.krylov_max,
             krylov_tolerance=preset.krylov_tolerance,
             refactor_after=preset.refactor_after,
+            flips_max=preset.flips_max,
+            patience=preset.patience,
             halvings_max=preset.halvings_max,
+            step_error=preset.step_error or 1.0,
+            coarsest=preset.coarsest,
+            finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
         )
         self.time = 0.0
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
-        self.newton = self.krylov = self.factorizations = 0
+        self.newton = self.krylov = self.factorizations = self.flips = self.halvings = 0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     @property
@@ -200,15 +215,57 @@ class Cloth:
             dt, self.gravity, ends, self.slopes, [body.as_tuple() for body in bodies], damping + self.fabric.damping
         )
         self.time += dt
-        self.steps += 1
-        self.unconverged_steps += not report.converged
+        return self._count(report)
+
+    def advance(self, end: float, motion: Motion, *, damping: float = 0.0) -> StepReport:
+        """Advance to `end` [s] by steps that share the interval and end with it: the controller's, or the preset's.
+
+        All intervals must be equally long. `motion` takes a time [s] and returns what holds at it: gravity (V, 3)
+        [m/s^2], positions of the held vertices (K, 3) [m], and the bodies.
+        """
+
+        def drive(time: float) -> tuple[Floats, Floats, Floats, list[tuple[int, float, Floats, Floats, Floats]]]:
+            gravity, held, bodies = motion(time)
+            return gravity, np.asarray(held, float).reshape(-1, 3), self.slopes, [body.as_tuple() for body in bodies]
+
+        if self.preset.step_error is None:
+            report = self._advance_evenly(end, motion, damping)
+        else:
+            report = self._count(self._solver.advance(self.time, end, drive, damping + self.fabric.damping))
+            self.gravity = motion(end)[0]
+        self.time = end
+        return report
+
+    def _advance_evenly(self, end: float, motion: Motion, damping: float) -> StepReport:
+        begin = self.time
+        steps = max(1, int(np.ceil((end - begin) / self.preset.time_step * (1.0 - 1e-9))))
+        for step in range(1, steps + 1):
+            self.gravity, held, bodies = motion(begin + (end - begin) * step / steps)
+            report = self.step((end - begin) / steps, held=held, bodies=bodies, damping=damping)
+        return report
+
+    def contact_force(self) -> Floats:
+        """Return the force of bodies on the cloth [N] in the last step: change of momentum less weight and holders."""
+        holders = self.reactions[self.held].sum(axis=0)
+        weight = (self.masses[:, None] * self.gravity).sum(axis=0)
+        return np.asarray(self._solver.momentum_rate()) - weight - holders
+
+    def _count(self, report: StepReport) -> StepReport:
+        self.steps += report.steps
+        self.unconverged_steps += report.unconverged
         residual = report.residual / self.force_scale
         if not residual <= self.worst_residual:  # a NaN stays
             self.worst_residual = residual
         self.newton += report.newton
         self.krylov += report.krylov
         self.factorizations += report.factorizations
+        self.flips += report.flips
+        self.halvings += report.halvings
         return report
+
+    def softest(self) -> float:
+        """Return the smallest eigenvalue of stiffness over mass here, without contact [1/s^2]; > 0 means stable."""
+        return float(self._solver.softest(self.positions, self.slopes))
 
     def why_invalid(self, path: Floats) -> str:
         """Return why a simulation with these positions (frames, V, 3) is not valid, or an empty text."""

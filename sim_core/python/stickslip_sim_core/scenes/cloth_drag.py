@@ -1,5 +1,6 @@
 """Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3]."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, plane
+from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, Motion, plane
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -61,8 +62,17 @@ def holder_path(time: float) -> Floats:
 DURATION = duration_of(DROP) + LEGS * duration_of(DRAG)
 """Of drop-and-drag [s]."""
 
-SETTLING_STEPS = 40
-"""Damped steps of 50 ms after which the cloth hangs at rest."""
+HANGING = SolverSettings("hanging", 0.05, tolerance=1e-5, step_error=None)
+"""How the hung shape is found, whatever the preset, so that all presets start from the same."""
+
+HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
+"""The bias is this many times as large at first: the cloth then has one shape, which is followed as the bias falls."""
+
+SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
+"""Steps for each of these, of 50 ms, and their damping [1/s]."""
+
+LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 200
+"""Steps then grow to this length [s], until no vertex moves further than this in one [m]; and how many there may be."""
 
 FRAMES = 300
 """Frames of a whole drop-and-drag."""
@@ -93,16 +103,31 @@ class DropAndDrag:
     self_intersections: NDArray[np.int32]
     """(frames,): pairs of triangles that cross."""
 
-    side: int
-    """+1 or -1: to which side along x the bias broke the symmetry of the drop."""
+    bias_side: int
+    """+1 or -1: to which side along x the bias breaks the symmetry of the drop."""
 
     bias: float
     """Its size: horizontal over vertical gravity during the drop."""
 
+    hung_side: int
+    """+1 or -1: to which side along x the cloth bellied as it hung; the bias chooses it."""
+
+    hung_softest: float
+    """Smallest eigenvalue of stiffness over mass as it hung [1/s^2]: positive, since it is stable."""
+
+    landed_side: int
+    """+1 or -1: on which side of the holders, along x, the cloth lay when the drop ended; 0 if it was not simulated."""
+
+    landed_offset: float
+    """Mean x of the cloth less that of the holders then [m], or NaN."""
+
+    kernel: str
+    """Level of the solver's kernels: levels differ in the last digits."""
+
     steps: int
     unconverged_steps: int
     worst_residual: float
-    """Largest residual force of a node in any step, in weights of a node."""
+    """Largest residual force of a node in any step, in weights of 25 mm^2 of the cloth."""
 
     valid: bool
     reason: str
@@ -125,31 +150,75 @@ def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
     return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
 
 
-def hang(cloth: Cloth, floor: list[Body], *, seed: int) -> tuple[Floats, Tilt]:
-    """Let the cloth come to rest under its holders; return their vertices' positions (K, 3) and the tilt of gravity."""
-    rest = cloth.mesh.rest
-    hung = np.zeros((len(rest), 3))
-    hung[:, 1] = rest[:, 0]
-    hung[:, 2] = rest[:, 1] + SIDE / 2 + CLEARANCE
+@dataclass(frozen=True, eq=False)
+class Hung:
+    """The shape of a cloth at rest under its holders."""
+
+    positions: Floats
+    """(V, 3) [m]"""
+
+    tilt: Tilt
+    side: int
+    softest: float
+    reason: str
+    """Why it is no stable equilibrium, or empty."""
+
+
+def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = None) -> Hung:
+    """Return the shape in which the cloth hangs at rest under its holders, over the floor.
+
+    A cloth held at two corners has many shapes at rest. This is the one that is reached as the tilt of gravity falls
+    from 30 times the bias to the bias; it is settled until nothing moves, and its stability is checked.
+    """
+    held = held_by_holders(mesh)
+    cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
+    flat = np.zeros((len(mesh.rest), 3))
+    flat[:, 1] = mesh.rest[:, 0]
+    flat[:, 2] = mesh.rest[:, 1] + SIDE / 2 + CLEARANCE
     rng = np.random.default_rng(seed)
     side = 1 if rng.random() < 0.5 else -1
     bias = float(rng.uniform(1e-3, 3e-3))
     twist = float(rng.uniform(-0.3, 0.3))
-    tilt = Tilt(side, bias, side * bias * (1.0 + twist * rest[:, 0] / (SIDE / 2)))
-    cloth.set_state(hung)
-    cloth.gravity[:, 0] = tilt.of_vertices * GRAVITY
-    for _ in range(SETTLING_STEPS):
-        cloth.step(0.05, held=hung[cloth.held], bodies=floor, damping=5.0)
-    cloth.set_state(cloth.positions)
-    return hung[cloth.held], tilt
+    tilt = Tilt(side, bias, side * bias * (1.0 + twist * mesh.rest[:, 0] / (SIDE / 2)))
+    cloth.set_state(flat)
+    for times in HANGING_TILTS:
+        cloth.gravity[:, 0] = times * tilt.of_vertices * GRAVITY
+        for _ in range(SETTLING_STEPS):
+            cloth.step(HANGING.time_step, held=flat[held], damping=SETTLING_DAMPING)
+    dt, moved, steps = HANGING.time_step, np.inf, 0
+    while (dt < LONGEST or moved > AT_REST) and steps < HANGING_STEPS_MAX:
+        before = cloth.positions
+        dt = min(1.5 * dt, LONGEST)
+        cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
+        moved, steps = float(np.abs(cloth.positions - before).max()), steps + 1
+    softest = cloth.softest()
+    reason = ""
+    if not moved <= AT_REST:
+        reason = f"the hung cloth did not come to rest: it moved by {moved:.1e} m in {dt:g} s"
+    elif not softest > 0.0:
+        reason = f"the hung cloth is not stable: its softest eigenvalue is {softest:.2g} 1/s^2"
+    return Hung(cloth.positions, tilt, 1 if cloth.positions[:, 0].mean() >= 0.0 else -1, softest, reason)
 
 
-def drag(cloth: Cloth, floor: list[Body], hung: Floats, tilt: Tilt, time: float, dt: float) -> None:
-    """Step the cloth to `time` after the holders have started; gravity is upright one second after the drop."""
-    upright = min(max(time - duration_of(DROP), 0.0), 1.0)
-    cloth.gravity[:, 0] = tilt.of_vertices * GRAVITY * (1.0 - upright)
-    x, z = holder_path(time)
-    cloth.step(dt, held=hung + np.array([x, 0.0, z]), bodies=floor)
+def motion_of(cloth: Cloth, floor: list[Body], hung: Floats, tilt: Tilt) -> Motion:
+    """Return what drives the cloth after the holders have started; gravity is upright one second after the drop."""
+
+    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+        upright = min(max(time - duration_of(DROP), 0.0), 1.0)
+        gravity = np.tile([0.0, 0.0, -GRAVITY], (len(cloth.mesh.rest), 1))
+        gravity[:, 0] = tilt.of_vertices * GRAVITY * (1.0 - upright)
+        x, z = holder_path(time)
+        return gravity, hung + np.array([x, 0.0, z]), floor
+
+    return motion
+
+
+def landing_offset(path: Floats, held: NDArray[np.intp]) -> float:
+    """Return the mean x of the cloth less that of its holders [m] in the first frame after the drop, or NaN."""
+    frame = int(np.ceil(duration_of(DROP) * FRAME_RATE))
+    if frame >= len(path):
+        return float("nan")
+    return float(path[frame, :, 0].mean() - path[frame, held, 0].mean())
 
 
 def drop_and_drag(
@@ -161,6 +230,8 @@ def drop_and_drag(
     frames: int = FRAMES,
     seed: int = 0,
     mesh: meshes.Mesh | None = None,
+    kernel: str | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
 ) -> DropAndDrag:
     """Hold a square of cloth by two corners, lower it onto a plane and drag it to and fro [thesis, 4.2.3].
 
@@ -170,12 +241,14 @@ def drop_and_drag(
 
     Args:
         fabric: One of `fabric_names()`, or one of your own.
-        mu: Coefficient of friction between cloth and floor, >= 0.
+        mu: Coefficient of friction between cloth and floor, 0 ... 10.
         preset: Solver settings, or their name.
         vertices: Vertices a side of the mesh, at least 5.
         frames: Frames to simulate, 2.4 a second from 0 on; 300 are the whole motion.
         seed: Of the bias.
         mesh: Instead of the structured mesh of `vertices`: one of the square of side `SIDE`.
+        kernel: Level of the kernels, see `Cloth`.
+        on_frame: Called with (frames done, frames) after every frame.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -188,28 +261,25 @@ def drop_and_drag(
     mesh = meshes.grid(SIDE, SIDE, vertices - 1, vertices - 1) if mesh is None else mesh
     held = held_by_holders(mesh)
     floor = [plane(mu)]
-    cloth = Cloth(mesh, fabric_of(fabric), settings, held=held)
-    hung, tilt = hang(cloth, floor, seed=seed)
-    per_frame = int(np.ceil(1.0 / (FRAME_RATE * settings.time_step)))
-    dt = 1.0 / (FRAME_RATE * per_frame)
-    masses = cloth.masses[:, None]
+    cloth = Cloth(mesh, fabric_of(fabric), settings, held=held, kernel=kernel)
+    hung = hang(mesh, cloth.fabric, seed=seed, kernel=kernel)
+    cloth.set_state(hung.positions)
+    motion = motion_of(cloth, floor, hung.positions[held], hung.tilt)
     weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
     positions, contact, holders = [cloth.positions], [np.zeros(3)], [-weight]
     for frame in range(1, frames):
-        for step in range(1, per_frame + 1):
-            before = (masses * cloth.velocities).sum(axis=0) if step == per_frame else None
-            drag(cloth, floor, hung, tilt, (frame - 1) / FRAME_RATE + step * dt, dt)
-            if before is not None:
-                pushed = ((masses * cloth.velocities).sum(axis=0) - before) / dt
-                pulled = cloth.reactions[held].sum(axis=0)
-                contact.append(pushed - (masses * cloth.gravity).sum(axis=0) - pulled)
-                holders.append(pulled)
+        cloth.advance(frame / FRAME_RATE, motion)
+        contact.append(cloth.contact_force())
+        holders.append(cloth.reactions[held].sum(axis=0))
         positions.append(cloth.positions)
+        if on_frame is not None:
+            on_frame(frame + 1, frames)
         if not np.isfinite(positions[-1]).all():
             break
     path = np.stack(positions)
     finite = bool(np.isfinite(path).all())
-    reason = cloth.why_invalid(path)
+    reason = hung.reason or cloth.why_invalid(path)
+    landed = landing_offset(path, held)
     return DropAndDrag(
         positions=path,
         rest=mesh.rest,
@@ -218,8 +288,13 @@ def drop_and_drag(
         contact_force=np.stack(contact),
         holder_force=np.stack(holders),
         self_intersections=np.array([self_intersections(p, mesh.triangles) if finite else 0 for p in path], np.int32),
-        side=tilt.side,
-        bias=tilt.bias,
+        bias_side=hung.tilt.side,
+        bias=hung.tilt.bias,
+        hung_side=hung.side,
+        hung_softest=hung.softest,
+        landed_side=int(np.sign(landed)) if np.isfinite(landed) else 0,
+        landed_offset=landed,
+        kernel=cloth.kernel,
         steps=cloth.steps,
         unconverged_steps=cloth.unconverged_steps,
         worst_residual=cloth.worst_residual,

@@ -9,7 +9,7 @@ namespace {
 // A fold by theta over the length h has s = h^2 |H|^2 = 4 sin^2(theta/2) where its energy should go as theta^2. The
 // ratio r(s) = theta^2 / s turns the one into the other; beyond `fold_end` theta^2 goes on as a parabola in s.
 struct Stiffening {
-  double ratio, slope;  // r and dr/ds
+  double ratio, slope, curvature;  // r, dr/ds, d2r/ds2
 };
 
 constexpr double fold_series = 0.4, fold_end = 3.8;
@@ -19,27 +19,49 @@ inline Stiffening stiffening_of(double s) {
     // theta^2 = 2 sum_n s^n / (n^2 C(2n, n))
     constexpr double c[11] = {1.0,         1.0 / 12,     1.0 / 90,      1.0 / 560,     1.0 / 3150,    1.0 / 16632,
                               1.0 / 84084, 1.0 / 411840, 1.0 / 1969110, 1.0 / 9237800, 1.0 / 42678636};
-    double ratio = c[10], slope = 0.0;
+    double ratio = c[10], slope = 0.0, half_curvature = 0.0;
     for (int n = 9; n >= 0; --n) {
+      half_curvature = half_curvature * s + slope;
       slope = slope * s + ratio;
       ratio = ratio * s + c[n];
     }
-    return {ratio, slope};
+    return {ratio, slope, 2.0 * half_curvature};
   }
   const double at = s < fold_end ? s : fold_end;
   const double theta = 2.0 * __builtin_asin(0.5 * __builtin_sqrt(at));
   const double sine = __builtin_sin(theta), cosine = __builtin_cos(theta);
+  // v = theta^2 and its derivatives by s; r = v/s, r' = (v' - r)/s, r'' = (v'' - 2 r')/s.
+  const double second = (sine - theta * cosine) / (2.0 * sine * sine * sine);
   double value = theta * theta, first = theta / sine;
   if (s > fold_end) {
-    const double second = (sine - theta * cosine) / (2.0 * sine * sine * sine), beyond = s - fold_end;
+    const double beyond = s - fold_end;
     value += beyond * (first + 0.5 * beyond * second);
     first += beyond * second;
   }
-  return {value / s, (first - value / s) / s};
+  const double slope = (first - value / s) / s;
+  return {value / s, slope, (second - 2.0 * slope) / s};
 }
 
-// W = A/2 r(s) H:D:H for each triangle; r D + (H:D:H) r' h^2 I, without the rank-one rest, goes into the matrix.
-double bending(const BendingData& data, const double* x, double* gradient, float* stiffening) {
+inline int store_fold(FoldData* folds, int entry, int node, NodeD a, NodeD b) {
+  folds->nodes[entry] = node;
+  float* to = folds->vectors + 8L * entry;
+  for (int c = 0; c < 4; ++c) {
+    to[c] = float(a[c]);
+    to[4 + c] = float(b[c]);
+  }
+  return entry + 1;
+}
+
+// W = A/2 r(s) q for each triangle, q = H:D:H and s = h^2 H:N:H with N = diag(1, 1, 1/2). By H its derivatives are,
+// with m = D H and n = N H,
+//
+//     W'  = A (r m + q r' h^2 n)
+//     W'' = A (r D + q r' h^2 N) + A (2 q r'' h^4 n n^T + 2 r' h^2 (n m^T + m n^T))
+//
+// The first part of W'' acts on x, y and z alike and goes into the matrix (`stiffening`), the second into `folds`.
+double bending(const BendingData& data, const double* x, double* gradient, float* stiffening, FoldData* folds) {
+  int entries = 0;
+  if (folds) folds->count = 0;
   double energy = 0.0;
   const double* d = data.rigidity;
   for (int t = 0; t < data.triangles; ++t) {
@@ -70,6 +92,21 @@ double bending(const BendingData& data, const double* x, double* gradient, float
       NodeD* at = reinterpret_cast<NodeD*>(gradient + 4L * data.nodes[i]);
       const double* w = data.weights + 4L * i;
       *at += spread(w[0]) * p0 + spread(w[1]) * p1 + spread(w[2]) * p2;
+    }
+    if (folds && s > folds->smallest) {
+      const double size2 = data.spacing2[t];
+      float* coefficients = folds->coefficients + 2L * folds->count;
+      coefficients[0] = float(2.0 * area * q * fold.curvature * size2 * size2);
+      coefficients[1] = float(2.0 * area * fold.slope * size2);
+      folds->begin[folds->count++] = entries;
+      for (int i = begin; i < end; ++i) {
+        if (data.nodes[i] >= folds->free_nodes) continue;
+        const double* w = data.weights + 4L * i;
+        const NodeD a = spread(w[0]) * h0 + spread(w[1]) * h1 + spread(0.5 * w[2]) * h2;
+        entries =
+            store_fold(folds, entries, data.nodes[i], a, spread(w[0]) * m0 + spread(w[1]) * m1 + spread(w[2]) * m2);
+      }
+      folds->begin[folds->count] = entries;
     }
   }
   return energy;

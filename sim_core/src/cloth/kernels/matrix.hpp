@@ -6,6 +6,24 @@
 namespace sim_core {
 namespace {
 
+inline void add_folds(const FoldData& folds, const Node* in, Node* out) {
+  for (int f = 0; f < folds.count; ++f) {
+    const Node* vectors = reinterpret_cast<const Node*>(folds.vectors);
+    Node along_a{}, along_b{};
+    for (int e = folds.begin[f]; e < folds.begin[f + 1]; ++e) {
+      const Node v = in[folds.nodes[e]];
+      along_a += vectors[2L * e] * v;
+      along_b += vectors[2L * e + 1] * v;
+    }
+    const float a = along_a[0] + along_a[1] + along_a[2], b = along_b[0] + along_b[1] + along_b[2];
+    const float aa = folds.coefficients[2L * f], ab = folds.coefficients[2L * f + 1];
+    const Node to_a = spread(aa * a + ab * b), to_b = spread(ab * a);
+    for (int e = folds.begin[f]; e < folds.begin[f + 1]; ++e) {
+      out[folds.nodes[e]] += to_a * vectors[2L * e] + to_b * vectors[2L * e + 1];
+    }
+  }
+}
+
 void apply(const ClothMatrix& matrix, const float* x, float* y) {
   const Node* in = reinterpret_cast<const Node*>(x);
   Node* out = reinterpret_cast<Node*>(y);
@@ -26,6 +44,7 @@ void apply(const ClothMatrix& matrix, const float* x, float* y) {
     }
     out[i] = sum + other;
   }
+  add_folds(*matrix.folds, in, out);
 }
 
 }  // namespace

@@ -57,6 +57,6 @@ def simulations(reader: DatasetReader, slots: Integers) -> Integers:
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:
     """Return the side to which each cloth fell; where no vertices are stored, the side to which it was pushed."""
     if "positions" not in reader.arrays:
-        return reader.label("side")[slots].astype(np.int64)
+        return reader.label("bias_side")[slots].astype(np.int64)
     rest = reader.read("rest", slots[:1])[0]
     return np.concatenate([landed_side(reader.read("positions", [slot]), rest) for slot in slots.tolist()])

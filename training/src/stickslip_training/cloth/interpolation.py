@@ -65,16 +65,20 @@ class Curves:
 
     def posterior(self, observed: Floats, variance: float) -> Posterior:
         """Return the posterior of observations (clips, n) with noise of `variance` in each of the n."""
-        exponents = -self.distances(observed) / (2.0 * variance)
+        return self._posterior(self.distances(observed), variance)
+
+    def _posterior(self, distances: Floats, variance: float) -> Posterior:
+        exponents = -distances / (2.0 * variance)
         weights = np.exp(exponents - exponents.max(axis=(1, 2, 3), keepdims=True)).sum(axis=2)
         return Posterior(self.materials, self.bins, weights / weights.sum(axis=(1, 2), keepdims=True))
 
     def fitted_variance(self, observed: Floats, material: Integers, mu: Floats) -> float:
         """Return the variance at which known answers are the most likely; that of features that err together is
         large."""
-        least = float(np.median(self.distances(observed).min(axis=(1, 2, 3)))) / observed.shape[1]
-        tried = max(least, 1e-12) * np.geomspace(0.3, 300.0, 40)
-        likely = [self.posterior(observed, v).log_likelihood(material, mu).mean() for v in tried]
+        distances = self.distances(observed)
+        least = float(np.median(distances.min(axis=(1, 2, 3)))) / observed.shape[1]
+        tried = max(least, 1e-12) * np.geomspace(0.3, 3000.0, 40)
+        likely = [self._posterior(distances, v).log_likelihood(material, mu).mean() for v in tried]
         return float(tried[int(np.argmax(likely))])
 
 
@@ -153,12 +157,17 @@ def _covered(runs: Runs, camera: Camera) -> Floats:
     cameras = Cameras.of([camera] * len(runs))
     meshes = torch.from_numpy(runs.positions[:, frames])
     covered = splat_meshes(meshes, cameras, holder_crops(cameras, instants))
-    return np.asarray(covered.flatten(1).numpy(), dtype=np.float64)
+    return _coarse(covered)
 
 
 def _masks(clips: Clips, chosen: Integers) -> Floats:
     """Return where there is cloth, (clips, n): brighter than half way from the floor to the bright part of the
     cloth."""
-    crops = clips.crops[torch.from_numpy(chosen)].flatten(1)
-    low, high = (torch.quantile(crops, q, dim=1, keepdim=True) for q in (0.3, 0.9))
-    return np.asarray(((crops - low) / (0.5 * (high - low) + 1e-3)).clamp(0.0, 1.0).numpy(), dtype=np.float64)
+    crops = clips.crops[torch.from_numpy(chosen)]
+    low, high = (torch.quantile(crops.flatten(1), q, dim=1)[:, None, None, None] for q in (0.3, 0.9))
+    return _coarse(((crops - low) / (0.5 * (high - low) + 1e-3)).clamp(0.0, 1.0))
+
+
+def _coarse(masks: torch.Tensor) -> Floats:
+    """Return means over 4 x 4 pixels of masks (n, F, 72, 88), (n, numbers): they keep where an edge lies within one."""
+    return np.asarray(torch.nn.functional.avg_pool2d(masks, 4).flatten(1).numpy(), dtype=np.float64)

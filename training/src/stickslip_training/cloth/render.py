@@ -12,6 +12,7 @@ dark.
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from stickslip_schemas.cameras import Camera
@@ -178,10 +179,36 @@ def splat_meshes(positions: torch.Tensor, cameras: Cameras, crops: Crops) -> tor
 
 def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
     """Refine fields on meshes (B, F, side, side, n) to (B, F, points, points, n), smoothly."""
+    weights = _spline(fields.shape[2], points)
     clips, frames, side, _, count = fields.shape
-    flat = fields.reshape(clips * frames, side, side, count).permute(0, 3, 1, 2)
-    fine = torch.nn.functional.interpolate(flat, (points, points), mode="bicubic", align_corners=True)
-    return fine.permute(0, 2, 3, 1).reshape(clips, frames, points, points, count)
+    rows = weights @ fields.reshape(clips * frames, side, side * count)
+    fine = weights @ rows.reshape(clips * frames * points, side, count)
+    return fine.reshape(clips, frames, points, points, count)
+
+
+@cache
+def _spline(nodes: int, points: int) -> torch.Tensor:
+    """Return W, (points, nodes): W @ y are values of the Catmull-Rom spline through y, which goes on straight at its
+    ends."""
+    place = torch.linspace(0, nodes - 1, points, dtype=torch.float64)
+    cell = place.floor().clamp(max=nodes - 2).long()
+    t = place - cell
+    basis = torch.stack(
+        [
+            -0.5 * t + t**2 - 0.5 * t**3,
+            1 - 2.5 * t**2 + 1.5 * t**3,
+            0.5 * t + 2 * t**2 - 1.5 * t**3,
+            -0.5 * t**2 + 0.5 * t**3,
+        ],
+        dim=1,
+    )
+    padded = torch.zeros(points, nodes + 2, dtype=torch.float64)
+    padded.scatter_(1, cell[:, None] + torch.arange(4), basis)
+    weights = padded[:, 1:-1].clone()
+    for ghost, first, second in ((0, 0, 1), (-1, -1, -2)):  # y_ghost = 2 y_first - y_second
+        weights[:, first] += 2 * padded[:, ghost]
+        weights[:, second] -= padded[:, ghost]
+    return weights.float()
 
 
 def shading(positions: torch.Tensor, cameras: Cameras, style: Style) -> torch.Tensor:

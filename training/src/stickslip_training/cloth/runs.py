@@ -5,10 +5,12 @@ it); a dataset that stores its meshes holds them, too.
 """
 
 import json
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -18,8 +20,9 @@ from stickslip_training.data.reader import DatasetReader, Split
 STEP = 1e-5
 """Of the positions in a packed file [m]."""
 
-DROPPED = 20
-"""The first instant, of 300, of which the landed side is told: 8.3 s, with the cloth down and the drag begun."""
+SLIDING = 60
+"""The instant, of 300, that tells the branch: on the first leg the free edge trails, or is pushed ahead of the
+holders."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,7 @@ class Runs:
     mu: Floats
     """(runs,)"""
     landed: Integers
-    """(runs,): +1 or -1, the side along x to which the free edge lies once the cloth is down."""
+    """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on the first leg."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -53,6 +56,15 @@ class Runs:
             self.landed[chosen],
         )
 
+    @staticmethod
+    def joined(first: "Runs", second: "Runs") -> "Runs":
+        """Return the runs of both, which must have the same instants and materials."""
+        if (first.instants, first.materials) != (second.instants, second.materials):
+            raise ValueError("runs that are joined must have the same instants and materials")
+        names = ("positions", "material", "mu", "landed")
+        both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+        return Runs(instants=first.instants, materials=first.materials, **both)
+
     @property
     def side(self) -> int:
         """Vertices along a side of the mesh."""
@@ -60,7 +72,14 @@ class Runs:
 
 
 def load_runs(path: str | Path) -> Runs:
-    """Read a packed file."""
+    """Read a packed file; raise ValueError where it is damaged, or none."""
+    try:
+        return _load(path)
+    except (BadZipFile, zlib.error, KeyError, EOFError) as error:
+        raise ValueError(f"{path} must be a packed file of simulations, and is damaged or is none: {error}") from error
+
+
+def _load(path: str | Path) -> Runs:
     with np.load(path) as file:
         low, high = file["differences"]
         differences = np.stack([low, high], axis=-1).view(np.int16)[..., 0]
@@ -129,8 +148,10 @@ def _runs(
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
-    """Return the side along x, +1 or -1, to which cloth fell: of positions at all instants, (runs, 300, V, 3) [m]."""
-    return _landed(positions[:, DROPPED][:, grid_order(rest)])
+    """Return the side along x, +1 or -1, of the free edge of positions at all instants, (runs, 300, V, 3) [m]."""
+    x = positions[:, SLIDING, :, 0]
+    free, held = (np.isclose(rest[:, 1], end, atol=1e-6) for end in (rest[:, 1].min(), rest[:, 1].max()))
+    return np.where(x[:, free].mean(axis=1) - x[:, held].mean(axis=1) > 0, 1, -1)
 
 
 def _landed(grid: SingleFloats) -> Integers:
@@ -138,9 +159,9 @@ def _landed(grid: SingleFloats) -> Integers:
 
 
 def _first(instants: tuple[int, ...]) -> int:
-    """Return the frame that tells the landed side."""
-    down = [frame for frame, instant in enumerate(instants) if instant >= DROPPED]
-    return down[0] if down else len(instants) - 1
+    """Return the frame that tells the branch."""
+    late = [frame for frame, instant in enumerate(instants) if instant >= SLIDING]
+    return late[0] if late else len(instants) - 1
 
 
 def grid_order(rest: SingleFloats) -> Integers:
@@ -159,13 +180,20 @@ def grid_order(rest: SingleFloats) -> Integers:
 def between(runs: Runs, gap: float) -> list[tuple[int, int]]:
     """Return pairs of runs of one fabric and one landed side that are neighbours in mu, no farther apart than `gap`.
 
-    The mesh of a friction between theirs is close to the mean of theirs: the steady states of a leg move with mu and do
-    not change their kind. Pairs across the two branches of low friction, whose meshes differ, are not returned.
+    The mesh of a friction between theirs is close to the mean of theirs: the steady states of a leg move with mu, and
+    keep their kind. Below `STEEP` they move fast, and two branches exist: neighbours there may be half as far apart.
     """
     pairs = []
     for code in np.unique(runs.material):
         for landed in (-1, 1):
             chosen = np.flatnonzero((runs.material == code) & (runs.landed == landed))
             chosen = chosen[np.argsort(runs.mu[chosen], kind="stable")]
-            pairs += [(int(a), int(b)) for a, b in pairwise(chosen) if runs.mu[b] - runs.mu[a] <= gap]
+            for a, b in pairwise(chosen.tolist()):
+                largest = gap if runs.mu[a] >= STEEP else gap / 2
+                if runs.mu[b] - runs.mu[a] <= largest:
+                    pairs.append((a, b))
     return pairs
+
+
+STEEP = 0.4
+"""mu below which a difference of 0.1 moves edges by several pixels."""

@@ -1,8 +1,8 @@
 """Clips of cloth: from a render task to a result, for every scene of cloth.
 
 One trace serves all textures (`stickslip_blender.multiplexed`) where an image gate finds it good enough. The gate
-renders one frame directly, with one texture, and compares means of 4 x 4 pixels: sampling noise is mostly gone from them,
-and what is wrong with the composition is not. Where it fails, every clip is rendered directly.
+renders one frame directly, with one texture, and compares means of 4 x 4 pixels: they have little sampling noise left,
+and all that is wrong with the composition. Where it fails, every clip is rendered directly.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera, load_rig
 from stickslip_schemas.chunks import decode_chunk, encode_chunk
+from stickslip_schemas.keys import content_key
 from stickslip_schemas.tasks import RenderOutput, TaskResult
 from stickslip_schemas.textures import Texture
 
+from stickslip_blender.build import build_digest
 from stickslip_blender.engine import CLOTH_SAMPLING, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR, Geometry, Set
 from stickslip_blender.lights import drawn_light
@@ -147,9 +149,7 @@ class ClipRenderer:
         return np.stack(frames, axis=1), labels
 
     def _composed(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures) -> Any:
-        return self.stage.composer.compose(
-            light, shot.points, self.camera, self.stage.substrate, self.floor, textures
-        )
+        return self.stage.composer.compose(light, shot.points, self.camera, self.stage.substrate, self.floor, textures)
 
     def _direct(self, shot: Shot, pictures: Sequence[Clip]) -> Iterator[Clip]:
         for picture in pictures:
@@ -172,7 +172,10 @@ def block_decibels(one: Clip, other: Clip) -> float:
 def render_clips(
     look: ClothRender, task: RenderTask, workshop: Workshop, make: Callable[[Any], Set], *, set_key: object = None
 ) -> TaskResult:
-    """Render the clips of a task on the stage that `make` makes of a rest shape; `set_key` says what else it depends on."""
+    """Render the clips of a task on the stage that `make` makes of a rest shape.
+
+    `set_key` says what else the stage depends on.
+    """
     (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
     track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")
     if rejected := why_unfit("cloth", track, 0.0, (camera,)):
@@ -183,12 +186,10 @@ def render_clips(
     )
     clip = renderer.clip(look, camera, track[list(look.instants)])
     trace = _trace(clip, look, task, workshop)
-    wanted = task.textures or (look.texture,)
+    wanted = [Texture(name) for name in task.textures] or [look.texture]
     videos, labels = clip.clips(trace, wanted)
-    kept = workshop.store.publish(_packed(trace)) if task.keep_trace else None
     if not task.textures:
-        result = workshop.rendered("video", videos[0], moving(videos[0]) if task.preview else None, labels)
-        return result if kept is None else _with_trace(result, kept)
+        return workshop.rendered("video", videos[0], moving(videos[0]) if task.preview else None, labels)
     output = RenderOutput(
         chunks={},
         labels=labels,
@@ -196,21 +197,22 @@ def render_clips(
         previews={texture: workshop.store.publish(moving(video)) for texture, video in zip(wanted, videos, strict=True)}
         if task.preview
         else {},
-        trace=kept,
     )
     return TaskResult(outcome="succeeded", output=output)
 
 
 def _trace(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Trace:
-    """Return the trace of a clip: of an earlier task, from the store, or a new one."""
-    key = f"{task.record.digest} {task.record.row} {look.trace}"
+    """Return the trace of a clip: one that was made before, if it is still kept, or a new one."""
+    shared = {"record": task.record.model_dump(), "look": look.trace, "build": build_digest(look.kind)}
+    key = content_key("trace", shared)
     kept = workshop.traces
     if key not in kept:
-        if task.trace is None:
+        stored = workshop.kept_trace(key)
+        if stored is None:
             kept[key] = clip.trace()
+            workshop.keep_trace(key, _packed(kept[key]))
         else:
-            shape = (len(clip.shots), clip.camera.height, clip.camera.width, 3)
-            kept[key] = _unpacked(workshop.store.read(task.trace), shape)
+            kept[key] = _unpacked(stored, (len(clip.shots), clip.camera.height, clip.camera.width, 3))
         while len(kept) > _KEPT_TRACES:
             kept.popitem(last=False)
     kept.move_to_end(key)
@@ -218,7 +220,7 @@ def _trace(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Wo
 
 
 def _packed(trace: Trace) -> bytes:
-    """Return a trace as an artifact: the gate's verdict, and the light."""
+    """Return a trace as bytes: the gate's verdict, and the light."""
     return np.float64(trace.gate_db).tobytes() + encode_chunk(trace.light)
 
 
@@ -226,8 +228,3 @@ def _unpacked(data: bytes, shape: tuple[int, ...]) -> Trace:
     light = np.empty(shape, dtype=np.float16)
     decode_chunk(data[8:], light)
     return Trace(light, float(np.frombuffer(data[:8])[0]))
-
-
-def _with_trace(result: TaskResult, digest: str) -> TaskResult:
-    assert isinstance(result.output, RenderOutput)
-    return result.model_copy(update={"output": result.output.model_copy(update={"trace": digest})})

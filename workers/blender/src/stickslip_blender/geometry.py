@@ -6,6 +6,7 @@ The scene in Blender and the rasteriser are both made of it, so that they see th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -41,7 +42,7 @@ class Set(Protocol):
     props: tuple[Prop, ...]
 
     def poses(self, instant: int, vertices: Array) -> Array:
-        """Return where the props are, (props, 4, 4), at an instant of the motion and vertices (V, 3) of the cloth [m]."""
+        """Return where the props are, (props, 4, 4), at an instant, with the cloth at vertices (V, 3) [m]."""
 
     def aim(self, instant: int, vertices: Array) -> Array:
         """Return the point that the lamp follows (3,) [m]."""
@@ -65,7 +66,7 @@ class Geometry:
         self.cloth_vertices, self.cloth_triangles = len(self.surface.uv), len(self.surface.triangles)
         count, parts = self.cloth_vertices, [self.surface.triangles]
         for prop in stage.props:
-            fans = [(face[0], b, c) for face in prop.faces for b, c in zip(face[1:], face[2:], strict=False)]
+            fans = [(face[0], b, c) for face in prop.faces for b, c in pairwise(face[1:])]
             parts.append(np.array(fans, dtype=np.int32) + count)
             count += len(prop.vertices)
         self.triangles = np.ascontiguousarray(np.concatenate(parts), dtype=np.int32)

@@ -79,18 +79,19 @@ def _noise(shape: tuple[int, ...], blur: tuple[int, int], seed: int) -> Field:
     noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
     for axis, extent in enumerate(blur):
         noise = sum((np.roll(noise, shift, axis) for shift in range(extent)), np.zeros(shape))
-    return (noise - noise.mean()) / noise.std()
+    scaled: Field = (noise - noise.mean()) / noise.std()
+    return scaled
 
 
-# Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. Periods are those that a camera of
-# 224 pixels sees at all: a pixel is 1.5 to 3 mm, so threads are drawn too coarse.
+# Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. A pixel of 224 is 1.5 to 3 mm, so
+# threads are drawn too coarse: periods are those that a camera sees at all.
 _GRAINS: dict[Grain, Callable[[Field, Field], Field]] = {
     "plain": lambda u, v: 0.5 * _noise(u.shape, (6, 6), 1),
     "twill": lambda u, v: 0.7 * np.sin(2.0 * np.pi * (u + v) / 4.0) + 0.3 * _noise(u.shape, (24, 2), 2),
     "melange": lambda u, v: 0.8 * _noise(u.shape, (2, 12), 3),
     "rib": lambda u, v: np.cos(2.0 * np.pi * u / 5.0),
-    "sparkle": lambda u, v: 2.5 * (_noise(u.shape, (3, 3), 4) > 2.6) - 0.12,
+    "sparkle": lambda u, v: np.where(_noise(u.shape, (3, 3), 4) > 2.6, 2.4, -0.12),
     "ribbon": lambda u, v: np.where(np.mod(v, 16.0) < 8.0, 0.7, -0.7),
     "mesh": lambda u, v: 0.6 * np.cos(2.0 * np.pi * u / 4.0) * np.cos(2.0 * np.pi * v / 4.0) - 0.2,
-    "pin-dots": lambda u, v: 1.2 * (np.hypot(np.mod(u, 7.0) - 3.5, np.mod(v, 7.0) - 3.5) < 1.2) - 0.25,
+    "pin-dots": lambda u, v: np.where(np.hypot(np.mod(u, 7.0) - 3.5, np.mod(v, 7.0) - 3.5) < 1.2, 0.95, -0.25),
 }

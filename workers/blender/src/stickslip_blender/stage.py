@@ -1,7 +1,7 @@
 """The stage of all scenes of cloth, in Blender: a cloth over a floor, under one lamp, before black.
 
-The cloth is the solver's, refined so that no facet shows. The lamp follows it along the stage [thesis, 4.2.3]. What else
-stands there is the scene's: see `stickslip_blender.scenes`.
+The cloth is the solver's, refined so that no facet shows. The lamp follows it along the stage [thesis, 4.2.3]. What
+else stands there is the scene's: see `stickslip_blender.scenes`.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ class _Floor:
         angle = 2.0 * np.pi * np.arange(around) / around
         circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=1) * _FLOOR_RADIUS
         circle[:, 2] = FLOOR
-        rim = circle + [0.0, 0.0, _FLOOR_RIM]
+        rim = circle + np.array([0.0, 0.0, _FLOOR_RIM])
         sides = [(k, (k + 1) % around, (k + 1) % around + around, k + around) for k in range(around)]
         vertices = np.concatenate([circle, rim])
         plate = _add_mesh(scene, "floor", vertices, [tuple(range(around)), *sides])

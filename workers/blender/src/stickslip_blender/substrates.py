@@ -103,14 +103,17 @@ def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDA
     share = place - texel
 
     def at(down: int, right: int) -> npt.NDArray[np.float64]:
-        found: npt.NDArray[np.float64] = marks[(texel[..., 1] + down) % GRAIN_SIZE, (texel[..., 0] + right) % GRAIN_SIZE]
+        found: npt.NDArray[np.float64] = marks[
+            (texel[..., 1] + down) % GRAIN_SIZE, (texel[..., 0] + right) % GRAIN_SIZE
+        ]
         return found
 
     low = at(0, 0) + share[..., 0] * (at(0, 1) - at(0, 0))
     high = at(1, 0) + share[..., 0] * (at(1, 1) - at(1, 0))
     fine = low + share[..., 1] * (high - low)
     factor = fine.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(axis=(1, 3))
-    return (factor[..., None] * np.asarray(substrate.tint)).astype(np.float32)
+    tinted: npt.NDArray[np.float32] = (factor[..., None] * np.asarray(substrate.tint)).astype(np.float32)
+    return tinted
 
 
 def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """The cloth that is seen: the solver's mesh refined, with weak creases and a hem of some thickness.
 
 The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at most; a label says
-how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer six millimetres.
+how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer 6 mm.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ class Surface:
         summed = np.stack(
             [np.bincount(index, weights=np.tile(face[:, x], 3), minlength=self._count) for x in range(3)], axis=1
         )
-        return summed / np.linalg.norm(summed, axis=1, keepdims=True)
+        normals: Array = summed / np.linalg.norm(summed, axis=1, keepdims=True)
+        return normals
 
 
 def _creases(uv: Array, seed: int) -> Array:
@@ -118,26 +119,30 @@ def _inward(rim: Array) -> Array:
     """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides there by 1."""
 
     def unit(v: Array) -> Array:
-        return v / np.linalg.norm(v, axis=1, keepdims=True)
+        scaled: Array = v / np.linalg.norm(v, axis=1, keepdims=True)
+        return scaled
 
     def left(v: Array) -> Array:
         return np.stack([-v[:, 1], v[:, 0]], axis=1)
 
     before, after = unit(rim - np.roll(rim, 1, axis=0)), unit(np.roll(rim, -1, axis=0) - rim)
     mean = unit(left(before) + left(after))
-    return mean / (mean * left(after)).sum(axis=1, keepdims=True)
+    inward: Array = mean / (mean * left(after)).sum(axis=1, keepdims=True)
+    return inward
 
 
 def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:
     """Return the corners (n, 3) and barycentric weights (n, 3) of flat points: of the triangle they are most inside."""
     a, b, c = (flat[faces[:, k]] for k in range(3))
     inverse = np.linalg.inv(np.stack([b - a, c - a], axis=-1))  # (T, 2, 2)
+    middle, reach = (a + b + c) / 3.0, 2.0 * np.abs(np.concatenate([b - a, c - a, c - b])).max()
     corners, weights = np.empty((len(points), 3), dtype=np.int32), np.empty((len(points), 3))
     for number, point in enumerate(points):
-        bc = np.einsum("tij,tj->ti", inverse, point - a)
+        near = np.flatnonzero((np.abs(middle - point) < reach).all(axis=1))
+        bc = np.einsum("tij,tj->ti", inverse[near], point - a[near])
         all_three = np.column_stack([1.0 - bc.sum(axis=1), bc])
         best = int(all_three.min(axis=1).argmax())
-        corners[number], weights[number] = faces[best], all_three[best]
+        corners[number], weights[number] = faces[near[best]], all_three[best]
     return corners, weights
 
 

@@ -6,6 +6,7 @@ Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread wou
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ Field = npt.NDArray[np.float64]
 Rgb = tuple[int, int, int]  # sRGB
 
 
+@cache
 def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     """Return the picture of a texture, 8-bit sRGB, shape (SIZE, SIZE, 3); row 0 is the lower edge of the cloth."""
     fine = SIZE * _OVERSAMPLING
@@ -27,6 +29,7 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     picture = _DRAWN_BY[texture](u, v)
     boxes = picture.reshape(SIZE, _OVERSAMPLING, SIZE, _OVERSAMPLING, 3)
     mean: npt.NDArray[np.uint8] = np.rint(boxes.mean(axis=(1, 3))).astype(np.uint8)
+    mean.flags.writeable = False  # it is kept for the next who asks
     return mean
 
 
@@ -116,8 +119,11 @@ def _argyle(u: Field, v: Field) -> Field:
     column = np.mod(np.floor(u * 4), 2) == 1
     diamond = _mix(column, (152, 60, 70), (40, 70, 80))
     picture = _mix(x + y < 0.5, diamond, (222, 214, 196))
-    return _mix(np.minimum(np.abs(_phase(u * 4 + v * 3, 1) - 0.5), np.abs(_phase(u * 4 - v * 3, 1) - 0.5)) < 0.03,
-                (250, 248, 240), picture)
+    return _mix(
+        np.minimum(np.abs(_phase(u * 4 + v * 3, 1) - 0.5), np.abs(_phase(u * 4 - v * 3, 1) - 0.5)) < 0.03,
+        (250, 248, 240),
+        picture,
+    )
 
 
 def _camouflage(u: Field, v: Field) -> Field:

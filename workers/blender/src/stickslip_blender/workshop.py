@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
@@ -12,7 +15,7 @@ import numpy.typing as npt
 from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import encode_chunk
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, write_durably
 from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
 
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
@@ -22,6 +25,10 @@ if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules
 
 FRAME_MARGIN = 1.0
 """How far inside the frame a rod or a cloth has to stay [px]."""
+
+TRACE_BYTES = 4 * 2**30
+"""Room that the traces kept in a store may take: about 500 clips of 30 frames."""
+_DIGEST_BYTES = 32
 
 Array = npt.NDArray[Any]
 
@@ -57,6 +64,36 @@ class Workshop:
         if self._renderer is not None:
             self._renderer[1].close()
             self._renderer = None
+
+    def kept_trace(self, key: str) -> bytes | None:
+        """Return a trace that any process kept in the store; None where there is none, or a damaged one."""
+        path = self._trace_path(key)
+        try:
+            data = path.read_bytes()
+            path.touch()  # the oldest are deleted first
+        except OSError:
+            return None
+        digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        return body if hashlib.sha256(body).digest() == digest else None
+
+    def keep_trace(self, key: str, data: bytes) -> None:
+        """Keep a trace in the store for textures to come; the oldest are deleted where all take too much room.
+
+        No result depends on it: where it cannot be written, only time is lost.
+        """
+        path = self._trace_path(key)
+        with suppress(OSError):
+            write_durably(path, hashlib.sha256(data).digest() + data)
+            files = sorted(path.parent.glob("[0-9a-f]*"), key=lambda file: file.stat().st_mtime)
+            room = TRACE_BYTES - sum(file.stat().st_size for file in files)
+            for file in files[:-1]:
+                if room >= 0:
+                    break
+                room += file.stat().st_size
+                file.unlink(missing_ok=True)
+
+    def _trace_path(self, key: str) -> Path:
+        return self.store.root / "traces" / key
 
     def record(self, record: RecordRef, *names: str) -> list[Array]:
         """Return one row of arrays of an artifact."""

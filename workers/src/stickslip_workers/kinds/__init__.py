@@ -20,6 +20,8 @@ class Kind:
     """How many simulations one call is given at most."""
     solver: str
     """The module of sim_core whose build a certificate vouches for."""
+    kernel: Callable[[], str] = str
+    """Return the level of the kernels that the solver takes here, where levels differ in the last digits."""
 
 
 def kind(name: str) -> Kind:

@@ -7,7 +7,7 @@ import numpy as np
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import TaskResult
 
-from stickslip_workers.cloth import fabric_of, result_of
+from stickslip_workers.cloth import fabric_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind
 
 if TYPE_CHECKING:
@@ -35,8 +35,12 @@ def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult
         "contact_force": np.asarray(run.contact_force, dtype=np.float32),
         "holder_force": np.asarray(run.holder_force, dtype=np.float32),
     }
-    labels = {"side": int(run.side), "bias": float(run.bias)}
+    labels = {
+        "bias_side": int(run.bias_side),
+        "landed_side": int(run.landed_side),
+        "bias": float(run.bias),
+    }
     return result_of(simulation, fabric, run, store, record=forces, labels=labels)
 
 
-KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth")
+KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth", kernel=kernel_level)

@@ -68,7 +68,9 @@ def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
         first, second = q - p, r - p
         return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
 
-    return np.stack([area(places, b, c), area(a, places, c), area(a, b, places)], axis=1) / area(a, b, c)[:, None]
+    parts = np.stack([area(places, b, c), area(a, places, c), area(a, b, places)], axis=1)
+    weights: Points = parts / area(a, b, c)[:, None]
+    return weights
 
 
 def projected(camera: Camera, points: npt.ArrayLike) -> Points:

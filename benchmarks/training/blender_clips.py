@@ -1,0 +1,84 @@
+"""Render clips of packed simulations with Blender, to test a network on a renderer that it has not seen.
+
+    $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz CLIPS.npz [--clips 24] [--seed 0] [--only RUN ...]
+
+RUNS.npz is of `cloth_runs.py --pack`. Only the instants of `--instants` are rendered. Every clip has a viewpoint and a
+light of its own and is rendered with `--textures` textures, from one trace; the runs, or those of `--only`, take turns.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.jobs import Quality
+from stickslip_schemas.kinds.cloth_drag import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS, ClothDragRender
+from stickslip_schemas.textures import HELD_OUT_TEXTURES, Texture
+
+
+def main() -> None:
+    """Render, and write videos and what is true of them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--clips", type=int, default=24, help="traces; clips are so many times the textures")
+    parser.add_argument("--textures", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, nargs="+", help="numbers of the runs; all, if not given")
+    parser.add_argument("--instants", type=int, nargs="+", default=[60, 80, 130, 150, 210, 220])
+    parser.add_argument("--quality", default="draft")
+    parser.add_argument("--held-out-textures", action="store_true")
+    parser.add_argument("--held-out-viewpoints", action="store_true")
+    parser.add_argument("--lighting", default="drawn", help="drawn or held-out")
+    args = parser.parse_args()
+    with np.load(args.runs) as file:
+        low, high = file["differences"]
+        positions = np.cumsum(np.stack([low, high], axis=-1).view(np.int16)[..., 0], axis=1, dtype=np.int16) * 1e-5
+        rest, triangles, instants = file["rest"], file["triangles"].astype(np.int32), file["instants"].tolist()
+        about = [json.loads(str(line)) for line in file["about"]]
+    frames = [instants.index(instant) for instant in args.instants]
+    runs = list(range(len(about))) if args.only is None else args.only
+    textures = [t for t in Texture if (t in HELD_OUT_TEXTURES) == args.held_out_textures]
+    views = HELD_OUT_VIEWPOINTS if args.held_out_viewpoints else TRAINING_VIEWPOINTS
+    cameras = {camera.name: camera for camera in load_rig("drag")}
+    random = np.random.default_rng(args.seed)
+    renderer = ClothRenderer(triangles, rest, Holders)
+    videos, told = [], []
+    try:
+        for clip in range(args.clips):
+            run, view = runs[clip % len(runs)], views[clip % len(views)]
+            chosen = [textures[place] for place in random.permutation(len(textures))[: args.textures]]
+            look = ClothDragRender.model_validate(
+                {
+                    "material": about[run]["material"],
+                    "texture": chosen[0],
+                    "viewpoint": view,
+                    "lighting": args.lighting,
+                    "quality": Quality(args.quality),
+                    "rig": "drag",
+                    "rig_digest": "0" * 64,
+                    "instants": tuple(args.instants),
+                    "light_seed": int(random.integers(2**31)),
+                    "crease_seed": int(random.integers(2**31)),
+                }
+            )
+            made = renderer.clip(look, cameras[view.value], positions[run][frames])
+            videos += list(made.clips(made.trace(), chosen)[0])
+            for texture in chosen:
+                told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **about[run]})
+                print(json.dumps(told[-1]), flush=True)
+    finally:
+        renderer.close()
+    np.savez_compressed(
+        args.out,
+        video=np.stack(videos),
+        instants=np.array(args.instants, np.int16),
+        about=np.array([json.dumps(line) for line in told]),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+import json
+
+import numpy as np
+import pytest
+from stickslip_schemas.cameras import load_rig
+from stickslip_training.cli import app
+from stickslip_training.cloth.clips import read_clips
+from stickslip_training.cloth.crop import HEIGHT, WIDTH
+from stickslip_training.cloth.runs import load_runs
+from stickslip_training.cloth.training import ClothTraining, save_friction, train_friction
+from stickslip_training.data.reader import DatasetReader
+from typer.testing import CliRunner
+
+runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
+AXES = {"material": ["gray-interlock", "11oz-black-denim"], "mu": [0.1, 0.4], "texture": "plaid", "viewpoint": "left"}
+
+
+@pytest.fixture(scope="module")
+def packed(request):
+    return request.path.parent.parent / "cloth" / "runs.npz"
+
+
+@pytest.fixture(scope="module")
+def model(packed, tmp_path_factory):
+    """A network after two steps: its answers have a form, and no worth."""
+    path = tmp_path_factory.mktemp("model") / "friction.pt"
+    runs = load_runs(packed)
+    some = [runs[np.arange(*bounds)] for bounds in ((0, 6), (6, 8))]
+    save_friction(path, train_friction(*some, ClothTraining(steps=2, batch_size=2, width=16), epoch=2))
+    return path
+
+
+@pytest.fixture
+def clips(make_clips):
+    made = make_clips(rejected=(1,), axes=AXES, frames=30, splits={"train": 0.0, "validation": 0.0, "test": 1.0})
+    made.edit_manifest(cameras=load_rig("drag"))
+    return made
+
+
+def test_train_and_evaluate(packed, tmp_path):
+    run = ["cloth", "train", str(packed), "--out", str(tmp_path / "run"), "--threads", "1"]
+    trained = runner.invoke(app, [*run, "--steps", "2"])
+    assert trained.exit_code == 0, trained.output
+    assert "step 2 of 2: loss" in trained.output
+    card = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert card["training_runs"] > card["validation_runs"] > 0
+    again = runner.invoke(app, [*run, "--steps", "2", "--seed", "1", "--resume"])
+    assert again.exit_code == 1
+    assert "seed must be that of the run that is resumed, 0, and is 1" in again.stderr
+    out = tmp_path / "report"
+    model = str(tmp_path / "run" / "friction.pt")
+    judged = runner.invoke(app, ["cloth", "evaluate", model, str(packed), "--out", str(out), "--renders", "1"])
+    assert judged.exit_code == 0, judged.output
+    assert "material not known" in judged.output
+    records = [json.loads(line) for line in (out / "records.jsonl").read_text().splitlines()]
+    assert json.loads((out / "report.json").read_text())["scores"]["blind"]["clips"] == len(records)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 8
+    assert "http" not in page.replace("http://www.w3.org", "")
+
+
+def test_predictions_of_a_dataset_are_a_list_that_can_be_scored(model, clips, tmp_path):
+    result = runner.invoke(app, ["cloth", "predict", str(clips.root), "--model", str(model), "--json"])
+    assert result.exit_code == 0, result.output
+    answers = json.loads(result.stdout)
+    assert [answer["slot"] for answer in answers] == [0, 2, 3]
+    for answer in answers:
+        assert set(answer) == {"slot", "material", "mu"}
+        assert sum(answer["material"].values()) == pytest.approx(1.0, abs=1e-4)
+        assert 0 <= answer["mu"]["low"] <= answer["mu"]["median"] <= answer["mu"]["high"] <= 1.6
+    (tmp_path / "answers.json").write_text(result.stdout)
+    scored = runner.invoke(app, ["cloth", "score", str(tmp_path / "answers.json"), str(clips.root)])
+    assert scored.exit_code == 0, scored.output
+    assert "3 clips of 3 simulations" in scored.output
+    (tmp_path / "answers.json").write_text(json.dumps(answers[:-1]))
+    missing = runner.invoke(app, ["cloth", "score", str(tmp_path / "answers.json"), str(clips.root)])
+    assert missing.exit_code == 1
+    assert "every slot of the test set must be answered, and 1 are not, 3 first" in missing.stderr
+    table = runner.invoke(app, ["cloth", "predict", str(clips.root), "--model", str(model)])
+    assert "80 %" in table.output
+
+
+def test_the_clips_of_a_dataset_as_a_network_sees_them(clips):
+    with DatasetReader(clips.root) as reader:
+        seen, slots = read_clips(reader, "test", ("11oz-black-denim",))
+    assert slots.tolist() == [0, 2, 3]
+    assert seen.crops.shape == (3, 6, HEIGHT, WIDTH)
+    assert 0 <= seen.crops.min() <= seen.crops.max() <= 1
+    assert seen.material.tolist() == [-1, 0, 0]  # the other fabric is not known
+    assert seen.mu.tolist() == [0.1, 0.1, 0.4]
+
+
+def test_what_cannot_be_measured_is_refused(model, clips, rods, make_clips):
+    def refused(*command):
+        result = runner.invoke(app, ["cloth", *command])
+        assert result.exit_code == 1
+        return result.stderr
+
+    assert "kind of the dataset must be cloth_drag to measure friction: it is rod_hang" in refused(
+        "predict", str(rods.root), "--model", str(model)
+    )
+    short = make_clips(frames=2)
+    assert "a clip must show the instant 60 of 300 to within 2" in refused(
+        "predict", str(short.root), "--model", str(model)
+    )
+    assert "split must be one of train, validation, test, and is 'all'" in refused(
+        "predict", str(clips.root), "--model", str(model), "--split", "all"
+    )
+    assert "splits train and validation must have simulations" in refused(
+        "train", str(clips.root), "--out", str(clips.root / "out")
+    )

@@ -1,0 +1,116 @@
+import json
+
+import numpy as np
+import pytest
+from stickslip_training.cloth.evaluation import (
+    Truth,
+    distance_to_interval,
+    errors,
+    measure,
+    median_of_videos,
+    predictions,
+    score,
+    score_predictions,
+)
+from stickslip_training.cloth.posterior import Bins, Estimates, Posterior
+
+BINS = Bins(0.0, 1.6, 64)
+
+
+def answers(mu, deviation, material, certain=0.9):
+    weight = np.exp(-0.5 * ((BINS.centers - np.asarray(mu)[:, None]) / deviation) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    shares = np.where(np.arange(3) == np.asarray(material)[:, None], certain, (1 - certain) / 2)
+    return Posterior(("a", "b", "c"), BINS, shares[..., None] * weight[:, None])
+
+
+def truth(mu, material=None, run=None):
+    count = len(mu)
+    return Truth(
+        np.zeros(count, int) if material is None else np.asarray(material),
+        np.asarray(mu, dtype=float),
+        np.where(np.arange(count) % 2, 1, -1),
+        np.arange(count) if run is None else np.asarray(run),
+    )
+
+
+def test_a_neighbour_in_the_grid_of_the_thesis_is_never_below_a_tenth():
+    grid = np.linspace(0, 1.5, 16)
+    assert (np.abs(np.diff(grid)) < 0.1).any()  # what a plain comparison says
+    found = errors(Estimates(grid[1:], grid[1:], grid[1:]), grid[:-1], np.arange(15))
+    assert found.within_01.value == 0.0
+    assert found.within_02.value == 1.0
+
+
+def test_scores_of_known_answers():
+    mu = np.array([0.2, 0.6, 1.0, 1.4])
+    scores = score(answers(mu + np.array([0.0, 0.05, -0.15, 0.0]), 0.06, [0, 0, 1, 2]), truth(mu))
+    assert scores.blind.mae.value == pytest.approx(0.05, abs=2e-3)
+    assert (scores.blind.within_01.value, scores.blind.within_02.value) == (0.75, 1.0)
+    assert scores.blind.coverage.value == 0.75
+    assert (scores.top_1.value, scores.top_2.value) == (0.5, 0.5 + 0.5 * 1.0)
+    assert set(scores.bands) == {"0 to 0.4", "0.4 to 0.8", "0.8 to 1.2", "1.2 to 1.6"}
+    assert scores.bands["0.8 to 1.2"].mae.value == pytest.approx(0.15, abs=2e-3)
+    assert scores.sides["-1"].clips == scores.sides["+1"].clips == 2
+    json.dumps(scores.as_dict())
+
+
+def test_calibrated_answers_are_reliable_and_overconfident_ones_are_not():
+    generator = np.random.default_rng(2)
+    mu = generator.uniform(0.4, 1.2, 3000)
+    seen = mu + generator.normal(0, 0.1, 3000)
+    good = score(answers(seen, 0.1, np.zeros(3000, int)), truth(mu))
+    assert all(abs(share - float(level)) < 0.03 for level, share in good.reliability.items())
+    assert 0.77 < good.blind.coverage.value < 0.83
+    bold = score(answers(seen, 0.05, np.zeros(3000, int)), truth(mu))
+    assert bold.blind.coverage.value < 0.55
+    assert bold.log_likelihood.value < good.log_likelihood.value
+
+
+def test_uncertainty_counts_simulations_and_not_clips():
+    values = np.repeat(np.random.default_rng(3).normal(size=10), 50)
+    few, many = measure(values, np.repeat(np.arange(10), 50)), measure(values, np.arange(500))
+    assert few.value == many.value
+    assert few.high - few.low > 5 * (many.high - many.low)
+    expected = 2 * 1.645 * values[::50].std() / np.sqrt(10)
+    assert few.high - few.low == pytest.approx(expected, rel=0.15)
+
+
+def test_the_measures_of_real_videos():
+    assert distance_to_interval(np.array([0.5, 0.7, 0.2]), np.full(3, 0.5), np.full(3, 0.1)) == pytest.approx(
+        [0, 0.1, 0.2]
+    )
+    medians, groups = median_of_videos(np.array([0.1, 0.9, 0.2, 0.5, 0.6]), np.array([7, 7, 7, 9, 9]))
+    assert medians.tolist() == [0.2, 0.55]
+    assert groups.tolist() == [7, 9]
+
+
+def test_printed_predictions_score_as_the_posteriors_do():
+    mu, material = np.array([0.2, 0.6, 1.0]), np.array([0, 1, 2])
+    posterior = answers(mu + 0.03, 0.06, [0, 1, 1])
+    told = json.loads(json.dumps(predictions(posterior, [4, 7, 9])))
+    assert set(told[0]) == {"slot", "material", "mu"}
+    assert sum(told[0]["material"].values()) == pytest.approx(1.0, abs=1e-5)
+    expected = {slot: (int(m), float(x), slot) for slot, m, x in zip([4, 7, 9], material, mu, strict=True)}
+    scores, direct = score_predictions(told, posterior.materials, expected), score(posterior, truth(mu, material))
+    assert scores.blind.mae.value == pytest.approx(direct.blind.mae.value, abs=1e-5)
+    assert scores.blind.coverage.value == direct.blind.coverage.value
+    assert scores.top_1.value == direct.top_1.value
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: a.pop(), "every slot of the test set must be answered, and 1 are not, 9 first"),
+        (lambda a: a.append(a[0]), "slot 4 is answered twice"),
+        (lambda a: a[0].update(slot=5), "slot of answer 0 must be one of the test set, and is 5"),
+        (lambda a: a[1].update(mu={"median": 2.0, "low": 0.0, "high": 1.0}), "low <= median <= high"),
+        (lambda a: a[1].pop("mu"), "answer 1 must have slot, material and mu"),
+        (lambda a: a[1].update(material={"silk": 1.0}), "must give probabilities of a, b, c"),
+    ],
+)
+def test_a_file_of_predictions_is_checked(change, message):
+    told = predictions(answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9])
+    change(told)
+    with pytest.raises(ValueError, match=message):
+        score_predictions(told, ("a", "b", "c"), {slot: (0, 0.5, slot) for slot in (4, 7, 9)})

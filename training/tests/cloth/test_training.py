@@ -1,0 +1,107 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from stickslip_training.cloth.evaluation import score
+from stickslip_training.cloth.posterior import MU_BINS
+from stickslip_training.cloth.runs import split_runs
+from stickslip_training.cloth.training import (
+    ClothTraining,
+    calibrated,
+    load_friction,
+    render_clips,
+    save_friction,
+    train_friction,
+)
+
+SMALL = ClothTraining(steps=6, batch_size=2, width=16)
+
+
+@pytest.fixture(scope="module")
+def few(runs):
+    train, validation, test = split_runs(runs, (0.12, 0.25), 0)
+    return train[np.arange(9)], validation[np.arange(2)], test[np.arange(2)]
+
+
+def weights(model):
+    return model.nets[0].state_dict()
+
+
+def equal(first, second):
+    return all(torch.equal(value, weights(second)[name]) for name, value in weights(first).items())
+
+
+def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, tmp_path, monkeypatch):
+    from stickslip_training.engine import fit as engine
+
+    straight = train_friction(*few[:2], SMALL, epoch=2)
+    monkeypatch.setattr(engine, "_is_over", lambda settings, state: state.step == 3)
+    train_friction(*few[:2], SMALL, out=tmp_path, epoch=2)
+    monkeypatch.undo()
+    resumed = train_friction(*few[:2], SMALL, out=tmp_path, epoch=2, resume=True)
+    assert equal(straight, resumed)
+    assert straight.temperature == resumed.temperature
+    assert not equal(straight, train_friction(*few[:2], replace(SMALL, seed=1), epoch=2))
+
+
+def test_saved_and_loaded(few, tmp_path):
+    model = train_friction(*few[:2], SMALL, epoch=6)
+    save_friction(tmp_path / "friction.pt", model)
+    again = load_friction(tmp_path / "friction.pt")
+    clips = render_clips(few[2], 2, 0)
+    assert np.array_equal(again.estimate(clips).joint, model.estimate(clips).joint)
+    assert again.card["training_runs"] == 9
+    assert (again.materials, again.instants) == (model.materials, model.instants)
+
+
+def test_every_render_has_a_look_of_its_own_and_the_seed_repeats_it(few):
+    clips = render_clips(few[2], 2, 3)
+    assert torch.equal(clips.crops, render_clips(few[2], 2, 3).crops)
+    assert not torch.equal(clips.crops[0], clips.crops[1])
+    assert clips.run.tolist() == [0, 0, 1, 1]
+    assert clips.mu.tolist() == np.repeat(few[2].mu, 2).tolist()
+
+
+def test_temperatures_mend_what_is_too_sure():
+    generator = np.random.default_rng(0)
+    truth = generator.uniform(0.3, 1.3, 2000)
+    seen = truth + generator.normal(0, 0.1, 2000)
+    log = (
+        -0.5 * ((MU_BINS.centers - seen[:, None]) / 0.05) ** 2
+    )  # as if the deviation was 0.05: temperature (0.1/0.05)^2
+    mu = np.repeat(log[:, None], 2, axis=1).astype(np.float32)
+    material = np.tile(np.float32([0.0, np.log(4.0)]), (2000, 1))  # 80 %, and it is so in 80 % of the cases
+    code = (np.arange(2000) % 5 > 0).astype(int)
+    found = calibrated(material, mu, code, truth, MU_BINS)
+    assert found[0] == pytest.approx(1.0, abs=0.1)
+    assert found[1] == pytest.approx(4.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps must be more than 0 and finite, and is 0"),
+        ({"turn": -1.0}, "turn must be 0 or more and finite, and is -1"),
+        ({"device": "toaster"}, "device must be one that torch can use here"),
+    ],
+)
+def test_settings_are_checked(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SMALL, **changes)
+
+
+def test_runs_to_validate_are_needed(few):
+    with pytest.raises(ValueError, match="there must be runs to train on and to validate: 9 and 0"):
+        train_friction(few[0], few[1][np.arange(0)], SMALL)
+
+
+@pytest.mark.slow
+def test_it_measures_friction_on_simulations_that_it_has_not_seen(runs):
+    """The acceptance of a small run: 200 CPU seconds, a split by simulation."""
+    train, validation, test = split_runs(runs, (0.12, 0.25), 0)
+    model = train_friction(train, validation, ClothTraining())
+    clips = render_clips(test, 6, 99)
+    scores = score(model.estimate(clips), clips.truth())
+    assert scores.blind.mae.value <= 0.13
+    assert scores.blind.within_02.value >= 0.75

@@ -1,0 +1,45 @@
+"""Ground truth against projection: every claim about a pixel is checked with the camera's own formula."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from stickslip_blender.geometry import FLOOR, Geometry
+from stickslip_blender.ground_truth import CLOTH, GROUND, PROP, ground_truth
+from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_schemas.cameras import load_rig
+
+
+def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any]) -> None:
+    sheet = make_sheet(17)
+    geometry = Geometry(sheet.triangles, sheet.rest, Holders(sheet.rest))
+    camera = load_rig("drag")[0]
+    now, then = (geometry.points(sheet.track[k], k) for k in (1, 2))
+    truth = ground_truth(geometry, now, then, camera)
+
+    assert set(np.unique(truth.segmentation)) == {GROUND, CLOTH, PROP}
+    v, u = np.mgrid[:224, :224]
+    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    place = (truth.depth[..., None] * ray - camera.translation) @ np.asarray(camera.rotation)
+    floor = truth.segmentation == GROUND
+    np.testing.assert_allclose(place[floor][:, 2], FLOOR, atol=1e-6)
+    assert not truth.flow[floor].any()
+    up = np.asarray(camera.rotation) @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(truth.normals[floor], np.broadcast_to(up, truth.normals[floor].shape), atol=1e-6)
+
+    cloth = truth.segmentation == CLOTH
+    assert cloth.sum() > 2000
+    assert np.isfinite(truth.uv[cloth]).all()
+    assert np.isnan(truth.uv[~cloth]).all()
+    vertices = now[: geometry.cloth_vertices]
+    for point, uv in zip(place[cloth][::40], truth.uv[cloth][::40], strict=True):
+        distance = np.linalg.norm(vertices - point, axis=1)
+        assert distance.min() < 0.005
+        assert np.abs(uv - geometry.uv[distance.argmin()]).max() < 0.05
+    # The sheet is dragged along x without changing its shape.
+    shift = then[0] - now[0]
+    moved, _ = camera.project(place[cloth] + shift)
+    np.testing.assert_allclose(truth.flow[cloth], moved - np.column_stack([u[cloth], v[cloth]]), atol=0.02)
+    facing = (truth.normals[cloth] * ray[cloth]).sum(axis=1)
+    assert (facing <= 0.0).all()
+    np.testing.assert_allclose(np.linalg.norm(truth.normals[cloth], axis=1), 1.0, atol=1e-5)

@@ -1,0 +1,72 @@
+"""Renders that share a trace are put together, and their result is taken apart again."""
+
+import pytest
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.kinds.rod_hang import RodHangRender
+from stickslip_schemas.states import Reason
+from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
+from stickslip_workers.together import apart, together, trace_of
+
+RECORD = RecordRef(digest="d" * 64, row=0)
+
+
+def clip(texture: str, *, preview: bool = False, record: RecordRef = RECORD, **look: object) -> RenderTask:
+    shown = {
+        "rig": "drag",
+        "rig_digest": "0" * 64,
+        "material": "gray-interlock",
+        "texture": texture,
+        "quality": "draft",
+    }
+    shown |= {"viewpoint": "left", "instants": (0, 10), "light_seed": 1, "crease_seed": 2}
+    render = ClothDragRender.model_validate(shown | look)
+    return RenderTask(render=render, record=record, preview=preview)
+
+
+def chunk(number: int) -> ChunkRef:
+    return ChunkRef(digest=f"{number:064x}", offset=0, length=1)
+
+
+def test_only_the_texture_may_differ() -> None:
+    same = trace_of(clip("dots"))
+    assert trace_of(clip("plaid", preview=True)) == same
+    others = [clip("dots", light_seed=2), clip("dots", viewpoint="right"), clip("dots", creases=0.5)]
+    others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
+    assert same not in {trace_of(task) for task in others}
+    with pytest.raises(ValueError, match="renders of one trace"):
+        together([clip("dots"), others[0]])
+
+
+def test_a_rod_shares_nothing() -> None:
+    rod = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=1)
+    task = RenderTask(render=rod, record=RECORD)
+    assert trace_of(task) is None
+    assert together([task]) is task
+    with pytest.raises(ValueError, match="renders of one trace"):
+        together([task, task])
+
+
+def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
+    tasks = [clip("dots"), clip("plaid", preview=True), clip("floral")]
+    asked = together(tasks)
+    assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
+    output = RenderOutput(
+        chunks={},
+        labels={"light_seed": 1},
+        clips={name: chunk(number) for number, name in enumerate(asked.textures)},
+        previews=dict.fromkeys(asked.textures, "e" * 64),
+    )
+    results = apart(tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0))
+    assert [result.output.chunks["video"] for result in results] == [chunk(0), chunk(1), chunk(2)]
+    assert [result.output.preview for result in results] == [None, "e" * 64, None]
+    assert all(result.output.labels == {"light_seed": 1} for result in results)
+    assert [(result.cpu_seconds, result.wall_seconds) for result in results] == [(2.0, 1.0)] * 3
+
+
+def test_what_is_wrong_with_a_trace_is_wrong_with_all_its_clips() -> None:
+    tasks = [clip("dots"), clip("plaid")]
+    out = TaskResult(outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0)
+    assert [(result.reason, result.cpu_seconds) for result in apart(tasks, out)] == [(Reason.out_of_frame, 1.0)] * 2
+    lacking = RenderOutput(chunks={}, labels={}, clips={"dots": chunk(0)})
+    results = apart(tasks, TaskResult(outcome="succeeded", output=lacking))
+    assert {result.outcome for result in results} == {"failed"}
