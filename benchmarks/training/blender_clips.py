@@ -2,9 +2,8 @@
 
     $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz CLIPS.npz [--clips 24] [--seed 0] [--only RUN ...]
 
-RUNS.npz is of `cloth_runs.py --pack`. `--silhouettes` writes where there is cloth instead of pictures. Only the
-instants of `--instants` are rendered. Every clip has a viewpoint and a light of its own and is rendered with
-`--textures` textures, from one trace; the runs, or those of `--only`, take turns.
+RUNS.npz is of `cloth_runs.py --pack`. Only the instants of `--instants` are rendered. Every clip has a viewpoint and a
+light of its own and is rendered with `--textures` textures, from one trace; the runs, or those of `--only`, take turns.
 """
 
 import argparse
@@ -12,21 +11,12 @@ import json
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from stickslip_blender.clips import ClothRenderer, Trace
+from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS, ClothDragRender
 from stickslip_schemas.textures import HELD_OUT_TEXTURES, Texture
-
-
-def silhouettes(trace: Trace) -> NDArray[np.bool_]:
-    """Return where there is cloth, (frames, height, width): it alone is traced with a reflectance that channels differ
-    in."""
-    cloth = trace.light[..., 2].astype(np.float32) - trace.light[..., 0]
-    lit = np.quantile(cloth[cloth > 0.02 * cloth.max()], 0.9)
-    return np.asarray(cloth > 0.1 * lit)  # hems and folds are darker than the rest, and traces have some noise
 
 
 def main() -> None:
@@ -43,8 +33,6 @@ def main() -> None:
     parser.add_argument("--held-out-textures", action="store_true")
     parser.add_argument("--held-out-viewpoints", action="store_true")
     parser.add_argument("--lighting", default="drawn", help="drawn or held-out")
-    parser.add_argument("--silhouettes", action="store_true", help="write where there is cloth, and the meshes")
-    parser.add_argument("--raw", action="store_true", help="keep the traces of silhouettes, too")
     args = parser.parse_args()
     with np.load(args.runs) as file:
         low, high = file["differences"]
@@ -58,7 +46,7 @@ def main() -> None:
     cameras = {camera.name: camera for camera in load_rig("drag")}
     random = np.random.default_rng(args.seed)
     renderer = ClothRenderer(triangles, rest, Holders)
-    videos, told, covered = [], [], []
+    videos, told = [], []
     try:
         for clip in range(args.clips):
             run, view = runs[clip % len(runs)], views[clip % len(views)]
@@ -78,29 +66,12 @@ def main() -> None:
                 }
             )
             made = renderer.clip(look, cameras[view.value], positions[run][frames])
-            trace = made.trace()
-            if args.silhouettes:
-                covered.append(silhouettes(trace))
-                if args.raw:
-                    np.save(args.out.with_suffix(f".{clip}.npy"), trace.light)
-                told.append({"run": run, "viewpoint": view.value})
-                continue
-            videos += list(made.clips(trace, chosen)[0])
+            videos += list(made.clips(made.trace(), chosen)[0])
             for texture in chosen:
                 told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **about[run]})
                 print(json.dumps(told[-1]), flush=True)
     finally:
         renderer.close()
-    if args.silhouettes:
-        np.savez_compressed(
-            args.out,
-            covered=np.packbits(np.stack(covered)),
-            shape=np.array(np.shape(covered), np.int16),
-            positions=np.stack([np.round(positions[line["run"]][frames] / 1e-5).astype(np.int16) for line in told]),
-            rest=rest,
-            viewpoints=np.array([line["viewpoint"] for line in told]),
-        )
-        return
     np.savez_compressed(
         args.out,
         video=np.stack(videos),

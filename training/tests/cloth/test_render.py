@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -77,21 +75,6 @@ def test_crops_of_a_picture_are_what_is_rendered_into_them(runs, camera):
     assert (through - direct).abs().mean() < 0.012
     solid = direct > 0.5, through > 0.5
     assert (solid[0] & solid[1]).sum() / (solid[0] | solid[1]).sum() > 0.97
-
-
-def test_the_silhouettes_are_those_of_blender():
-    """Clips of `benchmarks/training/blender_clips.py`; holders cover corners of the cloth there."""
-    with np.load(Path(__file__).with_name("blender.npz")) as file:
-        shape = tuple(file["shape"])
-        covered = np.unpackbits(file["covered"])[: np.prod(shape)].reshape(shape).astype(bool)
-        meshes, names = file["positions"], file["viewpoints"]
-    union = overlap = 0
-    for clip, name in enumerate(names):
-        camera = next(camera for camera in RIG if camera.name == name)
-        ours = silhouettes(torch.from_numpy(meshes[clip].astype(np.float32) * 1e-5), camera).numpy() > 0.5
-        overlap += (ours & covered[clip]).sum()
-        union += (ours | covered[clip]).sum()
-    assert overlap / union >= 0.95
 
 
 def test_turning_a_camera_turns_it_about_the_stage():

@@ -11,7 +11,7 @@ def test_the_packed_file_is_small_and_says_what_it_holds(packed, runs):
     with np.load(packed) as file:
         about = [json.loads(str(line)) for line in file["about"]]
         assert all(run["valid"] and run["vertices"] == 21 and run["build"] for run in about)
-    assert len(runs) == len(about) >= 65
+    assert len(runs) == len(about) >= 50
     assert runs.positions.shape == (len(runs), 30, 21, 21, 3)
     assert [runs.materials[code] for code in runs.material] == [run["material"] for run in about]
     assert runs.mu.tolist() == [run["mu"] for run in about]
@@ -58,7 +58,7 @@ def test_meshes_are_taken_between_neighbours_of_one_fabric_and_side(runs):
 
 
 def test_a_mesh_between_two_is_near_the_simulation_that_lies_there(runs):
-    """Leave one out: above a friction of 0.4, along a leg, to 1.5 mm in the median."""
+    """Leave one out, above a friction of 0.4 and along a leg: to 0.1 mm in the median."""
     off = []
     for code in range(len(runs.materials)):
         for side in (-1, 1):
@@ -66,10 +66,10 @@ def test_a_mesh_between_two_is_near_the_simulation_that_lies_there(runs):
             chosen = chosen[np.argsort(runs.mu[chosen])]
             for (a, b), (_, c) in pairwise(pairwise(chosen.tolist())):
                 share = (runs.mu[b] - runs.mu[a]) / (runs.mu[c] - runs.mu[a])
-                mean = (1 - share) * runs.positions[a, 6] + share * runs.positions[c, 6]
-                off.append(np.linalg.norm(mean - runs.positions[b, 6], axis=-1).mean())
+                mean = (1 - share) * runs.positions[a, 8] + share * runs.positions[c, 8]
+                off.append(np.linalg.norm(mean - runs.positions[b, 8], axis=-1).mean())
     assert len(off) > 10
-    assert np.median(off) < 1.5e-3
+    assert np.median(off) < 1e-4
 
 
 def test_what_is_no_grid_is_refused():

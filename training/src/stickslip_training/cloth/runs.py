@@ -148,8 +148,10 @@ def _runs(
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
-    """Return the side along x, +1 or -1, to which cloth fell: of positions at all instants, (runs, 300, V, 3) [m]."""
-    return _landed(positions[:, SLIDING][:, grid_order(rest)])
+    """Return the side along x, +1 or -1, of the free edge of positions at all instants, (runs, 300, V, 3) [m]."""
+    x = positions[:, SLIDING, :, 0]
+    free, held = (np.isclose(rest[:, 1], end, atol=1e-6) for end in (rest[:, 1].min(), rest[:, 1].max()))
+    return np.where(x[:, free].mean(axis=1) - x[:, held].mean(axis=1) > 0, 1, -1)
 
 
 def _landed(grid: SingleFloats) -> Integers:
