@@ -55,7 +55,7 @@ def main() -> None:
     args = parser.parse_args()
     print(f"{args.material}, mu {args.mu}, {args.preset}, core {build_info().build_hash[:12]}")
     print(
-        "| vertices a side | CPU s | phases [s] | steps | Newton | GMRES | factors a step | flips | halved | unconverged |"
+        "| vertices | CPU s | phases [s] | steps | Newton | GMRES | factors a step | flips | halved | unconverged |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for vertices in args.vertices:

@@ -248,8 +248,7 @@ class Cloth:
         """Return the force of bodies on the cloth [N] in the last step: change of momentum less weight and holders."""
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
-        force: Floats = np.asarray(self._solver.momentum_rate()) - weight - holders
-        return force
+        return np.asarray(self._solver.momentum_rate() - weight - holders)
 
     def _count(self, report: StepReport) -> StepReport:
         self.steps += report.steps
