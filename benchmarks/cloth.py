@@ -1,40 +1,47 @@
-"""CPU seconds of drop-and-drag, by phase, on meshes of 21, 41 and 81 vertices a side.
+"""What drop-and-drag costs, by phase, on meshes of 21, 41 and 81 vertices a side, beside what it cost before.
 
     python benchmarks/cloth.py [--vertices 21 41 81] [--mu 0.5] [--material gray-interlock] [--preset certified]
+                               [--seconds 124.6]
 
-Prints, for the whole motion of 131 s in one thread, CPU seconds, also per simulated second, the phases, and what
-the steps took. The reference is ARGUS on 1,600 vertices: 300 CPU s per simulated second (docs/measurements.md).
+Prints, for the motion in one thread, CPU seconds with the phases, steps, and what they took. `BEFORE` is the core of
+November 2026 that stepped by 20 ms (gray-interlock, mu 0.5, `certified`, 131 s), on a machine with little else to do.
 """
 
 import argparse
 import time
 
-import numpy as np
 from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, plane
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.scenes import cloth_drag as scenes
+from stickslip_sim_core.scenes import cloth_drag
+
+BEFORE = {21: (13.3, 6359, 3.91, 13.6, 0.45), 41: (82.3, 6359, 3.74, 15.5, 0.52), 81: (1037.0, 6319, 7.2, 57.6, 1.9)}
+"""By vertices a side: CPU s, steps, and Newton, GMRES and factors a step; 81: those of 10 steps at 45.5 s."""
 
 
-def run(material: str, mu: float, preset: str, vertices: int) -> None:
-    """Drive the cloth through the stage's whole path, as scenes.drop_and_drag does, and print a line."""
-    settings = PRESETS[preset]
-    mesh = meshes.grid(scenes.SIDE, scenes.SIDE, vertices - 1, vertices - 1)
-    held = scenes.held_by_holders(mesh)
-    cloth = Cloth(mesh, fabric(material), settings, held=held)
-    floor = [plane(mu)]
+def run(material: str, mu: float, preset: str, vertices: int, seconds: float) -> None:
+    """Drive the cloth as `drop_and_drag` does, and print a line."""
+    mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, vertices - 1, vertices - 1)
+    held = cloth_drag.held_by_holders(mesh)
     start = time.process_time()
-    hung, tilt = scenes.hang(cloth, floor, seed=0)
-    steps = int(np.ceil(scenes.DURATION / settings.time_step))
-    dt = scenes.DURATION / steps
-    for step in range(1, steps + 1):
-        scenes.drag(cloth, floor, hung, tilt, step * dt, dt)
+    hung = cloth_drag.hang(mesh, fabric(material), seed=0)
+    hanging = time.process_time() - start
+    cloth = Cloth(mesh, fabric(material), PRESETS[preset], held=held)
+    cloth.set_state(hung.positions)
+    motion = cloth_drag.motion_of(cloth, [plane(mu)], hung.positions[held], hung.tilt)
+    for frame in range(1, int(seconds * cloth_drag.FRAME_RATE + 1e-6) + 1):
+        cloth.advance(frame / cloth_drag.FRAME_RATE, motion)
     cpu = time.process_time() - start
-    phases = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cloth.phases().items())
+    phases = ", ".join(f"{name} {part:.1f}" for name, part in cloth.phases().items())
+    steps = cloth.steps
     print(
-        f"| {vertices} | {cpu:.1f} | {cpu / scenes.DURATION:.2f} | {phases} | {cloth.newton / cloth.steps:.2f} "
-        f"| {cloth.krylov / cloth.steps:.1f} | {cloth.factorizations / cloth.steps:.2f} | {cloth.unconverged_steps} |",
+        f"| {vertices} | {cpu:.1f} | hanging {hanging:.1f}, {phases} | {steps} | {cloth.newton / steps:.2f} "
+        f"| {cloth.krylov / steps:.1f} | {cloth.factorizations / steps:.2f} | {cloth.flips / steps:.1f} "
+        f"| {cloth.halvings} | {cloth.unconverged_steps} |",
         flush=True,
     )
+    if vertices in BEFORE:
+        cost, count, newton, krylov, factors = BEFORE[vertices]
+        print(f"| {vertices}, before | {cost:.1f} | | {count} | {newton:.2f} | {krylov:.1f} | {factors:.2f} | | | 0 |")
 
 
 def main() -> None:
@@ -44,12 +51,15 @@ def main() -> None:
     parser.add_argument("--mu", type=float, default=0.5)
     parser.add_argument("--material", choices=fabric_names(), default="gray-interlock")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="certified")
+    parser.add_argument("--seconds", type=float, default=(cloth_drag.FRAMES - 1) / cloth_drag.FRAME_RATE)
     args = parser.parse_args()
     print(f"{args.material}, mu {args.mu}, {args.preset}, core {build_info().build_hash[:12]}")
-    print("| vertices a side | CPU s | per simulated s | phases [s] | Newton | GMRES | factors a step | unconverged |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(
+        "| vertices a side | CPU s | phases [s] | steps | Newton | GMRES | factors a step | flips | halved | unconverged |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for vertices in args.vertices:
-        run(args.material, args.mu, args.preset, vertices)
+        run(args.material, args.mu, args.preset, vertices, args.seconds)
 
 
 if __name__ == "__main__":

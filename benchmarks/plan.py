@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from stickslip_schemas.builds import Builds
 
 
 def spec(samples: int, *, start: float) -> dict[str, Any]:
@@ -44,8 +45,8 @@ def main() -> None:
             assert coordinator.stdout is not None
             url = coordinator.stdout.readline().split()[-1]
             with httpx.Client(base_url=url, timeout=120) as client:
-                builds = {"sim_core": "a" * 64, "blender": "b" * 64, "packer": "c" * 64}
-                worker = {"name": "bench", "builds": builds, "kinds": ["rod_hang"], "slots": 1}
+                builds = dict.fromkeys(Builds.model_fields, "a" * 64)
+                worker = {"name": "bench", "builds": {"rod_hang": builds}, "slots": 1}
                 key = {"Authorization": f"Bearer {(Path(data) / 'worker-key').read_text().strip()}"}
                 client.post("/v1/workers", json=worker, headers=key).raise_for_status()
                 for name, start in (("first_seconds", 0.0), ("second_seconds", 500.0), ("same_again_seconds", 0.0)):

@@ -86,11 +86,11 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
     """Write the clips as a dataset version, its shards as the packer makes them, its metadata by zarr-python."""
     mu = {"type": "linspace", "start": 0.0, "stop": 1.0, "num": len(clips)}
     axes = {"material": "gray-interlock", "mu": mu, "texture": "plaid", "viewpoint": "calibrated"}
-    document: dict[str, Any] = {"kind": "cloth_drag", "axes": axes, "frames": FRAMES, "store_mesh": False}
+    document: dict[str, Any] = {"kind": "cloth_drag", "axes": axes, "frames": FRAMES, "store_positions": False}
     document["samples_per_shard"] = samples_per_shard
     spec = job_spec_adapter.validate_python(document)
     assert isinstance(spec, ClothDragSpec)
-    builds = Builds(sim_core="0" * 64, blender="0" * 64, packer="0" * 64)
+    builds = Builds(**dict.fromkeys(Builds.model_fields, "0" * 64))
     planned = list(samples(spec, builds))
     arrays: dict[str, NDArray[Any]] = {
         "video": clips,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from stickslip_blender.color import silicone_color
-from stickslip_blender.rods import RodRenderer
+from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import Quality
 

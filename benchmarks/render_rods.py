@@ -16,7 +16,7 @@ import numpy.typing as npt
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.color import silicone_color
 from stickslip_blender.engine import REFERENCE, SAMPLING, Sampling
-from stickslip_blender.rods import GROUND_LEVEL, POINTS, RodRenderer
+from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, POINTS, RodRenderer
 from stickslip_schemas.cameras import load_rig
 
 OTHERS = {

@@ -109,7 +109,7 @@ def look_at(directory: Path) -> None:
 def look_at_cloth(directory: Path) -> None:
     """Draw a batch of clips with their meshes, and lay frames of them out on a sheet: one clip a row."""
     console.rule("clips")
-    clips = ClipDataset(directory, mesh=True)
+    clips = ClipDataset(directory, positions=True)
     (batch,) = clips.loader(len(clips))
     console.print(
         f"{len(clips)} clips in one batch of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }"

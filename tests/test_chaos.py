@@ -51,7 +51,7 @@ def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
     assert again["dataset"] == over["dataset"]
     version = service.get(f"/v1/datasets/{over['dataset']['dataset']}")["versions"]
     assert [item["version"] for item in version] == [1]
-    builds = Builds.model_validate(service.get("/v1/workers")[0]["builds"])
+    builds = Builds.model_validate(service.get("/v1/workers")[0]["builds"]["rod_hang"])
     service.stop()
     assert service.all_processes() == []
     check_ledger(service.data)

@@ -151,15 +151,21 @@ def test_buttons_change_jobs(client: httpx.Client, worker: PretendWorker, app: F
 
 
 def test_a_page_is_told_of_changes(app: FastAPI, client: httpx.Client) -> None:
-    async def first_change() -> bytes:
+    change = b"event: change\ndata: {}\n\n"
+
+    async def follow() -> None:
         stream = _changes(app.state.coordinator)
         assert await anext(stream) == b"retry: 2000\n\n"
-        change = asyncio.ensure_future(anext(stream))
-        await asyncio.sleep(0.05)
+        assert await anext(stream) == change  # at once, for what happened before
+        app.state.coordinator.bell.ring()  # while it pauses
+        assert await asyncio.wait_for(anext(stream), 5) == change
+        following = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(1.2)
+        assert not following.done()
         app.state.coordinator.bell.ring()
-        return await asyncio.wait_for(change, 5)
+        assert await asyncio.wait_for(following, 5) == change
 
-    assert asyncio.run(first_change()) == b"event: change\ndata: {}\n\n"
+    asyncio.run(follow())
 
 
 def test_assets_are_local_and_licensed(client: httpx.Client) -> None:

@@ -8,6 +8,7 @@ import sysconfig
 from pathlib import Path
 
 from stickslip_sim_core import build_info
+from stickslip_sim_core._sim_core import cloth_kernels
 
 SOURCE = Path(__file__).parents[1]
 
@@ -39,6 +40,7 @@ def test_fields() -> None:
     assert info.compiler
     assert info.isa
     assert info.rod_kernel
+    assert info.cloth_kernel in cloth_kernels()
 
 
 def test_hash_follows_what_matters(tmp_path: Path) -> None:
@@ -54,6 +56,6 @@ def test_hash_follows_what_matters(tmp_path: Path) -> None:
         configure(tmp_path / "here", tmp_path / "build-here", "-DSIM_CORE_ISA=", "-DCMAKE_CXX_FLAGS=-fno-inline")
         != here
     )
-    source = tmp_path / "elsewhere" / "src" / "rod_newton.hpp"
+    source = tmp_path / "elsewhere" / "src" / "rods" / "newton.hpp"
     source.write_text(source.read_text() + "// \n")
     assert configure(tmp_path / "elsewhere", tmp_path / "build-elsewhere") != here

@@ -1,5 +1,7 @@
 """Scenes: the path of the stage, drop-and-drag on a coarse mesh, and a sphere that turns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,15 +87,53 @@ class TestDropAndDrag:
         assert np.abs(lifted[:, :2]).max() < 0.02 * weight
 
     def test_side_is_drawn_from_the_seed_and_followed(self) -> None:
-        """The belly of the falling cloth goes to the side that the label names."""
+        """The hung cloth bellies to the side of the bias; where it lands is a label of its own."""
         seen = set()
         for seed in range(4):
             fallen = drop_and_drag("gray-interlock", 0.5, vertices=7, frames=18, seed=seed)
             assert 1e-3 <= fallen.bias <= 3e-3
-            middle = np.abs(fallen.rest[:, 0]) < 0.02
-            assert np.sign(fallen.positions[-1, middle, 0].mean()) == fallen.side
-            seen.add(fallen.side)
+            assert fallen.hung_side == fallen.bias_side == np.sign(fallen.positions[0, :, 0].mean())
+            assert fallen.hung_softest > 0.0
+            held = scenes.held_by_holders(meshes.grid(scenes.SIDE, scenes.SIDE, 6, 6))
+            offset = fallen.positions[17, :, 0].mean() - fallen.positions[17, held, 0].mean()
+            assert fallen.landed_offset == offset
+            assert fallen.landed_side == np.sign(offset)
+            seen.add(fallen.bias_side)
         assert seen == {-1, 1}
+        assert drop_and_drag("gray-interlock", 0.5, vertices=7, frames=17).landed_side == 0
+
+    def test_hung_shape_is_one(self) -> None:
+        """Whatever the preset, settings and kernels: to 1e-6 mm and 1e-3 mm."""
+        mesh = meshes.grid(scenes.SIDE, scenes.SIDE, 10, 10)
+        first = scenes.hang(mesh, fabric("camel-ponte-roma"), seed=0)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(scenes, "HANGING", replace(scenes.HANGING, tolerance=1e-4, time_step=0.035))
+            second = scenes.hang(mesh, fabric("camel-ponte-roma"), seed=0, kernel="baseline")
+        assert first.reason == second.reason == ""
+        assert second.positions == pytest.approx(first.positions, abs=1e-6)
+        starts = [
+            drop_and_drag("gray-interlock", 0.5, vertices=9, frames=1, preset=preset).positions[0]
+            for preset in ("certified", "fast", "thesis-high")
+        ]
+        assert (starts[0] == starts[1]).all()
+        assert (starts[0] == starts[2]).all()
+
+    def test_hung_shape_that_does_not_settle_is_not_valid(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(scenes, "HANGING_STEPS_MAX", 2)
+        scene = drop_and_drag("gray-interlock", 0.5, vertices=7, frames=1)
+        assert not scene.valid
+        assert "did not come to rest" in scene.reason
+
+    def test_frames_are_announced(self) -> None:
+        seen: list[tuple[int, int]] = []
+        drop_and_drag("gray-interlock", 0.5, vertices=5, frames=4, on_frame=lambda *done: seen.append(done))
+        assert seen == [(2, 4), (3, 4), (4, 4)]
+
+    def test_kernel_is_recorded(self) -> None:
+        scene = drop_and_drag("gray-interlock", 0.5, vertices=5, frames=2, kernel="baseline")
+        assert scene.kernel == "baseline"
+        with pytest.raises(ValueError, match="kernel: must be one that this processor runs, baseline"):
+            drop_and_drag("gray-interlock", 0.5, vertices=5, frames=2, kernel="best")
 
     def test_rerun_is_bit_identical(self) -> None:
         first, second = (drop_and_drag("gray-interlock", 0.3, vertices=7, frames=30) for _ in range(2))
@@ -112,8 +152,8 @@ class TestDropAndDrag:
             ({"vertices": 4}, "vertices: must be at least 5, got 4"),
             ({"preset": "best"}, "preset: must be one of"),
             ({"fabric": "silk"}, "fabric: must be one of"),
-            ({"mu": -0.1}, "mu: must be finite and >= 0, got -0.1"),
-            ({"mu": float("nan")}, "mu: must be finite and >= 0, got nan"),
+            ({"mu": -0.1}, r"mu: must be in \[0, 10\], got -0.1"),
+            ({"mu": float("nan")}, r"mu: must be in \[0, 10\], got nan"),
         ],
     )
     def test_refusals(self, settings: dict[str, object], message: str) -> None:
@@ -154,8 +194,8 @@ class TestRotatingSphere:
 
     def test_refusals(self) -> None:
         for settings, message in (
-            ({"mu_floor": -1.0}, "mu: must be finite and >= 0, got -1.0"),
-            ({"mu": float("nan")}, "mu: must be finite and >= 0, got nan"),
+            ({"mu_floor": -1.0}, r"mu: must be in \[0, 10\], got -1.0"),
+            ({"mu": float("nan")}, r"mu: must be in \[0, 10\], got nan"),
             ({"frames": 0}, r"frames: must be 1 \.\.\. 3000, got 0"),
             ({"speed": 21.0}, r"speed: must be in \[-20, 20\] rad/s, got 21.0"),
             ({"vertices": 3}, "vertices: must be at least 5, got 3"),

@@ -1,6 +1,6 @@
 """Internal: the C++ core. Use stickslip_sim_core."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import numpy
@@ -29,6 +29,12 @@ class BuildInfo:
     def rod_kernel(self) -> str:
         """
         Vectors of the rod solver on this processor; its bits are the same for all.
+        """
+
+    @property
+    def cloth_kernel(self) -> str:
+        """
+        Level of the cloth kernels: the widest of this processor, or STICKSLIP_CLOTH_KERNEL. Levels differ in the last digits.
         """
 
     @property
@@ -101,6 +107,12 @@ class StepReport:
         """Largest residual force of a node [N]."""
 
     @property
+    def steps(self) -> int: ...
+
+    @property
+    def unconverged(self) -> int: ...
+
+    @property
     def substeps(self) -> int: ...
 
     @property
@@ -113,6 +125,13 @@ class StepReport:
     def factorizations(self) -> int: ...
 
     @property
+    def flips(self) -> int:
+        """Changes of contacts between open, stick and slip."""
+
+    @property
+    def halvings(self) -> int: ...
+
+    @property
     def contacts(self) -> int: ...
 
     @property
@@ -121,11 +140,17 @@ class StepReport:
 class ClothSolver:
     """Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp."""
 
-    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], density: float, stretching: Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], rigidity: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, halvings_max: int, kernel: str = '') -> None: ...
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], density: float, stretching: Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], rigidity: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, flips_max: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str = '') -> None: ...
 
     def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
 
     def step(self, dt: float, gravity: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], held: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], bodies: Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], damping: float) -> StepReport: ...
+
+    def advance(self, begin: float, end: float, motion: Callable[[float], tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]]]], damping: float) -> StepReport: ...
+
+    def last_dt(self) -> float: ...
+
+    def momentum_rate(self) -> Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')]: ...
 
     def positions(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
 
@@ -142,6 +167,8 @@ class ClothSolver:
     def energies(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> tuple[float, float, Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]]: ...
 
     def stiffness_times(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], v: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
+
+    def softest(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> float: ...
 
     def factor_error(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], dt: float) -> float: ...
 

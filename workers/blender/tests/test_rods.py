@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from stickslip_blender.pixels import Window
-from stickslip_blender.rods import GROUND_LEVEL, RADIUS, RodRenderer
+from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, RADIUS, RodRenderer
 from stickslip_schemas.cameras import Camera
 from stickslip_schemas.jobs import Quality
 
@@ -38,7 +38,7 @@ def test_a_repeat_has_the_same_bytes(curl: npt.NDArray[np.float64], rig: tuple[C
 _FRESH = """
 import hashlib, sys
 import numpy as np
-from stickslip_blender.rods import RodRenderer
+from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import Quality
 with RodRenderer(quality=Quality.draft) as renderer:
@@ -61,7 +61,7 @@ def test_the_ground_is_dark_even_and_what_blender_would_render(
     assert GROUND_LEVEL < 16
     assert np.median(views) == GROUND_LEVEL
     whole = Window(0, 0, 224, 224)
-    monkeypatch.setattr("stickslip_blender.rods._window_about", lambda vertices, camera: whole)
+    monkeypatch.setattr("stickslip_blender.scenes.rod_hang._window_about", lambda vertices, camera: whole)
     with RodRenderer(quality=Quality.draft) as renderer:
         full = renderer.render(curl, rig, color=ORANGE)
     assert np.array_equal(full, views)
@@ -129,7 +129,7 @@ def test_a_scratch_folder_makes_the_same_bytes_and_is_left_empty(
 ) -> None:
     with RodRenderer(quality=Quality.draft, scratch=tmp_path) as renderer:
         assert np.array_equal(renderer.render(curl, rig, color=ORANGE), views)
-        assert len(list(tmp_path.rglob("*.bmp"))) == 1
+        assert len(list(tmp_path.rglob("frame*"))) == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,7 +139,7 @@ def test_an_idle_renderer_takes_no_processor_time() -> None:
 import time
 import numpy as np
 from stickslip_blender.color import silicone_color
-from stickslip_blender.rods import RodRenderer
+from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_schemas.cameras import load_rig
 line = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 150)
 with RodRenderer(quality="draft") as renderer:

@@ -118,7 +118,7 @@ class Dispatcher:
         self._reports_due = 0.0
         self._task_seconds: dict[Stage, float] = {}
         self._simulation_seconds: float | None = None
-        self._renders_share = True
+        self._renders_share = False
         """Whether the last renders that were leased share traces."""
         self._next_lease = 0.0
         self._stopping = False
@@ -426,7 +426,7 @@ class Dispatcher:
 
 
 def _next_batch(queue: deque[Lease]) -> list[Lease]:
-    """Take what one process can do together from `queue`: simulations of one kind, renders of one trace, or one task."""
+    """Take what one process can do together from `queue`: simulations of a kind, renders of a trace, or one task."""
     batch = [queue.popleft()]
     if isinstance(batch[0].task, RenderTask) and (trace := trace_of(batch[0].task)) is not None:
         others = [lease for lease in queue if isinstance(lease.task, RenderTask) and trace_of(lease.task) == trace]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class SolverSettings:
     """Times that a step which does not converge is halved, 0 ... 20."""
 
     step_error: float | None = 1e-4
-    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: steps of `time_step`."""
+    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: `time_step`."""
 
     coarsest: int = 4
     """Steps that a frame of a scene takes at least, a power of two up to 1024."""
@@ -85,6 +86,8 @@ class SolverSettings:
             raise ValueError(f"unconverged_share_max: must be 0 ... 1, got {self.unconverged_share_max}")
 
 
+_CUT_OFF: dict[str, Any] = {"halvings_max": 0, "step_error": None, "unconverged_share_max": 1.0}
+
 PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
     {
         settings.name: settings
@@ -95,12 +98,8 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
             SolverSettings("fine", 0.01, tolerance=5e-5, step_error=5e-5, coarsest=8, finest=256),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
             SolverSettings("thesis-high", 0.0005, step_error=None),
-            SolverSettings(
-                "thesis-low-small-dt", 0.0005, newton_max=2, halvings_max=0, step_error=None, unconverged_share_max=1.0
-            ),
-            SolverSettings(
-                "thesis-low-big-dt", 0.001, newton_max=1, halvings_max=0, step_error=None, unconverged_share_max=1.0
-            ),
+            SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, **_CUT_OFF),
+            SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, **_CUT_OFF),
         )
     }
 )

@@ -167,8 +167,8 @@ class Hung:
 def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = None) -> Hung:
     """Return the shape in which the cloth hangs at rest under its holders, over the floor.
 
-    A cloth held at two corners has many shapes at rest. This is the one that is reached as the tilt of gravity falls from
-    30 times the bias to the bias; it is settled until nothing moves, and its stability is checked.
+    A cloth held at two corners has many shapes at rest. This is the one that is reached as the tilt of gravity falls
+    from 30 times the bias to the bias; it is settled until nothing moves, and its stability is checked.
     """
     held = held_by_holders(mesh)
     cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)

@@ -43,8 +43,8 @@ class Substrate:
 
     @property
     def mirrors(self) -> bool:
-        """Whether things are seen in it."""
-        return self.roughness < 0.6
+        """Whether shapes are seen in it: a rough floor that is no metal shows the cloth's mean colour at most."""
+        return self.metallic > 0.5 or self.roughness < 0.25
 
     @property
     def numbers(self) -> list[float]:

@@ -125,7 +125,7 @@ class Workshop:
 
     def chunk(self, pictures: Array) -> ChunkRef:
         """Publish the pictures (n, height, width, 3) of one sample as a chunk."""
-        chunk = encode_chunk(pictures[None])
+        chunk = encode_chunk(np.ascontiguousarray(pictures[None]))
         return ChunkRef(digest=self.store.publish(chunk), offset=0, length=len(chunk))
 
 

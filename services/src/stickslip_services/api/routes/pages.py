@@ -172,10 +172,12 @@ def get_changes(coordinator: CoordinatorDep) -> StreamingResponse:
 
 async def _changes(coordinator: Coordinator) -> AsyncIterator[bytes]:
     yield b"retry: 2000\n\n"
+    told = -1  # the first message comes at once: something may have changed since the page was made
     while True:
-        seen = coordinator.bell.rung
-        await coordinator.bell.wait(seen, 15.0)
-        yield b": still here\n\n" if coordinator.bell.rung == seen else b"event: change\ndata: {}\n\n"
+        await coordinator.bell.wait(told, 15.0)
+        rung = coordinator.bell.rung
+        yield b": still here\n\n" if rung == told else b"event: change\ndata: {}\n\n"
+        told = rung
         await asyncio.sleep(CHANGE_SECONDS)
 
 
