@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stickslip_training.cloth.evaluation import score
 from stickslip_training.cloth.posterior import MU_BINS
 from stickslip_training.cloth.runs import split_runs
 from stickslip_training.cloth.training import (
@@ -94,14 +93,3 @@ def test_settings_are_checked(changes, message):
 def test_runs_to_validate_are_needed(few):
     with pytest.raises(ValueError, match="there must be runs to train on and to validate: 9 and 0"):
         train_friction(few[0], few[1][np.arange(0)], SMALL)
-
-
-@pytest.mark.slow
-def test_it_measures_friction_on_simulations_that_it_has_not_seen(runs):
-    """The acceptance of a small run: 200 CPU seconds, a split by simulation."""
-    train, validation, test = split_runs(runs, (0.12, 0.25), 0)
-    model = train_friction(train, validation, ClothTraining())
-    clips = render_clips(test, 6, 99)
-    scores = score(model.estimate(clips), clips.truth())
-    assert scores.blind.mae.value <= 0.13
-    assert scores.blind.within_02.value >= 0.75

@@ -182,13 +182,14 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
         return named, dict(zip(("train", "validation", "test"), parts, strict=True))
     with DatasetReader(source) as reader:
         named = {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}
-        splits = {}
-        for split in ("train", "validation", "test"):
-            if len(reader.slots(_split(split))):
-                splits[split] = runs_of_dataset(reader, _split(split), INSTANTS)[0]
-        missing = {"train", "validation"} - set(splits)
+        missing = [split for split in ("train", "validation") if not len(reader.slots(_split(split)))]
         if missing:
             raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
+        splits = {
+            split: runs_of_dataset(reader, _split(split), INSTANTS)[0]
+            for split in ("train", "validation", "test")
+            if len(reader.slots(_split(split)))
+        }
         return named, splits
 
 

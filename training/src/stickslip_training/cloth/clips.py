@@ -50,8 +50,8 @@ def check_kind(reader: DatasetReader) -> None:
 def simulations(reader: DatasetReader, slots: Integers) -> Integers:
     """Return a number for each slot that is the same for the clips of one simulation: one fabric, mu and bias."""
     names = [name for name in ("material", "mu", "bias", "areal_density", "bending_rigidity") if name in reader.arrays]
-    told: list[Array] = [reader.label(name)[slots].astype(np.float64) for name in names]
-    return np.unique(np.stack(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    told: list[Array] = [reader.label(name)[slots].reshape(len(slots), -1).astype(np.float64) for name in names]
+    return np.unique(np.concatenate(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:
