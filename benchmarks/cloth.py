@@ -54,9 +54,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=(cloth_drag.FRAMES - 1) / cloth_drag.FRAME_RATE)
     args = parser.parse_args()
     print(f"{args.material}, mu {args.mu}, {args.preset}, core {build_info().build_hash[:12]}")
-    print(
-        "| vertices | CPU s | phases [s] | steps | Newton | GMRES | factors a step | flips | halved | unconverged |"
-    )
+    print("| vertices | CPU s | phases [s] | steps | Newton | GMRES | factors a step | flips | halved | unconverged |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for vertices in args.vertices:
         run(args.material, args.mu, args.preset, vertices, args.seconds)
