@@ -19,7 +19,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_familie
   natural_from_pictures.py render_cloth.py render_trajectory.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup demo test check bench constraints clean
+.PHONY: setup demo test test-parts test-service test-whole test-blender check bench constraints clean
 
 setup: .venv/core.stamp .venv-blender/raster.stamp
 
@@ -54,8 +54,20 @@ setup: .venv/core.stamp .venv-blender/raster.stamp
 demo: setup
 	$(PY) examples/demo.py
 
+# Two at a time, one for each core; each prints its report when it is done. `pytest -m slow` runs what is left out.
 test: setup check
-	$(PY) -m pytest
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-whole test-service test-parts test-blender
+
+test-parts:
+	$(PY) -m pytest schemas sim_core training
+
+test-service:
+	$(PY) -m pytest services workers/tests
+
+test-whole:
+	$(PY) -m pytest tests
+
+test-blender:
 	$(BLENDER_PY) -m pytest workers/blender
 
 check: setup

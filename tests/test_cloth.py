@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.manifest import Manifest
 from stickslip_sim_core import drop_and_drag
 from stickslip_training.kinds.cloth_drag import ClipDataset
@@ -56,8 +57,9 @@ def test_one_simulation_makes_all_clips(service: Service, job: dict[str, Any]) -
 
 def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
     spec = job_spec_adapter.validate_python(SPEC)
-    seed = spec.simulation({"material": "gray-interlock", "mu": 0.4}).seed
-    run = drop_and_drag("gray-interlock", 0.4, preset="fast", vertices=7, seed=seed)
+    simulation = spec.simulation({"material": "gray-interlock", "mu": 0.4})
+    assert isinstance(simulation, ClothDragSimulation)
+    run = drop_and_drag("gray-interlock", 0.4, preset="fast", vertices=7, seed=simulation.seed)
     arrays = read_arrays(directory)
     assert arrays["valid"].all()
     assert arrays["positions"].shape == (4, 300, 49, 3)
