@@ -248,7 +248,8 @@ class Cloth:
         """Return the force of bodies on the cloth [N] in the last step: change of momentum less weight and holders."""
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
-        return np.asarray(self._solver.momentum_rate() - weight - holders)
+        force: Floats = np.asarray(self._solver.momentum_rate()) - weight - holders
+        return force
 
     def _count(self, report: StepReport) -> StepReport:
         self.steps += report.steps
