@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 from importlib import metadata
 
 from stickslip_schemas.keys import content_key
@@ -28,6 +29,7 @@ def roots(kind: str) -> tuple[str, ...]:
     return ("stickslip_blender.actor", f"stickslip_blender.scenes.{kind}")
 
 
+@cache
 def build_digest(kind: str) -> str:
     """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
     files = sources(roots(kind), cut=CUT)
