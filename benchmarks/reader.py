@@ -15,7 +15,6 @@ MosaicML Streaming and WebDataset are peers that are not here: they would need p
 """
 
 import argparse
-import json
 import os
 import platform
 import statistics
@@ -39,10 +38,9 @@ from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.tasks import FileEntry
-from stickslip_training.data.seal import SEAL_NAME, sealed
 from stickslip_training.kinds.cloth_drag import ClipDataset
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
@@ -136,11 +134,10 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
 
 def _seal(root: Path) -> None:
     """Write the manifest's digest into the group's metadata, and those of both beside them."""
-    metadata = json.loads((root / "zarr.json").read_bytes())
-    metadata["attributes"] = {"manifest_sha256": sha256((root / MANIFEST_NAME).read_bytes())}
-    (root / "zarr.json").write_text(json.dumps(metadata))
-    digests = {name: sha256((root / name).read_bytes()) for name in (MANIFEST_NAME, "zarr.json")}
-    (root / SEAL_NAME).write_bytes(sealed(digests))
+    manifest = sha256((root / MANIFEST_NAME).read_bytes())
+    group = with_manifest_digest((root / GROUP_NAME).read_bytes(), manifest)
+    (root / GROUP_NAME).write_bytes(group)
+    (root / SEAL_NAME).write_bytes(seal_text(manifest, sha256(group)))
 
 
 def _write_array(group: zarr.Group, root: Path, array: ArrayLayout, values: NDArray[Any], shard_size: int) -> None:

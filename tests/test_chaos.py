@@ -13,7 +13,7 @@ from harness import Service, descendants, read_arrays, wait_for
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.samples import samples
 from stickslip_schemas.store import Store
 from stickslip_services.database.database import Database
@@ -115,7 +115,7 @@ def check_dataset(data: Path, reference: dict[str, Any], builds: Builds) -> None
     assert len(set(manifest.sample_keys)) == 48
     assert manifest.valid_count == 48
     files = {str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file()}
-    assert files == {file.path for file in manifest.files} | {"manifest.json"}
+    assert files == {file.path for file in manifest.files} | set(SEALED_NAMES) | {SEAL_NAME}
     for file in manifest.files:
         assert sha256((directory / file.path).read_bytes()) == file.sha256
     group = read_arrays(directory)

@@ -75,7 +75,7 @@ def test_unknown_names() -> None:
 
 
 def test_presets() -> None:
-    assert set(PRESETS) == {"certified", "fast", "thesis-high", "thesis-low-small-dt", "thesis-low-big-dt"}
+    assert set(PRESETS) == {"certified", "fast", "fine", "thesis-high", "thesis-low-small-dt", "thesis-low-big-dt"}
     assert all(preset_named(name).name == name for name in PRESETS)
     assert [PRESETS[f"thesis-{name}"].time_step for name in ("high", "low-small-dt", "low-big-dt")] == [
         5e-4,

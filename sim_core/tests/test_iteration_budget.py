@@ -1,8 +1,8 @@
 """How many iterations Newton's method takes where friction turns and follows the normal force.
 
 The counts are of the portable kernels, and repeat to the bit. Without the share of friction in Newton's matrix, the
-sphere takes ten times as many. Without its share in what contact prescribes, the shaken floor takes a fifth more. Results
-stay right in both cases; only the cost grows.
+sphere takes ten times as many. Without its share in what contact prescribes, the shaken floor takes a fifth more.
+Results stay right in both cases; only the cost grows.
 """
 
 import numpy as np

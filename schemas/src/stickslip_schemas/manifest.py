@@ -80,16 +80,27 @@ def with_manifest_digest(group: bytes, manifest: Sha256) -> bytes:
 
 def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
     """Return the digest of the manifest; raise BrokenSealError where one of the three files is not as it was made."""
-    digest = sha256(manifest)
-    if seal != seal_text(digest, sha256(group)):
-        raise BrokenSealError(
-            f"{MANIFEST_NAME} has the SHA-256 {digest} and {GROUP_NAME} {sha256(group)}, and {SEAL_NAME} must say so; "
-            f"it says {seal[:200]!r}"
-        )
+    digests = {MANIFEST_NAME: sha256(manifest), GROUP_NAME: sha256(group)}
+    stated = _stated(seal)
+    for name, found in digests.items():
+        if stated.get(name) != found:
+            raise BrokenSealError(f"{name} has SHA-256 {found}, and {SEAL_NAME} says {stated.get(name)}")
+    if seal != seal_text(*digests.values()):
+        raise BrokenSealError(f"{SEAL_NAME} must have a line each for {', '.join(digests)}, and nothing else")
     try:
         named = json.loads(group)["attributes"][MANIFEST_ATTRIBUTE]
     except (ValueError, KeyError, TypeError) as error:
         raise BrokenSealError(f"{GROUP_NAME} must have the attribute {MANIFEST_ATTRIBUTE}") from error
-    if named != digest:
-        raise BrokenSealError(f"{MANIFEST_ATTRIBUTE} of {GROUP_NAME} must be {digest}, and it is {named!r}")
-    return digest
+    if named != digests[MANIFEST_NAME]:
+        raise BrokenSealError(
+            f"{GROUP_NAME}: {MANIFEST_ATTRIBUTE} must be that of {MANIFEST_NAME}, {digests[MANIFEST_NAME]}, and is {named}"
+        )
+    return digests[MANIFEST_NAME]
+
+
+def _stated(seal: bytes) -> dict[str, str]:
+    try:
+        lines = [line.split("  ") for line in seal.decode("ascii").splitlines()]
+        return {name: digest for digest, name in lines}
+    except ValueError as error:
+        raise BrokenSealError(f"{SEAL_NAME} must have lines as of sha256sum: a digest and a name") from error

@@ -57,7 +57,7 @@ void Newton::predict(const StepProblem& problem, Buffer<double>& x, bool from_re
 }
 
 StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations,
-                          StepReport& report) {
+                          StepReport& report, double krylov_tolerance) {
   const int free_nodes = assembly_.numbering.free_nodes;
   predict(problem, x, from_rest);
   assembly_.set_diagonal(problem.dt, problem.damping);
@@ -76,7 +76,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     if (iteration > 0 && norms.largest <= settings_.tolerance) break;
     if (!std::isfinite(norms.squared)) break;
     ++report.newton;
-    correct(problem, x, report);
+    correct(problem, x, krylov_tolerance, report);
     // Along the line, non-monotone [Grippo et al. 1986].
     const double limit = *std::max_element(window, window + 4);
     double share = 1.0;
@@ -106,7 +106,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
 }
 
 // Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
-void Newton::correct(const StepProblem& problem, const Buffer<double>& x, StepReport& report) {
+void Newton::correct(const StepProblem& problem, const Buffer<double>& x, double krylov_tolerance, StepReport& report) {
   StaleFactor& factor = factors.latest();
   if (factor.stale(contact.mode, settings_)) {
     const Stopwatch watch(phases.factorization);
@@ -118,7 +118,7 @@ void Newton::correct(const StepProblem& problem, const Buffer<double>& x, StepRe
   double size = 0.0;
   for (float f : contact.force) size += static_cast<double>(f) * f;
   size = std::sqrt(size);
-  const double tolerance = std::max(settings_.krylov_tolerance, 0.3 * settings_.tolerance / std::max(size, 1e-300));
+  const double tolerance = std::max(krylov_tolerance, 0.3 * settings_.tolerance / std::max(size, 1e-300));
   const KrylovResult solved =
       assembly_.kernel.krylov(assembly_.matrix, factor.view(), contact.rows(), contact.force.data(), change_.data(),
                               work_.data(), settings_.krylov_max, std::min(tolerance, 0.5));

@@ -35,8 +35,10 @@ class Newton {
   ClothPhases phases;
 
   // Solves for the free nodes of x, or leaves the best found in it; its held nodes are at their ends. `from_rest`:
-  // begins at the start of the step, not where the velocity leads.
-  StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report);
+  // begins at the start of the step, not where the velocity leads. GMRES stops at `krylov_tolerance` of its right-hand
+  // side.
+  StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report,
+                    double krylov_tolerance);
 
   // Where the velocity leads, or the start, out of the bodies.
   void predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const;
@@ -45,7 +47,7 @@ class Newton {
 
  private:
   Norms look(const StepProblem& problem, const Buffer<double>& x);
-  void correct(const StepProblem& problem, const Buffer<double>& x, StepReport& report);
+  void correct(const StepProblem& problem, const Buffer<double>& x, double krylov_tolerance, StepReport& report);
   void subtract_corrections();
 
   Assembly& assembly_;

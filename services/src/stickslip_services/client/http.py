@@ -37,7 +37,7 @@ from tenacity import Retrying, retry_if_exception, stop_after_delay, wait_random
 
 from stickslip_services.addresses import DEFAULT_URL
 
-PATIENCE_SECONDS = 30.0
+PATIENCE_SECONDS = 60.0
 """How long a request that did not come through is sent again [s]."""
 SILENCE_SECONDS = 60.0
 """How long an event stream may be silent, whose keep-alives come every 15 s, before it is taken for dead [s]."""
