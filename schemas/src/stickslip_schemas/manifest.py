@@ -93,7 +93,8 @@ def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
         raise BrokenSealError(f"{GROUP_NAME} must have the attribute {MANIFEST_ATTRIBUTE}") from error
     if named != digests[MANIFEST_NAME]:
         raise BrokenSealError(
-            f"{GROUP_NAME}: {MANIFEST_ATTRIBUTE} must be that of {MANIFEST_NAME}, {digests[MANIFEST_NAME]}, and is {named}"
+            f"{GROUP_NAME}: {MANIFEST_ATTRIBUTE} must be that of {MANIFEST_NAME}, {digests[MANIFEST_NAME]}, "
+            f"and is {named}"
         )
     return digests[MANIFEST_NAME]
 
