@@ -17,6 +17,7 @@ from PIL import Image
 from pydantic import ValidationError
 from stickslip_blender import clips
 from stickslip_blender.actor import RenderActor
+from stickslip_blender.build import CUT, roots
 from stickslip_blender.clips import GATE
 from stickslip_blender.color import silicone_color, to_linear
 from stickslip_blender.lights import drawn_light
@@ -29,6 +30,7 @@ from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.kinds import KINDS
+from stickslip_schemas.sources import sources
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import ChunkRef, RenderOutput, TaskResult
@@ -251,6 +253,30 @@ def test_a_trajectory_becomes_a_clip_a_preview_and_labels(
     assert output.preview is not None
     with Image.open(io.BytesIO(store.read(output.preview))) as preview:
         assert (preview.format, preview.n_frames, preview.size) == ("WEBP", 3, (160, 160))
+
+
+def test_every_function_that_renders_is_in_the_build(
+    actor: RenderActor, record: str, trajectory: Callable[..., str]
+) -> None:
+    """The list of kinds is the one exception: it finds a module by a name and decides on nothing else."""
+    cloth = trajectory()
+    tasks = {
+        "rod_hang": (_task(record), _task(record)),
+        "cloth_drag": (_clip(cloth, frames=1), _clip(cloth, frames=1, light_seed=10)),
+    }
+    for kind, (first, task) in tasks.items():
+        actor.render(first)  # to import, and to close the renderer of the other kind, is no work
+        ran: set[str] = set()
+        sys.setprofile(lambda frame, event, _, ran=ran: ran.add(frame.f_code.co_filename) if event == "call" else None)
+        actor.render(task)
+        sys.setprofile(None)
+        ours = {Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")}
+        built = {path.resolve() for path in sources(roots(kind), cut=CUT).values()}
+        contract = {path for path in ours if path.parent.name == "stickslip_schemas"}
+        documents = {path for path in contract if path.stem in ("cloth", "jobs")}
+        registry = {path for path in ours if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")}
+        assert len(ours) > 8
+        assert ours - registry - documents <= built, ours - built
 
 
 def test_a_clip_has_the_same_bytes_however_its_trace_was_made(

@@ -3,16 +3,31 @@
 import pytest
 from stickslip_blender import build
 from stickslip_blender.build import CUT, build_digest, roots
+from stickslip_blender.scenes import renders
+from stickslip_schemas.kinds import KINDS, UnknownKindError
 from stickslip_schemas.sources import sources
 
 
 def test_the_rasteriser_is_in_the_build_of_cloth_and_not_of_rods(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = {kind: build_digest(kind) for kind in ("cloth_drag", "rod_hang")}
+    digest = build_digest.__wrapped__  # not the one that is kept
+    before = {kind: digest(kind) for kind in ("cloth_drag", "rod_hang")}
     monkeypatch.setattr(build, "BUILD_HASH", "another")
-    assert build_digest("cloth_drag") != before["cloth_drag"]
-    assert build_digest("rod_hang") == before["rod_hang"]
+    assert digest("cloth_drag") != before["cloth_drag"]
+    assert digest("rod_hang") == before["rod_hang"]
 
 
 def test_data_files_are_in_the_build() -> None:
     files = sources(roots("cloth_drag"), cut=CUT)
     assert {"stickslip_blender/fabrics.toml", "stickslip_blender/substrates.toml"} <= set(files)
+
+
+def test_every_kind_has_a_build_of_its_own_files() -> None:
+    assert len({build_digest(kind) for kind in KINDS}) == len(KINDS)
+    for kind in KINDS:
+        scenes = {name for name in sources(roots(kind), cut=CUT) if "/scenes/" in name}
+        assert scenes == {"stickslip_blender/scenes/__init__.py", f"stickslip_blender/scenes/{kind}.py"}
+
+
+def test_a_kind_that_nobody_registered_is_refused() -> None:
+    with pytest.raises(UnknownKindError, match=r"kind must be one of .*; got 'silk_fly'"):
+        renders("silk_fly")
