@@ -93,7 +93,7 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
         settings.name: settings
         for settings in (
             SolverSettings("certified", 0.02),
-            SolverSettings("fast", 0.04, tolerance=4e-4, step_error=3e-4, finest=64),
+            SolverSettings("fast", 0.04, tolerance=2e-4, step_error=3e-4, finest=64),
             # For meshes of 81 vertices a side and more, and where frames are compared.
             SolverSettings("fine", 0.01, tolerance=5e-5, step_error=5e-5, coarsest=8, finest=256),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
