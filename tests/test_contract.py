@@ -1,13 +1,14 @@
 """What two packages both say: the contract in the schemas, and what the core and the renderer do."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import stickslip_sim_core
 from pydantic import ValidationError
 from stickslip_schemas.certificate import Certificate
 from stickslip_schemas.cloth import KERNELS, ClothSpec, PresetName
-from stickslip_schemas.fabrics import Material
+from stickslip_schemas.fabrics import FabricNumbers, Material
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import KINDS, UnknownKindError
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
@@ -52,6 +53,22 @@ def test_friction_has_one_range() -> None:
     ClothDragSpec.model_validate({"kind": "cloth_drag", "axes": axes})
     with pytest.raises(ValidationError, match=f"less than or equal to {MU_MAX:g}"):
         ClothDragSpec.model_validate({"kind": "cloth_drag", "axes": axes | {"mu": MU_MAX + 1e-9}})
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"density": 0.01, "young": 1e4, "poisson": 0.49, "thickness": 2.1e-5, "bending": (1e-12,) * 3},
+        {"density": 5.0, "young": 1e8, "poisson": 0.49, "thickness": 0.0044, "bending": (1.0,) * 3, "damping": 10.0},
+        {"density": 0.2, "stretching": ((1e6, 0.0, 1e6, 1e6),) * 6, "bending": (1e-5, 1e-5, 1e-6)},
+    ],
+)
+def test_the_core_takes_every_fabric_that_a_spec_may_have(numbers: dict[str, Any]) -> None:
+    made = FabricNumbers.model_validate(numbers)
+    stickslip_sim_core.own_fabric("own", **made.model_dump())
+    stiffer = {"young": 1e9, "thickness": 0.01, "poisson": 0.3, "density": 0.2}
+    with pytest.raises(ValidationError, match="young times thickness must be at most 1e"):
+        FabricNumbers.model_validate(stiffer)
 
 
 @pytest.mark.parametrize("name", KINDS)

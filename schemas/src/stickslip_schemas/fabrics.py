@@ -32,7 +32,12 @@ class Material(StrEnum):
 MATERIAL_NAME = r"^[a-z0-9][a-z0-9-]{0,62}$"
 
 Stiffness = Annotated[float, Field(ge=0, le=1e6)]
-Rigidity = Annotated[float, Field(gt=0, le=1)]
+Rigidity = Annotated[float, Field(ge=1e-12, le=1)]
+
+MEMBRANE_MAX = 1e6
+"""Of the numbers of the stretching table, and of Young's modulus times thickness [N/m]."""
+PLATE_BOUNDS = (1e-11, 1.0)
+"""Of the rigidity of a plate of `young` and `thickness` [N m]."""
 
 
 class FabricNumbers(Document):
@@ -50,9 +55,9 @@ class FabricNumbers(Document):
         "[Wang et al. 2011]. Row 0: no strain; rows 1 to 5: a stretch of 1 + 1/6 at 0, 22.5, 45, 67.5 and 90 degrees "
         "from the warp",
     )
-    young: float | None = Field(default=None, gt=0, le=1e12, description="Young's modulus [Pa] of an isotropic sheet")
+    young: float | None = Field(default=None, ge=1, le=1e12, description="Young's modulus [Pa] of an isotropic sheet")
     poisson: float | None = Field(default=None, ge=0, le=0.49, description="Poisson's ratio of an isotropic sheet")
-    thickness: float | None = Field(default=None, gt=0, le=0.01, description="thickness [m] of an isotropic sheet")
+    thickness: float | None = Field(default=None, ge=1e-6, le=0.01, description="thickness [m] of an isotropic sheet")
     bending: tuple[Rigidity, Rigidity, Rigidity] | None = Field(
         default=None,
         description="plate rigidities (along the warp, along the weft, twist) [N m], energy per area H:D:H/2",
@@ -75,6 +80,16 @@ class FabricNumbers(Document):
                     )
             if self.bending is None:
                 raise ValueError("bending must be given with stretching: a table says nothing of bending")
-        elif any(number is None for number in isotropic):
+        elif self.young is None or self.poisson is None or self.thickness is None:
             raise ValueError("give stretching, or all of young, poisson and thickness")
+        else:
+            membrane = self.young * self.thickness
+            if membrane > MEMBRANE_MAX:
+                raise ValueError(f"young times thickness must be at most {MEMBRANE_MAX:g} N/m, and it is {membrane:g}")
+            plate = membrane * self.thickness**2 / (12 * (1 - self.poisson**2))  # E h^3 / (12 (1 - nu^2))
+            if not PLATE_BOUNDS[0] <= plate <= PLATE_BOUNDS[1]:
+                low, high = PLATE_BOUNDS
+                raise ValueError(
+                    f"young and thickness must give a plate rigidity from {low:g} to {high:g} N m, and it is {plate:g}"
+                )
         return self
