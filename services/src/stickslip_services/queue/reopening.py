@@ -87,7 +87,7 @@ def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> 
         ending = Ending.published(
             version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
         )
-        book.end_job(made.job, replace(ending, message=ending.message or "all of it was there already"))
+        book.end_job(made.job, replace(ending, message=ending.message or "every result was cached"))
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; what is missing is made again"
