@@ -107,13 +107,12 @@ def test_works_in_a_forked_child_after_use_in_the_parent(clips):
 
 
 def test_no_flipped_bit_is_silent(clips, tmp_path):
-    """400 single flips, anywhere in the files of shards and labels, 6 at least in each file."""
+    """Single flips anywhere in the files of shards and labels: 6 in each file, and 100 more."""
     made = clips.copy(tmp_path / "v1")
     shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
     sizes = np.array([path.stat().st_size for path in shards])
     generator = np.random.default_rng(3)
-    even = len(shards) * 6
-    targets = np.concatenate([np.repeat(np.arange(len(shards)), 6), generator.choice(len(shards), 400 - even)])
+    targets = np.concatenate([np.repeat(np.arange(len(shards)), 6), generator.choice(len(shards), 100)])
     silent = []
     for target in targets:
         path = shards[target]
