@@ -143,8 +143,8 @@ class Dispatcher:
 
     def _turn(self) -> None:
         self._collect(self._wait_seconds())
-        self._stage_pool.look()
-        self._render_pool.look()
+        self._stage_pool.check_starts()
+        self._render_pool.check_starts()
         self._enforce_limits()
         self._start_work()
         if time.monotonic() < self._backoff.next_try:
@@ -210,7 +210,7 @@ class Dispatcher:
                 pool.give_back(assignment.process, 0)
             else:
                 log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
-                pool.bury(assignment.process)
+                pool.note_death(assignment.process)
             result = process_failure(error, renders=assignment.stage is Stage.render)
             results = [
                 result.model_copy(update={"damaged_inputs": damaged_inputs(lease.task, self._store)})
@@ -294,8 +294,8 @@ class Dispatcher:
         self._render_pool.grow(1)
         while not self._stopping and None in (self._stage_pool.description, self._render_pool.description):
             self._collect(LONGEST_WAIT)
-            self._stage_pool.look()
-            self._render_pool.look()
+            self._stage_pool.check_starts()
+            self._render_pool.check_starts()
             self._stage_pool.grow(1)
             self._render_pool.grow(1)
 

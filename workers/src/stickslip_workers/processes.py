@@ -103,7 +103,7 @@ class Pool:
         self._busy.discard(process)
         ray.kill(process.actor, no_restart=True)
 
-    def bury(self, process: Process) -> None:
+    def note_death(self, process: Process) -> None:
         """Note that a busy process has died. A lost node may have taken others with it: ask the idle ones."""
         self._busy.discard(process)
         for idle in self._idle:
@@ -118,8 +118,8 @@ class Pool:
             self.end(process)
         self._starting, self._idle = [], []
 
-    def look(self) -> None:
-        """See which processes have started; raise StartError when they do not."""
+    def check_starts(self) -> None:
+        """Take in the processes that have started; raise StartError when they do not."""
         import ray
 
         if not self._starting:
@@ -161,7 +161,7 @@ class Pool:
         try:
             description = ray.get(process.described)
         except ray.exceptions.RayError as error:
-            if process.pid:  # it had been started: see `bury`
+            if process.pid:  # it had been started: see `note_death`
                 return
             self._failed_starts += 1
             log.error("%s: a process did not start: %s", self._settings.sort, error)
