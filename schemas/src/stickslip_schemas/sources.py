@@ -17,6 +17,10 @@ from pathlib import Path
 
 from stickslip_schemas.keys import sha256
 
+LIST_OF_KINDS = ("stickslip_schemas.kinds",)
+"""What builds cut. The list of kinds decides on nothing by itself, and it would make every build depend on every kind.
+The documents that it leads to are in the content keys as a whole."""
+
 OURS = "stickslip_"
 """How the names of our packages begin."""
 

@@ -17,7 +17,7 @@ from PIL import Image
 from pydantic import ValidationError
 from stickslip_blender import clips
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.build import CUT, roots
+from stickslip_blender.build import roots
 from stickslip_blender.clips import GATE
 from stickslip_blender.color import silicone_color, to_linear
 from stickslip_blender.lights import drawn_light
@@ -30,7 +30,7 @@ from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.sources import sources
+from stickslip_schemas.sources import LIST_OF_KINDS, sources
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import ChunkRef, RenderOutput, TaskResult
@@ -271,7 +271,7 @@ def test_every_function_that_renders_is_in_the_build(
         actor.render(task)
         sys.setprofile(None)
         ours = {Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")}
-        built = {path.resolve() for path in sources(roots(kind), cut=CUT).values()}
+        built = {path.resolve() for path in sources(roots(kind), cut=LIST_OF_KINDS).values()}
         contract = {path for path in ours if path.parent.name == "stickslip_schemas"}
         documents = {path for path in contract if path.stem in ("cloth", "jobs")}
         registry = {path for path in ours if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")}

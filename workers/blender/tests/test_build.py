@@ -2,10 +2,10 @@
 
 import pytest
 from stickslip_blender import build
-from stickslip_blender.build import CUT, build_digest, roots
+from stickslip_blender.build import build_digest, roots
 from stickslip_blender.scenes import renders
 from stickslip_schemas.kinds import KINDS, UnknownKindError
-from stickslip_schemas.sources import sources
+from stickslip_schemas.sources import LIST_OF_KINDS, sources
 
 
 def test_the_rasteriser_is_in_the_build_of_cloth_and_not_of_rods(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -17,14 +17,14 @@ def test_the_rasteriser_is_in_the_build_of_cloth_and_not_of_rods(monkeypatch: py
 
 
 def test_data_files_are_in_the_build() -> None:
-    files = sources(roots("cloth_drag"), cut=CUT)
+    files = sources(roots("cloth_drag"), cut=LIST_OF_KINDS)
     assert {"stickslip_blender/fabrics.toml", "stickslip_blender/substrates.toml"} <= set(files)
 
 
 def test_every_kind_has_a_build_of_its_own_files() -> None:
     assert len({build_digest(kind) for kind in KINDS}) == len(KINDS)
     for kind in KINDS:
-        scenes = {name for name in sources(roots(kind), cut=CUT) if "/scenes/" in name}
+        scenes = {name for name in sources(roots(kind), cut=LIST_OF_KINDS) if "/scenes/" in name}
         assert scenes == {"stickslip_blender/scenes/__init__.py", f"stickslip_blender/scenes/{kind}.py"}
 
 

@@ -1,19 +1,15 @@
 """Which code runs here: the digests that go into content keys, for each kind and stage.
 
 A build covers the files that the work imports (see `stickslip_schemas.sources`), the compiled core where it is used,
-and the versions of libraries that decide on bytes. One module is cut: the list of kinds. It decides on nothing by
-itself, and it would make every build depend on every kind. The documents that it leads to are in the content keys as a
-whole.
+and the versions of libraries that decide on bytes.
 """
 
 from importlib import metadata
 
 from stickslip_schemas.keys import content_key
-from stickslip_schemas.sources import digests, sources
+from stickslip_schemas.sources import LIST_OF_KINDS, digests, sources
 
 from stickslip_workers.kinds import kind
-
-CUT = ("stickslip_schemas.kinds",)
 
 _STAGES = "stickslip_workers.stages"
 _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
@@ -32,7 +28,7 @@ def build(stage: str, name: str) -> str:
     """Return the digest of everything that decides on what a stage makes for a kind."""
     libraries = {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
     core = "" if stage == "pack" else _core(kind(name).kernel())
-    files = digests(sources(roots(stage, name), cut=CUT))
+    files = digests(sources(roots(stage, name), cut=LIST_OF_KINDS))
     return content_key(f"build/{stage}", {"kind": name, "sources": files, "core": core, "libraries": libraries})
 
 
@@ -41,7 +37,7 @@ def solver_build(module: str) -> str:
 
     The level of its kernels is not part of it: levels differ by less than a certificate can see.
     """
-    return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=CUT))})
+    return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=LIST_OF_KINDS))})
 
 
 def kind_builds(name: str) -> dict[str, str]:

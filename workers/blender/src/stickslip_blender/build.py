@@ -7,13 +7,10 @@ from functools import cache
 from importlib import metadata
 
 from stickslip_schemas.keys import content_key
-from stickslip_schemas.sources import digests, sources
+from stickslip_schemas.sources import LIST_OF_KINDS, digests, sources
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.raster._raster import BUILD_HASH
-
-CUT = ("stickslip_schemas.kinds",)
-"""The list of kinds decides on nothing by itself; the documents it leads to are in the content keys as a whole."""
 
 _LIBRARIES = ("numcodecs", "google-crc32c", "numpy")
 
@@ -32,7 +29,7 @@ def roots(kind: str) -> tuple[str, ...]:
 @cache
 def build_digest(kind: str) -> str:
     """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
-    files = sources(roots(kind), cut=CUT)
+    files = sources(roots(kind), cut=LIST_OF_KINDS)
     content = {
         "kind": kind,
         "sources": digests(files),
