@@ -6,16 +6,18 @@ The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, field_validator, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Document, Int
 
 MAX_SAMPLES = 1_000_000
 """The most samples that one job may ask for."""
 
 T = TypeVar("T")
-Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
-Seed = Annotated[int, Field(ge=0, lt=2**31, description="seed; 0 is as good a seed as any other")]
+Count = Annotated[Int, Field(ge=1, le=MAX_SAMPLES)]
+Seed = Annotated[Int, Field(ge=0, lt=2**31, description="seed; 0 is as good a seed as any other")]
 
 
 class quantity:  # noqa: N801 - reads as an annotation
@@ -43,13 +45,11 @@ class ListAxis(_Axis[T], Generic[T]):
     """The values themselves, all different."""
 
     type: Literal["list"] = "list"
-    values: tuple[T, ...] = Field(max_length=MAX_SAMPLES)
+    values: tuple[T, ...] = Field(min_length=1, max_length=MAX_SAMPLES, json_schema_extra={"uniqueItems": True})
 
     @field_validator("values")
     @classmethod
     def _distinct(cls, values: tuple[T, ...]) -> tuple[T, ...]:
-        if not values:
-            raise ValueError("an axis needs at least one value")
         seen: set[T] = set()
         for value in values:
             if value in seen:
@@ -108,10 +108,25 @@ def _long_form(value: Any) -> Any:
         return {"type": "list", "values": value}
     if isinstance(value, int | float | str) and not isinstance(value, bool):
         return {"type": "list", "values": [value]}
+    if isinstance(value, dict) and "values" in value and "type" not in value:
+        return {"type": "list", **value}
     return value
 
 
-SHORTHAND = BeforeValidator(_long_form, json_schema_input_type=Any)
+class _Shorthand(BeforeValidator):
+    """Lets an axis be written in its short form, and says so in the JSON schema of what may be sent."""
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        long = handler(core)
+        if handler.mode == "serialization":
+            return long
+        reference = {"$ref": long["discriminator"]["mapping"]["list"]} if "discriminator" in long else long
+        values = handler.resolve_ref_schema(reference)["properties"]["values"]
+        short = {name: value for name, value in values.items() if name != "title"}
+        return {"anyOf": [values["items"], short, long]}
+
+
+SHORTHAND = _Shorthand(_long_form)
 """Lets an axis be written in its short form."""
 
 AnyAxis = ListAxis[Any] | LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any]

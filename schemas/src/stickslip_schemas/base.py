@@ -1,6 +1,15 @@
-"""The base of every document that crosses a process boundary."""
+"""The base of every document that crosses a process boundary, and numbers that are not read out of other types."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Strict
+
+Int = Annotated[int, Strict()]
+"""A whole number: not the text "1", not 1.0, not true."""
+Float = Annotated[float, Strict()]
+"""A number: not the text "1", not true."""
+Bool = Annotated[bool, Strict()]
+"""True or false: not 1, not "yes"."""
 
 
 class Document(BaseModel):

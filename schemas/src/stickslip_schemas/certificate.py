@@ -7,18 +7,18 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Bool, Document, Float
 from stickslip_schemas.keys import Sha256, canonical_json, content_key
 
 MAX_PAGE_CHARACTERS = 8 * 2**20
 
-Numbers = tuple[float | None, ...]
+Numbers = tuple[Float | None, ...]
 
 
 class CurveReport(Document):
     """A measured curve beside its master curve; null where there is nothing to measure."""
 
-    parameters: dict[str, float]
+    parameters: dict[str, Float]
     x: Numbers
     measured: Numbers
     master: Numbers
@@ -38,9 +38,9 @@ class ProtocolReport(Document):
     protocol: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")
     x: str
     y: str
-    tolerance: float = Field(ge=0, description="largest |relative error| that passes")
-    error: float | None = Field(ge=0, description="largest |relative error|; null is infinite")
-    passed: bool
+    tolerance: Float = Field(ge=0, description="largest |relative error| that passes")
+    error: Float | None = Field(ge=0, description="largest |relative error|; null is infinite")
+    passed: Bool
     settings: dict[str, Any]
     build_hash: Sha256 = Field(description="of the compiled core")
     curves: tuple[CurveReport, ...]
@@ -69,7 +69,7 @@ class Certificate(Document):
     protocol_sources: Sha256 = Field(description="digest of the sources that measured and of the master curves")
     extent: Literal["full", "quick"] = Field(description="quick: few points, to try things out; certifies nothing")
     protocols: tuple[ProtocolReport, ...] = Field(min_length=1)
-    passed: bool
+    passed: Bool
     environment: dict[str, str] = Field(description="where and how it was made; not part of the content")
 
     @property

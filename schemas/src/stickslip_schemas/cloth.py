@@ -8,7 +8,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Bool, Document, Float, Int
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.fabrics import MATERIAL_NAME, FabricNumbers, Material
@@ -151,17 +151,17 @@ class ClothSpec(JobSpec):
         default_factory=dict, description="fabrics of your own, by the names that the axis `material` uses"
     )
     preset: PresetName = PresetName.certified
-    allow_uncertified: bool = Field(
+    allow_uncertified: Bool = Field(
         default=False,
         description="make the dataset even where no passing certificate vouches for the preset with the workers' build",
     )
-    mesh: int = Field(default=41, ge=5, le=161, description="vertices along a side of the square mesh")
-    frames: int = Field(default=30, ge=1, description="frames of a clip, evenly spread over the instants of the motion")
-    store_positions: bool = Field(
+    mesh: Int = Field(default=41, ge=5, le=161, description="vertices along a side of the square mesh")
+    frames: Int = Field(default=30, ge=1, description="frames of a clip, evenly spread over the instants of the motion")
+    store_positions: Bool = Field(
         default=True, description="keep the positions of all vertices at all instants, beside the clips"
     )
     quality: Quality = Quality.standard
-    creases: float = Field(
+    creases: Float = Field(
         default=0.0,
         ge=0,
         le=1,

@@ -8,7 +8,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Document, Float
 
 
 class Material(StrEnum):
@@ -31,8 +31,8 @@ class Material(StrEnum):
 
 MATERIAL_NAME = r"^[a-z0-9][a-z0-9-]{0,62}$"
 
-Stiffness = Annotated[float, Field(ge=0, le=1e6)]
-Rigidity = Annotated[float, Field(ge=1e-12, le=1)]
+Stiffness = Annotated[Float, Field(ge=0, le=1e6)]
+Rigidity = Annotated[Float, Field(ge=1e-12, le=1)]
 
 MEMBRANE_MAX = 1e6
 """Of the numbers of the stretching table, and of Young's modulus times thickness [N/m]."""
@@ -48,21 +48,21 @@ class FabricNumbers(Document):
     thickness.
     """
 
-    density: float = Field(ge=0.01, le=5, description="mass per area [kg/m^2]")
+    density: Float = Field(ge=0.01, le=5, description="mass per area [kg/m^2]")
     stretching: tuple[tuple[Stiffness, Stiffness, Stiffness, Stiffness], ...] | None = Field(
         default=None,
         description="6 rows of (k0, k1, k2, k3) [N/m]; energy per area k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2 "
         "[Wang et al. 2011]. Row 0: no strain; rows 1 to 5: a stretch of 1 + 1/6 at 0, 22.5, 45, 67.5 and 90 degrees "
         "from the warp",
     )
-    young: float | None = Field(default=None, ge=1, le=1e12, description="Young's modulus [Pa] of an isotropic sheet")
-    poisson: float | None = Field(default=None, ge=0, le=0.49, description="Poisson's ratio of an isotropic sheet")
-    thickness: float | None = Field(default=None, ge=1e-6, le=0.01, description="thickness [m] of an isotropic sheet")
+    young: Float | None = Field(default=None, ge=1, le=1e12, description="Young's modulus [Pa] of an isotropic sheet")
+    poisson: Float | None = Field(default=None, ge=0, le=0.49, description="Poisson's ratio of an isotropic sheet")
+    thickness: Float | None = Field(default=None, ge=1e-6, le=0.01, description="thickness [m] of an isotropic sheet")
     bending: tuple[Rigidity, Rigidity, Rigidity] | None = Field(
         default=None,
         description="plate rigidities (along the warp, along the weft, twist) [N m], energy per area H:D:H/2",
     )
-    damping: float = Field(default=0.0, ge=0, le=10, description="force on a mass over its momentum [1/s]")
+    damping: Float = Field(default=0.0, ge=0, le=10, description="force on a mass over its momentum [1/s]")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from stickslip_schemas.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.axes import MAX_SAMPLES, AnyAxis, Seed
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Document, Float, Int
 from stickslip_schemas.cameras import Camera
 from stickslip_schemas.keys import Sha256, content_key, derived_seed
 
@@ -32,9 +32,9 @@ class Quality(StrEnum):
 class Splits(Document):
     """Shares of the simulations in each split; all renders of one simulation fall in the same one."""
 
-    train: float = Field(default=0.8, ge=0, le=1)
-    validation: float = Field(default=0.1, ge=0, le=1)
-    test: float = Field(default=0.1, ge=0, le=1)
+    train: Float = Field(default=0.8, ge=0, le=1)
+    validation: Float = Field(default=0.1, ge=0, le=1)
+    test: Float = Field(default=0.1, ge=0, le=1)
 
     @model_validator(mode="after")
     def _sum_to_one(self) -> Self:
@@ -105,7 +105,7 @@ class JobSpec(Document):
         description="product: every combination of the axes; zip: the axes have one length and go together",
     )
     splits: Splits = Splits()
-    samples_per_shard: int = Field(default=64, ge=1, le=4096)
+    samples_per_shard: Int = Field(default=64, ge=1, le=4096)
     seed: Seed = 0
 
     # --- what every kind says of itself ---------------------------------------------------------------------------

@@ -1,11 +1,15 @@
 """Errors as problem documents [RFC 9457] that name the field, the rule and the value."""
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from stickslip_schemas.hints import did_you_mean
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -42,9 +46,9 @@ class FieldError(BaseModel):
 
 
 class Problem(BaseModel):
-    """A problem document [RFC 9457]."""
+    """A problem document [RFC 9457]. `type` is `urn:stickslip:problem:` with the code, which `title` says in words."""
 
-    type: str = "about:blank"
+    type: str
     title: str
     status: int
     detail: str
@@ -54,16 +58,82 @@ class Problem(BaseModel):
     errors: list[FieldError] = Field(default_factory=list)
 
 
-def field_errors(error: ValidationError, document: Any) -> list[FieldError]:
-    """Return one FieldError for each of pydantic's, with pointers into `document` as the user wrote it."""
-    return [
-        FieldError(
-            pointer=_pointer(item["loc"], document, missing=item["type"] == "missing"),
-            rule=item["msg"].removeprefix("Value error, "),
-            value="" if item["type"] == "missing" else _shown(item["input"]),
-        )
-        for item in error.errors(include_url=False)
-    ]
+def field_errors(error: ValidationError, document: Any, of: Any) -> list[FieldError]:
+    """Return one FieldError for each of pydantic's, with pointers into `document` as the user wrote it.
+
+    `of` is the type that the document was to be, a model or a union of models: misspelt words are compared with its
+    fields and values.
+    """
+    items = [item for item in error.errors(include_url=False) if not _is_echo(item)]
+    return [_field_error(item, document, of) for item in items]
+
+
+def _is_echo(item: ErrorDetails) -> bool:
+    """Tell whether a list is said to be too short only because its items have errors of their own."""
+    return item["type"] == "too_short" and item["ctx"]["actual_length"] != len(item["input"])
+
+
+def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
+    location, rule = item["loc"], item["msg"].removeprefix("Value error, ")
+    value: Any = item["input"]
+    is_missing = item["type"] == "missing"
+    match item["type"]:
+        case "missing":
+            rule = "this field is required"
+        case "extra_forbidden":
+            known = sorted({name for model in _models_at(of, location[:-1]) for name in model.model_fields})
+            hint = did_you_mean(str(location[-1]), known) or "."
+            rule = f"there is no such field{hint} Fields: {', '.join(known)}"
+        case "union_tag_invalid" | "union_tag_not_found":
+            tag = item["ctx"]["discriminator"].strip("'")
+            known = [word for model in _models_at(of, location) for word in _literals(model.model_fields[tag].annotation)]
+            is_missing = item["type"] == "union_tag_not_found" and isinstance(value, Mapping)
+            if isinstance(value, Mapping):
+                location = (*location, tag)
+                value = value.get(tag)
+                hint = did_you_mean(str(value), known) if isinstance(value, str) else ""
+                rule = f"must be one of {', '.join(known)}{hint}"
+            else:
+                rule = f"must be an object with the field {tag}, one of {', '.join(known)}"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            rule = "must be an object"
+        case "too_short":
+            rule = f"must have at least {item['ctx']['min_length']} item(s)"
+        case "enum" | "literal_error":
+            known = re.findall(r"'([^']*)'", item["ctx"]["expected"])
+            rule = f"must be one of {', '.join(known)}" + (did_you_mean(value, known) if isinstance(value, str) else "")
+    return FieldError(
+        pointer=_pointer(location, document, missing=is_missing), rule=rule, value="" if is_missing else _shown(value)
+    )
+
+
+def _models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
+    """Return the models that a place in a document may hold, from the type of the whole."""
+    models = list(_models_in(of))
+    for part in location:
+        fields = [model.model_fields[part] for model in models if part in model.model_fields]
+        if fields:
+            models = [found for field in fields for found in _models_in(field.annotation)]
+        else:  # the place in a list, or the tag of a union
+            tagged = [
+                model
+                for model in models
+                if any(part in _literals(field.annotation) for field in model.model_fields.values())
+            ]
+            models = tagged or models
+    return models
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif get_origin(annotation) is not Literal:
+        for argument in get_args(annotation):
+            yield from _models_in(argument)
+
+
+def _literals(annotation: Any) -> list[str]:
+    return [str(value) for value in get_args(annotation)] if get_origin(annotation) is Literal else []
 
 
 def _pointer(location: Sequence[int | str], document: Any, *, missing: bool) -> str:

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Bool, Document, Float, Int
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
@@ -17,15 +17,15 @@ class RecordRef(Document):
     """One record of an artifact that holds several (`.npz`, first dimension = record)."""
 
     digest: Sha256
-    row: int = Field(ge=0)
+    row: Int = Field(ge=0)
 
 
 class ChunkRef(Document):
     """An encoded chunk: `length` bytes from `offset` of an artifact."""
 
     digest: Sha256
-    offset: int = Field(ge=0)
-    length: int = Field(gt=0)
+    offset: Int = Field(ge=0)
+    length: Int = Field(gt=0)
 
 
 class FileEntry(Document):
@@ -33,7 +33,7 @@ class FileEntry(Document):
 
     path: str = Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$")
     sha256: Sha256
-    size: int = Field(ge=0)
+    size: Int = Field(ge=0)
 
 
 # --- simulate -------------------------------------------------------------------------------------------------
@@ -63,7 +63,7 @@ class RenderTask(Document):
     stage: Literal["render"] = "render"
     render: AnyRender
     record: RecordRef
-    preview: bool = False
+    preview: Bool = False
     textures: tuple[str, ...] = Field(
         default=(), description="textures to make clips of, one sample each; none: that of the render document"
     )
@@ -89,7 +89,7 @@ class RenderOutput(Document):
 class Rejection(Document):
     """Why a slot is empty."""
 
-    slot: int = Field(ge=0)
+    slot: Int = Field(ge=0)
     sample_key: Sha256
     reason: Reason
     message: str
@@ -99,9 +99,9 @@ class Rejection(Document):
 class PackSlot(Document):
     """One slot of a shard: where its data lie, or that it was rejected."""
 
-    slot: int = Field(ge=0)
+    slot: Int = Field(ge=0)
     sample_key: Sha256
-    split: int
+    split: Int
     labels: dict[str, Any] = Field(description="parameters and what the stages added, by array name")
     record: RecordRef | None = None
     chunks: dict[str, ChunkRef] = Field(default_factory=dict)
@@ -118,7 +118,7 @@ class PackTask(Document):
 
     stage: Literal["pack"] = "pack"
     spec: AnyJobSpec
-    shard: int = Field(ge=0)
+    shard: Int = Field(ge=0)
     slots: tuple[PackSlot, ...] = Field(min_length=1)
 
 
@@ -135,7 +135,7 @@ class PublishTask(Document):
     stage: Literal["publish"] = "publish"
     spec: AnyJobSpec
     dataset: str
-    version: int = Field(ge=1)
+    version: Int = Field(ge=1)
     builds: Builds
     files: tuple[FileEntry, ...] = Field(description="the files of all shards")
     sample_keys: tuple[Sha256, ...] = Field(description="by slot")
@@ -149,7 +149,7 @@ class PublishOutput(Document):
     stage: Literal["publish"] = "publish"
     manifest: Sha256
     group: Sha256 = Field(description="of the root's zarr.json, which names the manifest")
-    bytes: int = Field(ge=0, description="size of all files of the version")
+    bytes: Int = Field(ge=0, description="size of all files of the version")
 
 
 Task = Annotated[SimulateTask | RenderTask | PackTask | PublishTask, Field(discriminator="stage")]
@@ -166,8 +166,8 @@ class TaskResult(Document):
     damaged_inputs: tuple[Sha256, ...] = Field(
         default=(), description="artifacts that the task needed and that are damaged or not in the store"
     )
-    cpu_seconds: float = Field(default=0.0, ge=0)
-    wall_seconds: float = Field(default=0.0, ge=0)
+    cpu_seconds: Float = Field(default=0.0, ge=0)
+    wall_seconds: Float = Field(default=0.0, ge=0)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -4,19 +4,26 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Bool, Document, Int
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.kinds import kind_named
+from stickslip_schemas.kinds import KINDS, kind_named
 from stickslip_schemas.states import Stage
 from stickslip_schemas.tasks import Task, TaskResult
+
+MAX_SLOTS = 100_000
+"""The most tasks that one dispatcher may run at once."""
 
 
 class WorkerRegistration(Document):
     """A dispatcher presents itself. A second registration of a `name` takes the first one's leases away."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
-    builds: dict[str, Builds] = Field(min_length=1, description="of each kind that it makes")
-    slots: int = Field(ge=1, description="how many tasks it runs at once")
+    builds: dict[str, Builds] = Field(
+        min_length=1,
+        description="of each kind that it makes",
+        json_schema_extra={"propertyNames": {"enum": list(KINDS)}},
+    )
+    slots: Int = Field(ge=1, le=MAX_SLOTS, description="how many tasks it runs at once")
     versions: dict[str, str] = Field(default_factory=dict, description="for people: sim_core, blender, ray, ...")
 
     @field_validator("builds")
@@ -38,15 +45,15 @@ class LeaseRequest(Document):
     """Ask for at most so many tasks of each stage."""
 
     worker_id: str
-    wanted: dict[Stage, int]
+    wanted: dict[Stage, Int]
 
 
 class Lease(Document):
     """A task on loan. `token` is its fencing token: a report with an older one is refused."""
 
     task_id: str
-    token: int
-    attempt: int = Field(ge=1)
+    token: Int
+    attempt: Int = Field(ge=1)
     task: Task
 
 
@@ -61,8 +68,8 @@ class LeaseState(Document):
     """A lease that the dispatcher believes to hold, and whether the task has been started."""
 
     task_id: str
-    token: int
-    started: bool
+    token: Int
+    started: Bool
 
 
 class Heartbeat(Document):
@@ -82,7 +89,7 @@ class Report(Document):
     """How one leased task ended; `released` gives it back untouched (a dispatcher that stops)."""
 
     task_id: str
-    token: int
+    token: Int
     result: TaskResult | None = Field(description="null gives the lease back")
 
 

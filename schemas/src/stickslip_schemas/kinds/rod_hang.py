@@ -6,7 +6,7 @@ from pydantic import Field
 
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Document, Float
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.jobs import JobSpec, Quality, Render, SeedRule, Simulation
 
@@ -62,7 +62,7 @@ class RodHangSpec(JobSpec):
 
     kind: Literal["rod_hang"]
     axes: RodHangAxes
-    poisson: float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio; GJ/EI = 1/(1+nu)")
+    poisson: Float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio; GJ/EI = 1/(1+nu)")
     views: Literal["rod-4"] | None = Field(default="rod-4", description="camera rig; null renders nothing")
     quality: Quality = Quality.standard
 

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.problems import field_errors
 
 
@@ -65,7 +65,7 @@ def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
         lines = [
             f"  {field.pointer.lstrip('/').replace('/', '.') or 'the document'}: {field.rule}"
             + (f", and it is {field.value}" if field.value else "")
-            for field in field_errors(error, document)
+            for field in field_errors(error, document, AnyJobSpec)
         ]
         raise SpecFileError("\n".join([f"{path} is not valid", *lines])) from error
 
