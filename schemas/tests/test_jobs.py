@@ -97,7 +97,7 @@ def test_examples_are_specs(name: str, kind: type, count: int) -> None:
         (changed(RODS, "/sede", 1), "/sede", "did you mean seed?", "1"),
         (changed(RODS, "/seed", "1"), "/seed", "valid integer", '"1"'),
         (changed(RODS, "/samples_per_shard", True), "/samples_per_shard", "valid integer", "true"),
-        (changed(CLOTH, "/frames", 30.0), "/frames", "valid integer", "30.0"),
+        (changed(CLOTH, "/frames", 30.5), "/frames", "valid integer", "30.5"),
         (changed(CLOTH, "/quality", "hihg"), "/quality", "did you mean high?", '"hihg"'),
         (changed(CLOTH, "/axes/texture", ["dot"]), "/axes/texture/0", "did you mean dots?", '"dot"'),
         (changed(RODS, "/kind", "rod-hang"), "/kind", "did you mean rod_hang?", '"rod-hang"'),

@@ -195,7 +195,7 @@ def test_an_idempotency_key_makes_one_job(client: httpx.Client, worker: PretendW
 
 def test_a_kind_that_no_worker_makes_is_a_problem(client: httpx.Client, worker: PretendWorker) -> None:
     response = client.post("/v1/jobs", json={"kind": "cloth_drag", "axes": CLOTH_AXES})
-    problem(response, 422, "kind_not_available")
+    problem(response, 409, "kind_not_available")
 
 
 def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> None:

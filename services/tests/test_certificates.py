@@ -184,7 +184,7 @@ class TestHttp:
             PretendWorker(app.state.coordinator, app.state.coordinator.store, kinds=KINDS).register()
             answer = client.post("/v1/jobs", json=cloth(preset="fast").model_dump(mode="json"))
             problem = answer.json()
-            assert (answer.status_code, problem["code"]) == (422, "preset_not_certified")
+            assert (answer.status_code, problem["code"]) == (409, "preset_not_certified")
             (field,) = problem["errors"]
             assert (field["pointer"], field["value"]) == ("/preset", '"fast"')
             assert "stickslip certify --preset fast" in field["rule"]

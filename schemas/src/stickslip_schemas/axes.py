@@ -6,18 +6,20 @@ The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, field_validator, model_validator
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, field_validator, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stickslip_schemas.base import Document, Int
+from stickslip_schemas.base import WHOLE, Document
 
 MAX_SAMPLES = 1_000_000
 """The most samples that one job may ask for."""
 
 T = TypeVar("T")
-Count = Annotated[Int, Field(ge=1, le=MAX_SAMPLES)]
-Seed = Annotated[Int, Field(ge=0, lt=2**31, description="seed; 0 is as good a seed as any other")]
+Count = Annotated[int, Strict(), Field(ge=1, le=MAX_SAMPLES), WHOLE]
+Seed = Annotated[
+    int, Strict(), Field(ge=0, lt=2**31, description="seed of all that is drawn at random; 0 is a seed, too"), WHOLE
+]
 
 
 class quantity:  # noqa: N801 - reads as an annotation
@@ -44,7 +46,7 @@ class _Axis(Document, Generic[T]):
 class ListAxis(_Axis[T], Generic[T]):
     """The values themselves, all different."""
 
-    type: Literal["list"] = "list"
+    type: Literal["list"]
     values: tuple[T, ...] = Field(min_length=1, max_length=MAX_SAMPLES, json_schema_extra={"uniqueItems": True})
 
     @field_validator("values")
@@ -108,8 +110,6 @@ def _long_form(value: Any) -> Any:
         return {"type": "list", "values": value}
     if isinstance(value, int | float | str) and not isinstance(value, bool):
         return {"type": "list", "values": [value]}
-    if isinstance(value, dict) and "values" in value and "type" not in value:
-        return {"type": "list", **value}
     return value
 
 

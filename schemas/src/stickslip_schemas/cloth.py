@@ -148,7 +148,9 @@ class ClothSpec(JobSpec):
     """The cameras; their names are those of the viewpoints."""
 
     materials: dict[Annotated[str, Field(pattern=MATERIAL_NAME)], FabricNumbers] = Field(
-        default_factory=dict, description="fabrics of your own, by the names that the axis `material` uses"
+        default_factory=dict,
+        description="fabrics of your own, by the names that the axis `material` uses",
+        json_schema_extra={"additionalProperties": False},
     )
     preset: PresetName = PresetName.certified
     allow_uncertified: Bool = Field(

@@ -72,15 +72,26 @@ class JobDetail(Job):
 
 
 class Validation(Document):
-    """What a job would be, without making it one."""
+    """What a job would be, without making one. `refusal` says why it would be refused now; null: it would not."""
 
     spec: AnyJobSpec
     spec_digest: Sha256
     sample_count: int
-    simulation_count: int
-    cached_count: int | None = Field(description="tasks whose results are there already; null: no worker known yet")
+    simulation_count: int = Field(description="different simulations; samples that differ in their look share one")
+    render_count: int
+    task_count: int = Field(description="tasks of all stages: simulations, renders, shards, and one that publishes")
+    expected_splits: dict[str, int] = Field(
+        description="samples by split if each got exactly its share; the real numbers differ a little"
+    )
+    cached_count: int | None = Field(
+        description="tasks that have a result already; null: no worker has registered, or the grid is too large to look"
+    )
     bytes_estimate: int = Field(description="size of the arrays before compression [bytes]")
+    stored_bytes_estimate: int | None = Field(
+        description="size of the files, compressed as the newest dataset of the kind was [bytes]; null: there is none"
+    )
     certificate: Sha256 | None = Field(description="of the certificate that will vouch for the dataset; null: none")
+    refusal: str | None = Field(description="why a job of this spec would be refused now; null: it would be accepted")
 
 
 class Dataset(Document):

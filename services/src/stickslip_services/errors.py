@@ -4,9 +4,10 @@ StickslipError
 ├── NotFoundError               404
 ├── UnknownWorkerError          404
 ├── ConflictError               409
+├── PreconditionFailedError     412
 ├── IdempotencyKeyReusedError   422
-├── KindNotAvailableError       422
-├── PresetNotCertifiedError     422
+├── KindNotAvailableError       409
+├── PresetNotCertifiedError     409
 └── MissingArtifactError        500
 """
 
@@ -20,7 +21,11 @@ class NotFoundError(StickslipError):
 
 
 class ConflictError(StickslipError):
-    """It cannot be done in the state that the thing is in."""
+    """The state does not allow it."""
+
+
+class PreconditionFailedError(StickslipError):
+    """The thing has changed since the client saw it."""
 
 
 class IdempotencyKeyReusedError(StickslipError):

@@ -1,7 +1,6 @@
 """Request bodies: JSON documents, read strictly, refused with pointers to what is wrong."""
 
 import json
-from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from fastapi import Request
@@ -20,10 +19,10 @@ SHOWN_ERRORS = 20
 class JsonBody(Generic[T]):
     """A dependency that reads a request's body as a document."""
 
-    def __init__(self, adapter: TypeAdapter[T] | type[BaseModel]) -> None:
-        self._validate: Callable[[Any], Any] = (
-            adapter.validate_python if isinstance(adapter, TypeAdapter) else adapter.model_validate
-        )
+    def __init__(self, of: Any) -> None:
+        """Read documents of a type: a model or a union of models."""
+        self._of = of
+        self._adapter: TypeAdapter[T] = TypeAdapter(of)
 
     async def __call__(self, request: Request) -> T:
         """Return the document; raise ProblemError."""
@@ -42,11 +41,11 @@ class JsonBody(Generic[T]):
     def _read(self, body: bytes) -> Any:
         document = parse_json(body)
         try:
-            valid = self._validate(document)
+            valid = self._adapter.validate_python(document)
             json.dumps(document, allow_nan=False)  # models refuse NaN with its place; this is for what is free in form
             return valid
         except ValidationError as error:
-            fields = field_errors(error, document)
+            fields = field_errors(error, document, self._of)
         except RecursionError as error:
             raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
         except ValueError as error:

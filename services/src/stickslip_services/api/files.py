@@ -37,7 +37,7 @@ def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Respons
         "Accept-Ranges": "bytes",
         "Cache-Control": "public, max-age=31536000, immutable",
     }
-    if _matches(request.headers.get("if-none-match"), etag):
+    if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     try:
         size = path.stat().st_size
@@ -58,7 +58,8 @@ def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Respons
     return StreamingResponse(_blocks(path, first, last + 1), status, headers, media_type)
 
 
-def _matches(header: str | None, etag: str) -> bool:
+def matches(header: str | None, etag: str) -> bool:
+    """Tell whether an entity tag is among those of `If-None-Match` [RFC 9110, 13.1.2]."""
     if header is None:
         return False
     return header.strip() == "*" or etag in (item.strip().removeprefix("W/") for item in header.split(","))

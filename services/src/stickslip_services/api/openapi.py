@@ -32,13 +32,63 @@ def describe(app: FastAPI) -> dict[str, Any]:
     if not app.openapi_schema:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = document.setdefault("components", {}).setdefault("schemas", {})
-        for name, schema in body_components(_DOCUMENTS).items():
-            components.setdefault(name, schema)
+        # What may be sent is more than what is answered (short forms of axes), so its schema holds for both.
+        components.update(body_components(_DOCUMENTS))
         _drop_foreign_errors(document)
+        _name_by_title(document)
+        _drop_null_parameters(document)
+        _require_tags(document, components)
         for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
             components.pop(unused, None)
         app.openapi_schema = document
     return app.openapi_schema
+
+
+def _drop_null_parameters(document: dict[str, Any]) -> None:
+    """Let no parameter be null: one that is not required is left out."""
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            for parameter in operation.get("parameters", ()):
+                kinds = [kind for kind in parameter["schema"].pop("anyOf", ()) if kind != {"type": "null"}]
+                for kind in kinds:
+                    parameter["schema"] |= kind
+
+
+def _require_tags(node: Any, components: dict[str, Any]) -> None:
+    """Require the field that tells the members of a union apart, also where it has a default."""
+    if isinstance(node, dict):
+        discriminator = node.get("discriminator")
+        if isinstance(discriminator, dict) and "mapping" in discriminator:
+            for reference in discriminator["mapping"].values():
+                member = components[reference.rpartition("/")[2]]
+                member["required"] = sorted({*member.get("required", ()), discriminator["propertyName"]})
+        for value in node.values():
+            _require_tags(value, components)
+    elif isinstance(node, list):
+        for value in node:
+            _require_tags(value, components)
+
+
+def _name_by_title(document: dict[str, Any]) -> None:
+    """Call a component by its title where pydantic made a name of its parameters: `ListAxisMu`."""
+    components = document["components"]["schemas"]
+    for name in list(components):
+        title = components[name].get("title", name)
+        if title != name and title.isidentifier() and title not in components:
+            components[title] = components.pop(name)
+            _refer(document, f"#/components/schemas/{name}", f"#/components/schemas/{title}")
+
+
+def _refer(node: Any, old: str, new: str) -> None:
+    if isinstance(node, dict):
+        for key, value in node.items():
+            if value == old:
+                node[key] = new
+            else:
+                _refer(value, old, new)
+    elif isinstance(node, list):
+        for value in node:
+            _refer(value, old, new)
 
 
 def _drop_foreign_errors(document: dict[str, Any]) -> None:

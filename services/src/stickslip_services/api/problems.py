@@ -3,13 +3,13 @@
 import json
 import logging
 from collections.abc import Mapping
-from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match, Route
 from stickslip_schemas.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
 
 from stickslip_services import errors
@@ -20,9 +20,10 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.NotFoundError: (404, ProblemCode.not_found),
     errors.UnknownWorkerError: (404, ProblemCode.unknown_worker),
     errors.ConflictError: (409, ProblemCode.conflict),
+    errors.PreconditionFailedError: (412, ProblemCode.precondition_failed),
     errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
-    errors.KindNotAvailableError: (422, ProblemCode.kind_not_available),
-    errors.PresetNotCertifiedError: (422, ProblemCode.preset_not_certified),
+    errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),
+    errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
     errors.MissingArtifactError: (500, ProblemCode.storage_error),
 }
 
@@ -65,7 +66,8 @@ def problem_response(
 ) -> Response:
     """Return a problem document as a response."""
     problem = Problem(
-        title=HTTPStatus(status).phrase,
+        type=f"urn:stickslip:problem:{code}",
+        title=code.replace("_", " ").capitalize(),
         status=status,
         detail=detail,
         code=code,
@@ -131,8 +133,22 @@ def _http_error(request: Request, error: Exception) -> Response:
     if error.status_code == 404:
         detail = f"there is nothing at {request.url.path}"
     elif error.status_code == 405:
-        detail = f"{request.url.path} does not know the method {request.method}"
+        allowed = _allowed_methods(request)
+        detail = f"{request.url.path} answers {allowed}, and not {request.method}"
+        return _answer(request, 405, code, detail, headers={"Allow": allowed})
     return _answer(request, error.status_code, code, detail, headers=error.headers)
+
+
+def _allowed_methods(request: Request) -> str:
+    """Return the methods of a resource: those of the routes with the longest template that fits its path."""
+    fitting = [
+        route
+        for route in request.app.routes
+        if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE
+    ]
+    longest = max((len(route.path) for route in fitting), default=0)
+    methods = {method for route in fitting if len(route.path) == longest for method in route.methods or ()}
+    return ", ".join(sorted(methods))
 
 
 def _database_error(request: Request, error: Exception) -> Response:

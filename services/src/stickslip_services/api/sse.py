@@ -26,6 +26,20 @@ LOOK_SECONDS = 0.2
 BATCH = 200
 
 
+OPENAPI = {
+    # Each event of the stream; OpenAPI 3.2 calls it `itemSchema`.
+    "schema": {
+        "type": "object",
+        "properties": {
+            "id": {"type": "string", "pattern": "^[0-9]{1,18}$"},
+            "event": {"enum": [name.value for name in EventName]},
+            "data": {"type": "string", "contentMediaType": "application/json"},
+            "retry": {"type": "integer"},
+        },
+        "required": ["data"],
+    }
+}
+
 Show = Callable[[Connection, int], JobDetail]
 """Returns a job as a transaction sees it."""
 

@@ -3,16 +3,14 @@
 What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from sqlalchemy import Connection
-from stickslip_schemas.builds import Builds
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store
@@ -41,6 +39,8 @@ from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import (
     Replay,
     cancel_job,
+    check_unchanged,
+    find_job,
     find_replay,
     fingerprint,
     has_runnable_job,
@@ -57,8 +57,9 @@ from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.stranded import find_stranded, note_stranded
-from stickslip_services.queue.submitting import count_settled, insert_job, plan_job
+from stickslip_services.queue.submitting import insert_job, plan_job
 from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.validating import validate
 from stickslip_services.queue.workers import (
     RegisteredWorker,
     find_worker,
@@ -68,9 +69,6 @@ from stickslip_services.queue.workers import (
     present_workers,
 )
 from stickslip_services.settings import Settings
-
-_NO_BUILDS = Builds(**dict.fromkeys(Builds.model_fields, "0" * 64))
-"""Stands in where simulations are only counted."""
 
 CHECKED_AT_ONCE = 64 * 2**20
 """The largest dataset that is checked while the request that asks for it again waits [bytes]."""
@@ -114,21 +112,7 @@ class Coordinator:
 
     def validate(self, spec: JobSpec) -> Validation:
         """Tell what a job would be."""
-        with self.database.read() as connection:
-            terms = terms_for(connection, spec)
-        with collector_at_rest():
-            plan = self._expand(spec, terms or Terms(_NO_BUILDS, None))
-        with self.database.read() as connection:
-            cached = None if terms is None else count_settled(connection, plan.tasks)
-        return Validation(
-            spec=spec,
-            spec_digest=spec.content_digest,
-            sample_count=spec.sample_count,
-            simulation_count=plan.simulation_count,
-            cached_count=cached,
-            bytes_estimate=bytes_estimate(spec),
-            certificate=plan.certificate,
-        )
+        return validate(self.database, spec)
 
     def submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
@@ -160,25 +144,32 @@ class Coordinator:
             self.check_made_datasets(at_most=CHECKED_AT_ONCE)
             return shown
 
-    def cancel(self, job_id: str) -> JobDetail:
-        """Cancel a job."""
+    def cancel(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
+        """Cancel a job. With `if_match`, only if its entity tag is one of these."""
         with self._book() as book:
+            self._check_unchanged(book.connection, job_id, if_match)
             job = cancel_job(book, job_id)
         return self._shown(job)
 
-    def pause(self, job_id: str) -> JobDetail:
-        """Pause a job."""
+    def pause(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
+        """Pause a job. With `if_match`, only if its entity tag is one of these."""
         with self._book() as book:
+            self._check_unchanged(book.connection, job_id, if_match)
             job = pause_job(book, job_id)
         return self._shown(job)
 
-    def resume(self, job_id: str) -> JobDetail:
-        """Let a paused job go on, with the builds that it was planned for."""
+    def resume(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
+        """Let a paused job go on, with the builds that it was planned for. With `if_match`, only if its entity tag is one of these."""
         with self._book() as book:
+            self._check_unchanged(book.connection, job_id, if_match)
             job = resume_job(book, job_id)
         self.plan_waiting_jobs()
         self._note_stranded()
         return self._shown(job)
+
+    def _check_unchanged(self, connection: Connection, job_id: str, if_match: Collection[str] | None) -> None:
+        if if_match is not None:
+            check_unchanged(self.show(connection, int(find_job(connection, job_id).seq)), if_match)
 
     def _shown(self, job: int) -> JobDetail:
         with self.database.read() as connection:

@@ -15,7 +15,12 @@ from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, make_page
 from stickslip_services.database.tables import idempotency_keys, job_stages, jobs, previews, samples, tasks
-from stickslip_services.errors import ConflictError, IdempotencyKeyReusedError, NotFoundError
+from stickslip_services.errors import (
+    ConflictError,
+    IdempotencyKeyReusedError,
+    NotFoundError,
+    PreconditionFailedError,
+)
 from stickslip_services.queue.eta import StageTimings
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
@@ -106,6 +111,19 @@ def resume_job(book: Ledger, job_id: str) -> int:
     set_job_state(book.connection, row.seq, state, book.now, reason=reason, message=message)
     charge_waiting_tasks(book.connection, row.seq)
     return int(row.seq)
+
+
+def etag(job: JobDetail) -> str:
+    """Return the entity tag [RFC 9110, 8.8.3] of a job as it is shown; any change changes it."""
+    return f'"{sha256(job.model_dump_json().encode())[:32]}"'
+
+
+def check_unchanged(job: JobDetail, etags: Collection[str]) -> None:
+    """Raise PreconditionFailedError where a job's entity tag is none of `etags`."""
+    if etag(job) not in etags:
+        raise PreconditionFailedError(
+            f"job {job.id} has changed since the ETag in If-Match, {', '.join(etags)[:200]}: get it again"
+        )
 
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:

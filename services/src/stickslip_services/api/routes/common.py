@@ -3,10 +3,9 @@
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
-from stickslip_schemas.problems import MEDIA_TYPE, FieldError, ProblemCode
+from stickslip_schemas.problems import MEDIA_TYPE
 
-from stickslip_services.api.problems import ProblemError
-from stickslip_services.database.paging import MAX_PAGE_SIZE, PageRequest
+from stickslip_services.database.paging import MAX_PAGE_SIZE, TOKEN_PATTERN, PageRequest
 
 
 def coordinator_of(request: Request) -> Any:
@@ -16,14 +15,11 @@ def coordinator_of(request: Request) -> Any:
 
 def _page(
     page_size: Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="the most items to return")] = 50,
-    page_token: Annotated[str | None, Query(max_length=64, description="`next_page_token` of the page before")] = None,
+    page_token: Annotated[
+        str | None, Query(pattern=TOKEN_PATTERN, description="`next_page_token` of the page before")
+    ] = None,
 ) -> PageRequest:
-    try:
-        return PageRequest.from_query(page_size, page_token)
-    except ValueError as error:
-        field = FieldError(pointer="/query/page_token", rule=str(error), value=(page_token or "")[:200])
-        detail = f"{error}, and it is {field.value!r}"
-        raise ProblemError(422, ProblemCode.validation_failed, detail, fields=[field]) from error
+    return PageRequest.from_query(page_size, page_token)
 
 
 PageDep = Annotated[PageRequest, Depends(_page)]
@@ -31,15 +27,16 @@ PageDep = Annotated[PageRequest, Depends(_page)]
 _TITLES = {
     400: "The body is not JSON",
     401: "The key is missing or wrong",
-    403: "The request comes under a foreign name, or from a page of another site",
-    404: "There is no such thing",
-    409: "It cannot be done in the state that the thing is in",
+    403: "The request names a foreign host, or comes from a page of another site",
+    404: "Not found",
+    409: "The state does not allow it; `detail` names the state",
+    412: "The job has changed since the `ETag` in `If-Match`",
     413: "The body is too large",
-    415: "The body is not declared to be JSON",
+    415: "The `Content-Type` of the body is not JSON",
     416: "The range lies outside the file",
-    422: "The request breaks a rule; `errors` says which, and where",
-    500: "The coordinator has a fault",
-    503: "The coordinator cannot answer now",
+    422: "The request breaks a rule; `errors` lists the fields, rules and values",
+    500: "The coordinator failed; its log says more",
+    503: "The coordinator is busy or cannot reach its database; try again later",
 }
 
 BODY_PROBLEMS = (400, 413, 415, 422)

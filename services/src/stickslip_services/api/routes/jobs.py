@@ -4,27 +4,33 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.responses import Job, JobDetail, Page, Preview, SampleState, Validation
 from stickslip_schemas.states import TaskState
 
 from stickslip_services.api import sse
 from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.problems import ProblemError
+from stickslip_services.api.files import matches
 from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.jobs import Replay, find_job, list_jobs, list_previews, list_samples
+from stickslip_services.queue.jobs import Replay, etag, find_job, list_jobs, list_previews, list_samples
 
 router = APIRouter(tags=["jobs"])
 
 CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
-SpecBody = Annotated[JobSpec, Depends(JsonBody(job_spec_adapter))]
+SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec))]
 
 _LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
 _ETAG = {"ETag": {"description": "Changes with the job", "schema": {"type": "string"}}}
+_CHANGED: dict[int | str, dict[str, Any]] = {
+    202: {"description": "The job after the change", "headers": _ETAG},
+    **problem_responses(404, 409, 412),
+}
+
+IfMatch = Annotated[
+    str | None, Header(description="the `ETag` of the job as you saw it: where it has changed since, nothing is done")
+]
 _REPLAYED: dict[str, Any] = {
     "description": "The answer that this Idempotency-Key got the first time",
     "model": JobDetail,
@@ -39,7 +45,7 @@ _REPLAYED: dict[str, Any] = {
     responses={
         200: _REPLAYED,
         202: {"description": "The job is in the queue", "headers": _LOCATION},
-        **problem_responses(*BODY_PROBLEMS),
+        **problem_responses(409, *BODY_PROBLEMS),
     },
     openapi_extra=body_schema("JobSpec"),
 )
@@ -89,29 +95,29 @@ def get_job(
 ) -> Response:
     """Return a job."""
     with coordinator.database.read() as connection:
-        content = coordinator.show(connection, find_job(connection, job_id).seq).model_dump_json()
-    etag = f'"{sha256(content.encode())[:32]}"'
-    if if_none_match is not None and (if_none_match.strip() == "*" or etag in if_none_match):
-        return Response(status_code=304, headers={"ETag": etag})
-    return _json(content, headers={"ETag": etag})
+        job = coordinator.show(connection, int(find_job(connection, job_id).seq))
+    content, tag = job.model_dump_json(), etag(job)
+    if matches(if_none_match, tag):
+        return Response(status_code=304, headers={"ETag": tag})
+    return _json(content, headers={"ETag": tag})
 
 
-@router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=problem_responses(404, 409))
-def cancel_job(job_id: str, coordinator: CoordinatorDep) -> JobDetail:
+@router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=_CHANGED)
+def cancel_job(job_id: str, coordinator: CoordinatorDep, response: Response, if_match: IfMatch = None) -> JobDetail:
     """Cancel a job. Tasks that only it needs are dropped; what is finished or published stays."""
-    return coordinator.cancel(job_id)
+    return _tagged(response, coordinator.cancel(job_id, if_match=_etags(if_match)))
 
 
-@router.post("/v1/jobs/{job_id}:pause", status_code=202, responses=problem_responses(404, 409))
-def pause_job(job_id: str, coordinator: CoordinatorDep) -> JobDetail:
+@router.post("/v1/jobs/{job_id}:pause", status_code=202, responses=_CHANGED)
+def pause_job(job_id: str, coordinator: CoordinatorDep, response: Response, if_match: IfMatch = None) -> JobDetail:
     """Pause a job: nothing more is started for it, and what runs finishes. Its place in the queue stays."""
-    return coordinator.pause(job_id)
+    return _tagged(response, coordinator.pause(job_id, if_match=_etags(if_match)))
 
 
-@router.post("/v1/jobs/{job_id}:resume", status_code=202, responses=problem_responses(404, 409))
-def resume_job(job_id: str, coordinator: CoordinatorDep) -> JobDetail:
+@router.post("/v1/jobs/{job_id}:resume", status_code=202, responses=_CHANGED)
+def resume_job(job_id: str, coordinator: CoordinatorDep, response: Response, if_match: IfMatch = None) -> JobDetail:
     """Let a paused job go on."""
-    return coordinator.resume(job_id)
+    return _tagged(response, coordinator.resume(job_id, if_match=_etags(if_match)))
 
 
 @router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404, 422))
@@ -145,7 +151,7 @@ def get_previews(job_id: str, coordinator: CoordinatorDep) -> list[Preview]:
                 "`job.progress` (about once a second, with the id of the event before it). After the `job.state` that "
                 "ends the job the stream ends."
             ),
-            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+            "content": {"text/event-stream": sse.OPENAPI},
         },
         **problem_responses(404, 422),
     },
@@ -154,16 +160,24 @@ def get_events(
     job_id: str,
     request: Request,
     coordinator: CoordinatorDep,
-    last_event_id: Annotated[str | None, Header(description="go on after this event")] = None,
+    last_event_id: Annotated[
+        str | None, Header(pattern=r"^[0-9]{0,18}$", description="id of the last event that you have")
+    ] = None,
 ) -> Response:
     """Follow a job."""
-    after = last_event_id or "0"
-    if not after.isdecimal() or len(after) > 18:
-        detail = f"Last-Event-ID must be the id of an event, and it is {after[:100]!r}"
-        raise ProblemError(422, ProblemCode.validation_failed, detail)
     with coordinator.database.read() as connection:
         job = int(find_job(connection, job_id).seq)
-    return sse.stream(coordinator.database, coordinator.bell, coordinator.show, job, after=int(after))
+    return sse.stream(coordinator.database, coordinator.bell, coordinator.show, job, after=int(last_event_id or 0))
+
+
+def _etags(if_match: str | None) -> list[str] | None:
+    """Return the entity tags that a job may have [RFC 9110, 13.1.1]; None: any."""
+    return None if if_match is None or if_match.strip() == "*" else [tag.strip() for tag in if_match.split(",")]
+
+
+def _tagged(response: Response, job: JobDetail) -> JobDetail:
+    response.headers["ETag"] = etag(job)
+    return job
 
 
 def _json(content: str, *, status: int = 200, headers: dict[str, str] | None = None) -> Response:

@@ -1,0 +1,74 @@
+"""How many samples, simulations, renders and shards a spec means, from its axes and without walking the grid."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from math import ceil, prod
+
+import numpy as np
+
+from stickslip_schemas.axes import AnyAxis, ListAxis, axis_values
+from stickslip_schemas.base import Document
+from stickslip_schemas.jobs import JobSpec, SeedRule
+from stickslip_schemas.samples import SPLITS
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What a spec means, in numbers."""
+
+    samples: int
+    simulations: int
+    renders: int
+    shards: int
+    expected_splits: dict[str, int]
+    """Samples by split if each split got exactly its share; a sample's split is a hash, so real ones differ a little."""
+
+    @property
+    def tasks(self) -> int:
+        """Tasks of all stages; the last one publishes."""
+        return self.simulations + self.renders + self.shards + 1
+
+
+def count(spec: JobSpec) -> Counts:
+    """Return the numbers of `spec`.
+
+    Two samples share a simulation where they agree in all axes that enter its document or its seeds, and a render where
+    they agree in those of the render, too. Time and memory grow with the longest axis, not with the grid.
+    """
+    physical = _axes_of(spec, spec.simulation_type, spec.simulation_seeds)
+    seen = physical | _axes_of(spec, spec.render_type, spec.render_seeds)
+    shares = (spec.splits.train, spec.splits.validation, spec.splits.test)
+    return Counts(
+        samples=spec.sample_count,
+        simulations=_distinct(spec, physical),
+        renders=0 if spec.render_settings() is None else _distinct(spec, seen),
+        shards=ceil(spec.sample_count / spec.samples_per_shard),
+        expected_splits={name: round(share * spec.sample_count) for name, share in zip(SPLITS, shares, strict=True)},
+    )
+
+
+def _axes_of(spec: JobSpec, document: type[Document], seeds: Collection[SeedRule]) -> set[str]:
+    """Return the axes that a document of a sample depends on."""
+    entering = {axis for rule in seeds for axis in spec.seed_axes(rule)}
+    return entering | {name for name in spec.named_axes if name in document.model_fields}
+
+
+def _distinct(spec: JobSpec, names: Collection[str]) -> int:
+    """Return how many different values some axes take together over the grid."""
+    axes = [(place, axis) for place, (name, axis) in enumerate(spec.named_axes.items()) if name in names]
+    if spec.combine == "product":
+        return prod(_distinct_values(axis) for _, axis in axes)
+    if any(isinstance(axis, ListAxis) for _, axis in axes):
+        return spec.sample_count  # the values of a list are all different, and zipped axes have one length
+    rows = np.zeros(spec.sample_count, dtype=np.int64)
+    for place, axis in axes:
+        values, codes = np.unique(axis_values(axis, dimension=place), return_inverse=True)
+        if len(values) == spec.sample_count:
+            return spec.sample_count
+        _, rows = np.unique(rows * len(values) + codes, return_inverse=True)
+    return int(rows.max()) + 1
+
+
+def _distinct_values(axis: AnyAxis) -> int:
+    """Return how many different values an axis has: a narrow range holds fewer numbers than it may be asked for."""
+    return axis.num if isinstance(axis, ListAxis) else len(np.unique(axis_values(axis)))

@@ -1,0 +1,66 @@
+"""Rules between fields, which JSON Schema has no words for: a generated document that breaks one is not a valid one.
+
+Each is a part of the message of the error that names it. Whatever else the coordinator refuses, its schema must refuse.
+"""
+
+import uuid
+from typing import Any
+
+import schemathesis
+from pydantic import TypeAdapter, ValidationError
+from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.kinds import AnyJobSpec
+from stickslip_schemas.worker_api import ReportBatch
+
+RELATIONS = (
+    "low must be less than high",
+    "start and stop must differ",
+    "train + validation + test must be 1",
+    "axes that are zipped must have one length",
+    "a job has at most",
+    "frames must be at most",
+    "Input should be one of 11oz-black-denim",  # or a material of the spec's own
+    "materials must not redefine",
+    "give stretching, or",
+    "stretching must be positive definite",
+    "bending must be given with stretching",
+    "young times thickness must be",
+    "young and thickness must give",
+    "reason is there exactly when",
+    "output is there exactly when",
+    "damaged_inputs are those of",
+    "a sample is rejected for a reason of its own",
+    "error must be the largest of the curves",
+    "passed must say whether",
+    "x, measured, master and errors must have one length",
+    "every protocol must be there once",
+    "all protocols must have been run with one build",
+)
+
+_DOCUMENTS: dict[str, TypeAdapter[Any]] = {
+    "/v1/jobs": TypeAdapter(AnyJobSpec),
+    "/v1/jobs:validate": TypeAdapter(AnyJobSpec),
+    "/v1/worker/report": TypeAdapter(ReportBatch),
+    "/v1/certificates": TypeAdapter(CertificateUpload),
+}
+
+
+@schemathesis.hook
+def filter_case(context: Any, case: Any) -> bool:
+    """Leave out valid cases whose body breaks a rule between fields, and no other."""
+    adapter = _DOCUMENTS.get(case.path)
+    if adapter is None or case.method != "POST" or not case.meta.generation.mode.is_positive:
+        return True
+    try:
+        adapter.validate_python(case.body)
+    except ValidationError as error:
+        return not any(relation in item["msg"] for item in error.errors() for relation in RELATIONS)
+    return True
+
+
+@schemathesis.hook
+def map_case(context: Any, case: Any) -> Any:
+    """Give each request an Idempotency-Key of its own: the same one with another document is rightly refused."""
+    if case.headers and "idempotency-key" in case.headers and case.meta.generation.mode.is_positive:
+        case.headers["idempotency-key"] = uuid.uuid4().hex
+    return case
