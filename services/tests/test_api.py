@@ -9,7 +9,7 @@ import pytest
 from fastapi import FastAPI
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, rods, serving
+from stickslip_services.testing import HttpApi, ManualClock, PretendWorker, failure, rejection, rods, serving
 
 JSON = {"Content-Type": "application/json"}
 
@@ -157,7 +157,9 @@ def test_unknown_places_and_methods_are_problems(client: httpx.Client) -> None:
     problem(client.get("/v1/datasets/ds-0"), 404, "not_found")
     problem(client.get("/v1/tasks/simulate-0"), 404, "not_found")
     problem(client.get("/v1/previews/..%2f..%2fetc"), 404, "not_found")
-    assert client.put("/v1/jobs").headers["allow"]
+    assert client.put("/v1/jobs").headers["allow"] == "GET, POST"
+    assert client.get("/v1/jobs/job-0:cancel").status_code == 404
+    assert client.options("/v1/jobs/job-0:cancel").headers["allow"] == "POST"
     problem(client.put("/v1/jobs"), 405, "method_not_allowed")
     problem(client.get("/v1/datasets/ds-0/versions/999999999999999999999"), 422, "validation_failed")
 
@@ -177,6 +179,29 @@ def test_a_job_is_accepted_and_shown(client: httpx.Client, worker: PretendWorker
     changed = client.get(response.headers["location"], headers={"If-None-Match": shown.headers["etag"]})
     assert (changed.status_code, changed.json()["state"]) == (200, "succeeded")
     assert client.post(f"/v1/jobs/{shown.json()['id']}:cancel").status_code == 409
+
+
+def test_a_change_may_depend_on_the_state_that_was_seen(client: httpx.Client, worker: PretendWorker) -> None:
+    response = client.post("/v1/jobs", json=rods(name="mine"))
+    place = response.headers["location"]
+    seen = client.get(place).headers["etag"]
+    worker.finish(*worker.lease(simulate=1))  # it goes on, and nobody told the client
+    document = problem(client.post(f"{place}:pause", headers={"If-Match": seen}), 412, "precondition_failed")
+    assert seen in document["detail"]
+    assert client.get(place).json()["state"] == "running"
+    now = client.get(place).headers["etag"]
+    paused = client.post(f"{place}:pause", headers={"If-Match": f'"other", {now}'})
+    assert (paused.status_code, paused.json()["state"]) == (202, "paused")
+    assert client.get(place).headers["etag"] == paused.headers["etag"] != now
+    assert client.post(f"{place}:resume", headers={"If-Match": "*"}).json()["state"] == "running"
+    problem(client.post("/v1/jobs/job-0:cancel", headers={"If-Match": "*"}), 404, "not_found")
+
+
+def test_a_problem_has_a_type_and_a_title_of_its_own(client: httpx.Client) -> None:
+    document = problem(client.get("/v1/jobs/job-0"), 404, "not_found")
+    assert (document["type"], document["title"]) == ("urn:stickslip:problem:not_found", "Not found")
+    misspelt = client.post("/v1/jobs", json=with_axis() | {"qualty": "high"})
+    assert "did you mean quality?" in problem(misspelt, 422, "validation_failed")["detail"]
 
 
 def test_an_idempotency_key_makes_one_job(client: httpx.Client, worker: PretendWorker) -> None:
@@ -286,6 +311,28 @@ def test_health_and_metrics(client: httpx.Client, worker: PretendWorker) -> None
     assert 'stickslip_jobs{state="running"} 1.0' in text
     assert 'stickslip_leases{worker="pretend"} 2.0' in text
     assert 'stickslip_request_seconds_count{method="POST",route="/v1/jobs",status="202"} 1.0' in text
+
+
+def test_metrics_tell_how_tasks_ended_and_what_is_stored(app: FastAPI, client: httpx.Client) -> None:
+    api = HttpApi(str(client.base_url), app.state.worker_key)
+
+    def judge(task: Any) -> Any:
+        if task.stage == "simulate" and task.simulation.gamma == 1.0:
+            return rejection()
+        return failure() if task.stage == "render" else None
+
+    worker = PretendWorker(api, app.state.coordinator.store, judge=judge).register()
+    client.post("/v1/jobs", json=rods())
+    worker.finish(*worker.lease())
+    worker.finish(*worker.lease())
+    text = client.get("/metrics").text
+    assert 'stickslip_task_seconds_count{outcome="succeeded",stage="simulate"} 2.0' in text
+    assert 'stickslip_task_seconds_sum{outcome="rejected",stage="simulate"} 2.0' in text
+    assert 'stickslip_task_failures_total{outcome="rejected",reason="solver_diverged",stage="simulate"} 2.0' in text
+    assert 'stickslip_task_failures_total{outcome="failed",reason="renderer_crash",stage="render"} 2.0' in text
+    assert 'stickslip_store_disk_bytes{state="free"}' in text
+    assert "stickslip_dataset_versions 0.0" in text
+    assert 'stickslip_info{version="' in text
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.4", "example.org", ""])

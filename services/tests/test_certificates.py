@@ -1,5 +1,6 @@
 """Certificates: registered once, shown, and asked for before cloth is made."""
 
+import re
 from typing import Any
 
 import httpx
@@ -11,6 +12,7 @@ from stickslip_schemas.states import JobState, Reason
 from stickslip_services.coordinator import make_app
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.validating import validate
 from stickslip_services.settings import Settings
 from stickslip_services.testing import BUILDS, ManualClock, PretendWorker, parsed, rods, serving, show_job
 
@@ -63,13 +65,14 @@ def weaver(coordinator: Coordinator) -> PretendWorker:
 
 class TestTheRule:
     def test_cloth_needs_a_certificate(self, coordinator: Coordinator, weaver: PretendWorker) -> None:
-        for ask in (lambda spec: coordinator.submit(spec, None), coordinator.validate):
-            with pytest.raises(
-                PresetNotCertifiedError, match=r"^preset 'certified' .* `stickslip certify --preset certified`"
-            ):
-                ask(cloth())
+        refusal = r"^preset 'certified' .* `stickslip certify --preset certified`"
+        with pytest.raises(PresetNotCertifiedError, match=refusal):
+            coordinator.submit(cloth(), None)
+        told = validate(coordinator.database, cloth())  # which counts all the same
+        assert re.match(refusal, told.refusal or "")
+        assert (told.sample_count, told.certificate, told.cached_count) == (2, None, None)
         added = coordinator.add_certificate(upload())
-        assert coordinator.validate(cloth()).certificate == added.digest
+        assert validate(coordinator.database, cloth()).certificate == added.digest
         job = coordinator.submit(cloth(), None)
         weaver.work()
         manifest = manifest_of(coordinator, job)
@@ -92,13 +95,12 @@ class TestTheRule:
     ) -> None:
         good = coordinator.add_certificate(upload())
         coordinator.add_certificate(upload(extent="quick", error=0.5))
-        assert coordinator.validate(cloth()).certificate == good.digest
+        assert validate(coordinator.database, cloth()).certificate == good.digest
         coordinator.add_certificate(upload(error=0.02))
-        with pytest.raises(PresetNotCertifiedError):
-            coordinator.validate(cloth())
+        assert validate(coordinator.database, cloth()).refusal
         clock.advance(1)
         coordinator.add_certificate(upload())
-        assert coordinator.validate(cloth()).certificate == good.digest
+        assert validate(coordinator.database, cloth()).certificate == good.digest
 
     def test_uncertified_where_the_spec_says_so(self, coordinator: Coordinator, weaver: PretendWorker) -> None:
         job = coordinator.submit(cloth(allow_uncertified=True), None)

@@ -6,6 +6,7 @@ The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, field_validator, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
@@ -138,18 +139,24 @@ def axis_values(axis: AnyAxis, *, dimension: int = 0) -> list[Any]:
     `dimension` keeps axes apart that are sampled together: it selects the dimension of the Sobol sequence and
     the stream of the random generator.
     """
-    if isinstance(axis, ListAxis):
-        return list(axis.values)
+    return list(axis.values) if isinstance(axis, ListAxis) else range_values(axis, dimension=dimension).tolist()
+
+
+def range_values(
+    axis: LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any], *, dimension: int = 0
+) -> npt.NDArray[np.float64]:
+    """Return the values of an axis that is a range; see `axis_values`."""
     if isinstance(axis, LinspaceAxis):
-        return [float(value) for value in np.linspace(axis.start, axis.stop, axis.num)]
+        return np.linspace(axis.start, axis.stop, axis.num, dtype=np.float64)
     if isinstance(axis, SobolAxis):
         unit = _sobol(axis.num, axis.seed, dimension)
     else:
         unit = np.random.Generator(np.random.PCG64([axis.seed, dimension])).random(axis.num)
-    return [float(axis.low + (axis.high - axis.low) * value) for value in unit]
+    values: npt.NDArray[np.float64] = axis.low + (axis.high - axis.low) * unit
+    return values
 
 
-def _sobol(num: int, seed: int, dimension: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _sobol(num: int, seed: int, dimension: int) -> npt.NDArray[np.float64]:
     from scipy.stats import qmc  # an extra: only who expands a spec needs it
 
     exponent = max(0, int(num - 1).bit_length())

@@ -6,7 +6,7 @@ from math import ceil, prod
 
 import numpy as np
 
-from stickslip_schemas.axes import AnyAxis, ListAxis, axis_values
+from stickslip_schemas.axes import AnyAxis, ListAxis, range_values
 from stickslip_schemas.base import Document
 from stickslip_schemas.jobs import JobSpec, SeedRule
 from stickslip_schemas.samples import SPLITS
@@ -21,7 +21,7 @@ class Counts:
     renders: int
     shards: int
     expected_splits: dict[str, int]
-    """Samples by split if each split got exactly its share; a sample's split is a hash, so real ones differ a little."""
+    """Samples by split if each split got exactly its share; splits are drawn, so real numbers differ a little."""
 
     @property
     def tasks(self) -> int:
@@ -57,18 +57,18 @@ def _distinct(spec: JobSpec, names: Collection[str]) -> int:
     """Return how many different values some axes take together over the grid."""
     axes = [(place, axis) for place, (name, axis) in enumerate(spec.named_axes.items()) if name in names]
     if spec.combine == "product":
-        return prod(_distinct_values(axis) for _, axis in axes)
-    if any(isinstance(axis, ListAxis) for _, axis in axes):
-        return spec.sample_count  # the values of a list are all different, and zipped axes have one length
+        return prod(_distinct_values(axis, 0) for _, axis in axes)
+    # Zipped axes have one length: one whose values are all different tells all samples apart.
+    if any(_distinct_values(axis, place) == spec.sample_count for place, axis in axes):
+        return spec.sample_count
     rows = np.zeros(spec.sample_count, dtype=np.int64)
     for place, axis in axes:
-        values, codes = np.unique(axis_values(axis, dimension=place), return_inverse=True)
-        if len(values) == spec.sample_count:
-            return spec.sample_count
+        assert not isinstance(axis, ListAxis)  # whose values are all different
+        values, codes = np.unique(range_values(axis, dimension=place), return_inverse=True)
         _, rows = np.unique(rows * len(values) + codes, return_inverse=True)
     return int(rows.max()) + 1
 
 
-def _distinct_values(axis: AnyAxis) -> int:
+def _distinct_values(axis: AnyAxis, dimension: int) -> int:
     """Return how many different values an axis has: a narrow range holds fewer numbers than it may be asked for."""
-    return axis.num if isinstance(axis, ListAxis) else len(np.unique(axis_values(axis)))
+    return axis.num if isinstance(axis, ListAxis) else len(np.unique(range_values(axis, dimension=dimension)))

@@ -86,7 +86,9 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
             rule = f"there is no such field{hint} Fields: {', '.join(known)}"
         case "union_tag_invalid" | "union_tag_not_found":
             tag = item["ctx"]["discriminator"].strip("'")
-            known = [word for model in _models_at(of, location) for word in _literals(model.model_fields[tag].annotation)]
+            known = [
+                word for model in _models_at(of, location) for word in _literals(model.model_fields[tag].annotation)
+            ]
             is_missing = item["type"] == "union_tag_not_found" and isinstance(value, Mapping)
             if isinstance(value, Mapping):
                 location = (*location, tag)

@@ -48,7 +48,7 @@ GRACE_SECONDS = 3
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
     coordinator = Coordinator(settings, clock or steady_clock())
-    metrics = Metrics(coordinator.database, coordinator.alive_workers)
+    metrics = Metrics(coordinator.database, coordinator.store.root, coordinator.alive_workers)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -76,8 +76,10 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.coordinator = coordinator
     app.state.metrics = metrics
     app.state.worker_key = worker_key(settings.worker_key_path)
-    for module in (jobs, datasets, certificates, tasks, workers, health, pages):
-        app.include_router(module.router)
+    routers = [module.router for module in (jobs, datasets, certificates, tasks, workers, health, pages)]
+    for router in routers:
+        app.include_router(router)
+    app.state.routes = [route for router in routers for route in router.routes]
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]

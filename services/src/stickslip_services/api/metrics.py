@@ -1,22 +1,27 @@
-"""Metrics for Prometheus: the queue, read from its counters when somebody asks, and the requests."""
+"""Metrics for Prometheus: the queue and the store, read when somebody asks, and what went by since the start."""
 
+import shutil
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
-from prometheus_client import CollectorRegistry, Histogram, generate_latest
+from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import Connection, func, select
+from stickslip_schemas.worker_api import ReportAnswer, ReportBatch
 
+from stickslip_services import __version__
 from stickslip_services.database.database import Database
-from stickslip_services.database.tables import jobs, task_counts
+from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.queue.workers import RegisteredWorker, leased_counts
 
 AliveWorkers = Callable[[Connection], list[RegisteredWorker]]
 
 
 class _QueueCollector(Collector):
-    def __init__(self, database: Database, alive_workers: AliveWorkers) -> None:
+    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers) -> None:
         self._database = database
+        self._store = store
         self._alive_workers = alive_workers
 
     def collect(self) -> Iterable[Metric]:
@@ -32,19 +37,42 @@ class _QueueCollector(Collector):
             for state, count in connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)):
                 by_state.add_metric([state], count)
             held = leased_counts(connection)
+            committed = (func.count(), func.coalesce(func.sum(dataset_versions.c.bytes), 0))
+            count, size = connection.execute(select(*committed).where(dataset_versions.c.manifest.is_not(None))).one()
+        versions = GaugeMetricFamily("stickslip_dataset_versions", "Dataset versions", value=count)
+        bytes_ = GaugeMetricFamily("stickslip_dataset_bytes", "Size of the files of all dataset versions", value=size)
+        disk = GaugeMetricFamily("stickslip_store_disk_bytes", "Disk of the store", labels=["state"])
+        place = self._store if self._store.exists() else self._store.parent
+        usage = shutil.disk_usage(place)
+        disk.add_metric(["free"], usage.free)
+        disk.add_metric(["used"], usage.used)
         for worker in alive:
             leases.add_metric([worker.name], held.get(worker.id, 0))
         workers.add_metric([], len(alive))
         slots.add_metric([], sum(worker.slots for worker in alive))
-        return [tasks, by_state, leases, workers, slots]
+        return [tasks, by_state, leases, workers, slots, versions, bytes_, disk]
 
 
 class Metrics:
     """The metrics of one coordinator."""
 
-    def __init__(self, database: Database, alive_workers: AliveWorkers) -> None:
+    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers) -> None:
         self._registry = CollectorRegistry()
-        self._registry.register(_QueueCollector(database, alive_workers))
+        self._registry.register(_QueueCollector(database, store, alive_workers))
+        Info("stickslip", "The coordinator", registry=self._registry).info({"version": __version__})
+        self._task_seconds = Histogram(
+            "stickslip_task_seconds",
+            "Time that a try of a task took, by how it ended [s]",
+            ["stage", "outcome"],
+            registry=self._registry,
+            buckets=(0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000, 3000, 10000),
+        )
+        self._failures = Counter(
+            "stickslip_task_failures",
+            "Tries that failed and samples that were rejected, by reason",
+            ["stage", "outcome", "reason"],
+            registry=self._registry,
+        )
         self._requests = Histogram(
             "stickslip_request_seconds",
             "Time to answer a request [s]",
@@ -55,6 +83,17 @@ class Metrics:
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
         """Note that a request was answered."""
         self._requests.labels(method, route, str(status)).observe(seconds)
+
+    def count_reports(self, batch: ReportBatch, answer: ReportAnswer) -> None:
+        """Note how tasks ended, as far as their reports were accepted."""
+        for report, verdict in zip(batch.reports, answer.verdicts, strict=True):
+            result = report.result
+            if verdict.verdict != "accepted" or result is None:
+                continue
+            stage = report.task_id.partition("-")[0]
+            self._task_seconds.labels(stage, result.outcome).observe(result.wall_seconds)
+            if result.reason is not None:
+                self._failures.labels(stage, result.outcome, result.reason).inc()
 
     def text(self) -> bytes:
         """Return all metrics as Prometheus reads them."""

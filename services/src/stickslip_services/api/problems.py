@@ -143,7 +143,7 @@ def _allowed_methods(request: Request) -> str:
     """Return the methods of a resource: those of the routes with the longest template that fits its path."""
     fitting = [
         route
-        for route in request.app.routes
+        for route in request.app.state.routes
         if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE
     ]
     longest = max((len(route.path) for route in fitting), default=0)

@@ -11,7 +11,7 @@ from sqlalchemy import Connection
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
+from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import PublishOutput
@@ -59,7 +59,6 @@ from stickslip_services.queue.retrying import fail_tries, find_held, give_back, 
 from stickslip_services.queue.stranded import find_stranded, note_stranded
 from stickslip_services.queue.submitting import insert_job, plan_job
 from stickslip_services.queue.terms import Terms, terms_for
-from stickslip_services.queue.validating import validate
 from stickslip_services.queue.workers import (
     RegisteredWorker,
     find_worker,
@@ -110,10 +109,6 @@ class Coordinator:
 
     # --- users ----------------------------------------------------------------------------------------------------
 
-    def validate(self, spec: JobSpec) -> Validation:
-        """Tell what a job would be."""
-        return validate(self.database, spec)
-
     def submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
         with collector_at_rest():
@@ -152,14 +147,14 @@ class Coordinator:
         return self._shown(job)
 
     def pause(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
-        """Pause a job. With `if_match`, only if its entity tag is one of these."""
+        """Pause a job; with `if_match` as in `cancel`."""
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = pause_job(book, job_id)
         return self._shown(job)
 
     def resume(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
-        """Let a paused job go on, with the builds that it was planned for. With `if_match`, only if its entity tag is one of these."""
+        """Let a paused job go on, with the builds it was planned for; with `if_match` as in `cancel`."""
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = resume_job(book, job_id)

@@ -89,11 +89,6 @@ class _Known(NamedTuple):
     message: str
 
 
-def count_settled(connection: Connection, keys: Iterable[bytes]) -> int:
-    """Return how many of the tasks have a result already."""
-    return sum(known.state.is_settled for known in _find(connection, keys).values())
-
-
 def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     """Write the tasks of `job` and return the state of the last of them."""
     connection = book.connection

@@ -1,21 +1,23 @@
 """What a job of a spec would be, told without making one: by arithmetic, so that a grid of a million is no work."""
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, func, select
 from stickslip_schemas.counting import count
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import Validation
+from stickslip_schemas.states import TaskState
 
-from stickslip_services.database.database import Database
-from stickslip_services.database.tables import dataset_versions, jobs
+from stickslip_services.database.database import Database, batches
+from stickslip_services.database.tables import dataset_versions, jobs, tasks
 from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.planning import collector_at_rest, expand
-from stickslip_services.queue.submitting import count_settled
 from stickslip_services.queue.terms import Terms, terms_for
 
 LOOKED_UP = 10_000
 """The largest grid whose tasks are looked up one by one, to see which have a result."""
+
+_SETTLED = [state for state in TaskState if state.is_settled]
 
 
 def validate(database: Database, spec: JobSpec) -> Validation:
@@ -56,7 +58,11 @@ def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
     with collector_at_rest():
         plan = expand(spec, terms.builds, certificate=terms.certificate)
         with database.read() as connection:
-            return count_settled(connection, plan.tasks)
+            found = (
+                connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(_SETTLED)))
+                for batch in batches(plan.tasks)
+            )
+            return sum(number or 0 for number in found)
 
 
 def _compression(connection: Connection, kind: str) -> float | None:

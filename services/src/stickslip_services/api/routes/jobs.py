@@ -14,6 +14,7 @@ from stickslip_services.api.files import matches
 from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.jobs import Replay, etag, find_job, list_jobs, list_previews, list_samples
+from stickslip_services.queue.validating import validate
 
 router = APIRouter(tags=["jobs"])
 
@@ -71,7 +72,7 @@ def post_job(
 @router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
 def validate_job(spec: SpecBody, coordinator: CoordinatorDep) -> Validation:
     """Tell what a job would be, without making one."""
-    return coordinator.validate(spec)
+    return validate(coordinator.database, spec)
 
 
 @router.get("/v1/jobs", responses=problem_responses(422))

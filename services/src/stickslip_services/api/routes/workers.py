@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Depends, Request, Response
 from stickslip_schemas.responses import WorkerEntry
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -17,6 +17,7 @@ from stickslip_schemas.worker_api import (
 
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.doors import require_worker_key
+from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.workers import show_workers
@@ -84,7 +85,10 @@ def post_heartbeat(
     openapi_extra=body_schema("ReportBatch"),
 )
 def post_report(
-    batch: Annotated[ReportBatch, Depends(JsonBody(ReportBatch))], coordinator: CoordinatorDep
+    batch: Annotated[ReportBatch, Depends(JsonBody(ReportBatch))], coordinator: CoordinatorDep, request: Request
 ) -> ReportAnswer:
     """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
-    return coordinator.report(batch)
+    answer = coordinator.report(batch)
+    metrics: Metrics = request.app.state.metrics
+    metrics.count_reports(batch, answer)
+    return answer

@@ -1,0 +1,91 @@
+"""The coordinator keeps what its OpenAPI document promises: every check of schemathesis, empty and used.
+
+`tests/schemathesis_hooks.py` names the rules between fields that JSON Schema has no words for.
+"""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from stickslip_services.coordinator import make_app
+from stickslip_services.errors import StickslipError
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, list_jobs, parsed, rejection, rods, serving
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = 3
+"""Generated for each operation, beside those that cover the document; a nightly run may ask for more."""
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("state", ["empty", "used"])
+def test_every_check_of_schemathesis_passes(state: str, tmp_path: Path) -> None:
+    app = make_app(Settings(data=tmp_path, durable=False))
+    command = Path(sys.executable).with_name("schemathesis")
+    with serving(app) as url:
+        coordinator: Coordinator = app.state.coordinator
+        if state == "used":
+            make_datasets(coordinator)
+        stop = threading.Event()
+        canceller = threading.Thread(target=cancel_jobs, args=(coordinator, stop))
+        canceller.start()
+        try:
+            run = subprocess.run(
+                [
+                    *(
+                        command,
+                        "run",
+                        f"{url}/openapi.json",
+                        "--header",
+                        f"Authorization: Bearer {app.state.worker_key}",
+                    ),
+                    *(
+                        "--checks",
+                        "all",
+                        "--max-examples",
+                        str(EXAMPLES),
+                        "--seed",
+                        "1",
+                        "--suppress-health-check",
+                        "all",
+                    ),
+                    *("--generation-database", "none", "--no-color"),
+                ],
+                cwd=ROOT,
+                capture_output=True,
+                text=True,
+                timeout=230,
+            )
+        finally:
+            stop.set()
+            canceller.join()
+    assert run.returncode == 0, run.stdout[-8000:] + run.stderr[-2000:]
+    assert " passed" in run.stdout
+
+
+def make_datasets(coordinator: Coordinator) -> None:
+    """Make a dataset with rejected samples, and leave another job half done."""
+    worker = PretendWorker(
+        coordinator,
+        coordinator.store,
+        whole=True,
+        judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None,
+    ).register()
+    coordinator.submit(parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
+    worker.work()
+    coordinator.submit(parsed(rods(gamma=(7.0, 8.0))), None)
+    worker.finish(*worker.lease(simulate=1))
+
+
+def cancel_jobs(coordinator: Coordinator, stop: threading.Event) -> None:
+    """End the jobs that are made: the event stream of one that waits for a worker would go on for ever."""
+    while not stop.wait(0.1):
+        for job in list_jobs(coordinator):
+            if not job.state.is_terminal:
+                try:
+                    coordinator.cancel(job.id)
+                except StickslipError:
+                    continue  # it has ended in between
