@@ -9,7 +9,15 @@ import pytest
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.manifest import Manifest, seal_text, with_manifest_digest
 from stickslip_services.client.http import Client, ProblemError, UnexpectedError, UnreachableError
-from stickslip_services.client.pull import DamagedError, UnsafePathError, pull, safe_path, verify
+from stickslip_services.client.pulling import (
+    DamagedError,
+    ForeignFilesError,
+    UnsafePathError,
+    pull,
+    refuse_foreign_files,
+    safe_path,
+    verify,
+)
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, rods, serving
@@ -305,3 +313,20 @@ def test_keys_that_the_manifest_does_not_list_are_found(origin: tuple[str, str],
     (fault,) = verify(tmp_path)
     assert (fault.path, fault.fault) == ("sample_key/c/0/0", "sample_key")
     assert "slots 0 to 1" in fault.detail
+
+
+def test_files_of_something_else_are_not_mixed_with_a_dataset(origin: tuple[str, str], tmp_path: Path) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes/thesis.txt").write_text("mine")
+    with Client(origin[0]) as client, pytest.raises(ForeignFilesError, match=r"1 file is .*notes/thesis\.txt"):
+        pull(client, origin[1], 1, tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == ["notes", "thesis.txt"]
+
+
+def test_a_dataset_is_not_mixed_with_another(origin: tuple[str, str], tmp_path: Path) -> None:
+    with Client(origin[0]) as client:
+        pull(client, origin[1], 1, tmp_path)
+    manifest = Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes())
+    fewer = {file.path for file in manifest.files[1:]}
+    with pytest.raises(ForeignFilesError, match=rf"It holds {manifest.dataset}:v1\."):
+        refuse_foreign_files(tmp_path, fewer, "ds-other:v1")

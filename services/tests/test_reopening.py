@@ -8,7 +8,7 @@ import pytest
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import RecordRef, RenderOutput, SimulateOutput, TaskResult
-from stickslip_services.client.pull import verify
+from stickslip_services.client.pulling import verify
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
 from stickslip_services.testing import ManualClock, PretendWorker, parsed, rods, show_job

@@ -90,7 +90,7 @@ def run_without_server(code: str) -> "subprocess.CompletedProcess[str]":
 
 
 def test_the_client_needs_nothing_of_the_server() -> None:
-    done = run_without_server("import stickslip_services.client, stickslip_services.client.pull")
+    done = run_without_server("import stickslip_services.client, stickslip_services.client.pulling")
     assert (done.returncode, done.stderr) == (0, "")
 
 

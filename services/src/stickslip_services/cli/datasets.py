@@ -11,7 +11,7 @@ from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli import wording
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client import pull
+from stickslip_services.client import pulling
 from stickslip_services.client.http import Client, ClientError
 
 
@@ -50,7 +50,7 @@ def pull_dataset(
         columns = (BarColumn(bar_width=32), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
         with Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
             row = bar.add_task("pull", total=None)
-            done = pull.pull(
+            done = pulling.pull(
                 client,
                 name,
                 version,
@@ -81,7 +81,7 @@ def _resolve(client: Client, dataset: str) -> tuple[str, int]:
 def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled")]) -> None:
     """Check every file of a dataset against its manifest; exit with 1 if anything is wrong."""
     screen = console()
-    faults = pull.verify(target)
+    faults = pulling.verify(target)
     if not faults:
         screen.print(f"{escape(str(target))}: every file is as the manifest says")
         return

@@ -1,5 +1,17 @@
-"""The client of a coordinator; it needs nothing of the server."""
+"""The clients of a coordinator, and downloading; they need nothing of the server."""
 
-from stickslip_services.client.http import Client, ClientError, ProblemError, UnexpectedError, UnreachableError
+from stickslip_services.client.aio import AsyncClient
+from stickslip_services.client.calls import ClientError, ProblemError, UnexpectedError, UnreachableError
+from stickslip_services.client.http import Client
+from stickslip_services.client.pulling import pull, verify
 
-__all__ = ["Client", "ClientError", "ProblemError", "UnexpectedError", "UnreachableError"]
+__all__ = [
+    "AsyncClient",
+    "Client",
+    "ClientError",
+    "ProblemError",
+    "UnexpectedError",
+    "UnreachableError",
+    "pull",
+    "verify",
+]

@@ -33,7 +33,8 @@ from stickslip_schemas.manifest import (
 from stickslip_schemas.store import write_durably
 from stickslip_schemas.tasks import FileEntry
 
-from stickslip_services.client.http import Client, ClientError, UnreachableError, raise_for_problem
+from stickslip_services.client.calls import ClientError, UnreachableError, raise_for_problem
+from stickslip_services.client.http import Client
 
 CONNECTIONS = 4
 TRIES = 5
@@ -42,6 +43,10 @@ PART = ".part"
 
 class UnsafePathError(ClientError):
     """A manifest names a file outside its dataset."""
+
+
+class ForeignFilesError(ClientError):
+    """The directory holds files that are not of the dataset."""
 
 
 class DamagedError(ClientError):
@@ -78,10 +83,12 @@ def pull(
     """Download a version to `target`; files that are there and right are left alone.
 
     `on_plan` hears how many files and bytes are to come, `on_bytes` of each piece that arrives. The manifest is written
-    last: where it is, the dataset is whole.
+    last: where it is, the dataset is whole. Raise ForeignFilesError, and write nothing, where `target` holds files of
+    something else: mixed with them, the dataset would not be what its manifest says.
     """
     manifest, sealed = _fetch_sealed(client, dataset, version)
     files = [(file, safe_path(target, file.path)) for file in manifest.files]
+    refuse_foreign_files(target, {file.path for file in manifest.files}, f"{dataset}:v{version}")
     target.mkdir(parents=True, exist_ok=True)
     missing = [(file, path) for file, path in files if not _is_whole(path, file)]
     changed = {name: content for name, content in sealed.items() if _content(target / name) != content}
@@ -103,6 +110,27 @@ def pull(
         write_durably(target / name, content)
         on_bytes(len(content))
     return Pulled(len(files) + len(sealed), count, size)
+
+
+def refuse_foreign_files(target: Path, own: set[str], name: str) -> None:
+    """Raise ForeignFilesError where `target` holds files that are not among the paths `own` of the dataset `name`.
+
+    A directory that holds this very version may have files of yours beside it: pulling mends it.
+    """
+    own = own | set(SEALED_NAMES)
+    foreign = [path for path in _files_below(target) if path.removesuffix(PART) not in own]
+    there = ""
+    with suppress(OSError, ValidationError):
+        manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
+        there = f"{manifest.dataset}:v{manifest.version}"
+    if not foreign or there == name:
+        return
+    number = "1 file is" if len(foreign) == 1 else f"{len(foreign)} files are"
+    holds = f" It holds {there}." if there else ""
+    raise ForeignFilesError(
+        f"{target} is not empty, and {number} not part of {name}: {min(foreign)}, for example.{holds} Nothing was "
+        "written; pull into a new directory"
+    )
 
 
 def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Manifest, dict[str, bytes]]:
