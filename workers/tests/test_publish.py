@@ -1,5 +1,6 @@
 """Publish: every reader gives back what went in, and a version is never half there."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -121,3 +122,27 @@ def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
     with pytest.raises(OSError, match="must have"):
         publish(task, made.store)
     assert not made.store.dataset_path(task.dataset, 1).exists()
+
+
+def test_a_version_has_a_card_that_is_true(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = make_dataset()
+    directory = made.publish()
+    manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+    text = (directory / "README.md").read_text()
+    assert sha256(text.encode()) in {file.sha256 for file in manifest.files if file.path == "README.md"}
+    for name, array in zarr.open_group(directory, mode="r").arrays():
+        assert f"| `{name}` |" in text
+        assert str(array.attrs["description"]) in text
+    assert f"{manifest.sample_count} samples, {manifest.valid_count} of them valid" in text
+    for split, count in manifest.split_counts.items():
+        assert f"| {split} | {count} |" in text
+    assert manifest.rejections
+    assert f"| {manifest.rejections[0].reason} | {len(manifest.rejections)} |" in text
+    assert manifest.builds.simulate in text
+    assert "No certificate vouches" in text
+    monkeypatch.chdir(directory)
+    first, second = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(first, names)
+    assert names["sample"].any()
+    assert "open_samples" in second  # whose package workers may not import: tests/ run it

@@ -1,4 +1,4 @@
-"""What a client may ask a coordinator for: each call as data, the same for the synchronous and the asynchronous client."""
+"""What a client may ask a coordinator for: each call as data, the same for both clients."""
 
 import json
 import os

@@ -18,6 +18,7 @@ from stickslip_schemas.samples import SPLITS, dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskResult
 
+from stickslip_workers.stages.card import CARD_NAME, card
 from stickslip_workers.stages.metadata import metadata_files
 
 
@@ -47,8 +48,11 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         split_counts=_split_counts(task, store),
         rejections=task.rejections,
         sample_keys=task.sample_keys,
-        files=tuple(sorted(files, key=lambda file: file.path)),
+        files=tuple(files),
     )
+    text = card(manifest)
+    files.append(FileEntry(path=CARD_NAME, sha256=store.publish(text), size=len(text)))
+    manifest = manifest.model_copy(update={"files": tuple(sorted(files, key=lambda file: file.path))})
     directory = store.dataset_path(task.dataset, task.version)
     for file in manifest.files:
         store.link(file.sha256, directory / file.path)

@@ -1,0 +1,101 @@
+"""The dataset card: `README.md` of a dataset version, for people who find the directory and nothing else."""
+
+import json
+from collections import Counter
+from typing import Any
+
+from stickslip_schemas.axes import AnyAxis, ListAxis
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import Manifest
+
+CARD_NAME = "README.md"
+
+SHOWN_VALUES = 12
+
+
+def card(manifest: Manifest) -> bytes:
+    """Return the card of a version: what it holds, how it was made, how to read, check and cite it."""
+    spec = manifest.spec
+    name = f"{manifest.dataset}:v{manifest.version}"
+    document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
+    sections = [
+        f"# {spec.name or manifest.dataset}",
+        f"{(type(spec).__doc__ or spec.kind).strip().splitlines()[0]}",
+        f"Dataset `{name}`, made by stickslip: {manifest.sample_count} samples, {manifest.valid_count} of them valid.",
+        "## Parameters",
+        f"The samples are the {_COMBINED[spec.combine]} of these axes.",
+        _table(("axis", "values", "unit and meaning"), [_axis_row(spec, *item) for item in spec.named_axes.items()]),
+        "## Splits",
+        _table(("split", "valid samples"), [(split, str(n)) for split, n in manifest.split_counts.items()]),
+        "All renders of one simulation are in the same split.",
+        "## Arrays",
+        "The first dimension of every array is `sample`; its index is the slot of the sample.",
+        _table(("array", "shape of a sample", "type", "meaning"), [_array_row(array) for array in layout(spec)]),
+        "## Rejected samples",
+        _rejected(manifest),
+        "## How it was made",
+        _table(("part", "build (SHA-256 of its code)"), list(manifest.builds.model_dump().items())),
+        _certificate(manifest),
+        f"The spec, whose digest is `{manifest.spec_digest}`:",
+        f"```json\n{json.dumps(document, indent=2)}\n```",
+        "## How to read it",
+        "Any Zarr v3 reader opens this directory:",
+        f'```python\nimport zarr\n\ngroup = zarr.open_group(".", mode="r")\nvalid = group["valid"][:]\n'
+        f'sample = group["{_telling_array(spec)}"][int(valid.argmax())]\n```',
+        "Read `valid` first: a rejected sample keeps its slot and holds fill values. The reader of stickslip checks "
+        "every file against `manifest.json` and raises an error where one is missing or damaged:",
+        '```python\nfrom stickslip_training.kinds import open_samples\n\ntrain = open_samples(".", "train")\n```',
+        "## How to check it",
+        "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every other file. "
+        "`stickslip verify .` checks all files.",
+        "## How to cite it",
+        f"Write `{name}` and the SHA-256 of `manifest.json`, which stands in `manifest.sha256`.",
+    ]
+    return ("\n\n".join(sections) + "\n").encode()
+
+
+_COMBINED = {"product": "product (every combination)", "zip": "rows (the axes go together)"}
+
+
+def _axis_row(spec: Any, name: str, axis: AnyAxis) -> tuple[str, str, str]:
+    described = {array.name: array.description for array in layout(spec)}
+    return f"`{name}`", _values(axis), described.get(name, "")
+
+
+def _values(axis: AnyAxis) -> str:
+    if not isinstance(axis, ListAxis):
+        low, high = (axis.start, axis.stop) if axis.type == "linspace" else (axis.low, axis.high)
+        return f"{axis.num} from {low:g} to {high:g} ({axis.type})"
+    shown = ", ".join(str(value) for value in axis.values[:SHOWN_VALUES])
+    return shown if axis.num <= SHOWN_VALUES else f"{shown} and {axis.num - SHOWN_VALUES} more"
+
+
+def _array_row(array: Any) -> tuple[str, str, str, str]:
+    shape = ", ".join(f"{name} {size}" for name, size in zip(array.dimensions, array.shape, strict=True)) or "one value"
+    codes = f"; codes: {', '.join(f'{code} {name}' for code, name in enumerate(array.categories))}"
+    meaning = array.description + (codes if array.categories else "")
+    return f"`{array.name}`", shape, array.dtype, meaning
+
+
+def _rejected(manifest: Manifest) -> str:
+    if not manifest.rejections:
+        return "None: every sample of the grid is valid."
+    reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
+    return _table(("reason", "samples"), [(reason, str(count)) for reason, count in reasons.most_common()])
+
+
+def _certificate(manifest: Manifest) -> str:
+    if manifest.certificate is None:
+        return "No certificate vouches for the physics of this build and preset."
+    preset = manifest.spec.certified_preset
+    return f"The certificate `{manifest.certificate}` vouches for this build and the preset `{preset}`."
+
+
+def _telling_array(spec: Any) -> str:
+    arrays = layout(spec)
+    return next((array.name for array in arrays if array.per_sample), arrays[0].name)
+
+
+def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [header, tuple("---" for _ in header), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
