@@ -33,6 +33,7 @@ RELATIONS = (
     "error must be the largest of the curves",
     "passed must say whether",
     "x, measured, master and errors must have one length",
+    "dense_x and dense_master must have",
     "every protocol must be there once",
     "all protocols must have been run with one build",
 )

@@ -188,7 +188,7 @@ def test_png_and_plot_hold_what_they_are_given() -> None:
     rows = np.frombuffer(zlib.decompress(data[start : start + length]), dtype=np.uint8).reshape(2, 10)
     assert (rows[:, 0] == 0).all()
     assert (rows[:, 1:].reshape(2, 3, 3) == pixels).all()
-    plot = line_plot([0.0, 1.0, 2.0], {"a<b": [1.0, float("nan"), 3.0]}, x_name="t", y_name="y")
+    plot = line_plot({"a<b": [(0.0, 1.0), (1.0, float("nan")), (2.0, 3.0)]}, x_name="t", y_name="y")
     assert plot.count(",") >= 2
     assert "a&lt;b" in plot
     assert "nan" not in plot

@@ -11,7 +11,9 @@ import pytest
 
 from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
 from stickslip_sim_core.protocols import Curve, ProtocolResult, bend_twist, rod_cantilever, rod_lateral_buckling
+from stickslip_sim_core.protocols.dense import dense_master
 from stickslip_sim_core.protocols.rod_chain import extrapolated, planar_frames, round_rod, tip
+from stickslip_sim_core.reference import master_curves
 
 
 class TestBendTwist:
@@ -168,3 +170,23 @@ class TestResult:
             protocols.run("rod-cantilever", speed=1)
         with pytest.raises(ValueError, match="elements: must be a multiple of 4"):
             protocols.run("rod-cantilever", elements=33)
+
+
+class TestDenseCurves:
+    """Master curves as they are drawn: through the exact values, and smooth between them."""
+
+    def test_formulas_are_exact_and_one_point_has_a_curve(self) -> None:
+        curve = Curve({}, (2.0,), (0.2,), (float(master_curves.cantilever(np.array([2.0]))[0]),))
+        x, y = dense_master("cantilever", curve)
+        assert len(x) == 200
+        assert (x[0], x[-1]) == pytest.approx((2.0 / 1.5, 3.0))
+        np.testing.assert_allclose(y, master_curves.cantilever(x))
+
+    def test_a_smooth_curve_goes_through_the_exact_values(self) -> None:
+        ratio = (0.1, 0.02, 0.5)  # in any order
+        curve = Curve({"poisson": 0.3}, ratio, (1.0, 1.0, 1.0), (14.0, 13.0, np.nan))
+        x, y = dense_master("lateral-buckling", curve)
+        assert (x[0], x[-1]) == pytest.approx((0.02, 0.1))
+        assert (y[0], y[-1]) == pytest.approx((13.0, 14.0))
+        assert (np.diff(y) > 0).all()
+        assert [len(part) for part in dense_master("lateral-buckling", Curve({}, (1.0,), (1.0,), (2.0,)))] == [1, 1]

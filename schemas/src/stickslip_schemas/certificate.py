@@ -1,6 +1,7 @@
 """The certificate: what one build of the core, with the numbers of one preset, measured on the physical protocols.
 
-Its digest is over everything but `environment`: the same build and preset on another day give the same certificate.
+Its digest is over everything but `environment` and the densely drawn curves: the same build and preset on another day
+give the same certificate.
 """
 
 from typing import Any, Literal, Self
@@ -15,6 +16,12 @@ MAX_PAGE_CHARACTERS = 8 * 2**20
 Numbers = tuple[Float | None, ...]
 
 
+_NOT_CONTENT: Any = {
+    "environment": True,
+    "protocols": {"__all__": {"curves": {"__all__": {"dense_x", "dense_master"}}}},
+}
+
+
 class CurveReport(Document):
     """A measured curve beside its master curve; null where there is nothing to measure."""
 
@@ -23,12 +30,16 @@ class CurveReport(Document):
     measured: Numbers
     master: Numbers
     errors: Numbers = Field(description="measured over master less one; null is infinite")
+    dense_x: Numbers = Field(default=(), description="where the master curve is drawn densely; for pictures only")
+    dense_master: Numbers = ()
 
     @model_validator(mode="after")
     def _one_length(self) -> Self:
         lengths = {len(self.x), len(self.measured), len(self.master), len(self.errors)}
         if len(lengths) > 1:
             raise ValueError(f"x, measured, master and errors must have one length, and theirs are {sorted(lengths)}")
+        if len(self.dense_x) != len(self.dense_master):
+            raise ValueError("dense_x and dense_master must have one length")
         return self
 
 
@@ -75,7 +86,7 @@ class Certificate(Document):
     @property
     def digest(self) -> str:
         """Key of the content."""
-        return content_key("certificate", self.model_dump(mode="json", exclude={"environment"}))
+        return content_key("certificate", self.model_dump(mode="json", exclude=_NOT_CONTENT))
 
     @property
     def certifies(self) -> bool:

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from stickslip_schemas.certificate import Certificate, ProtocolReport
 from stickslip_schemas.keys import canonical_json, content_key
@@ -18,6 +19,7 @@ from stickslip_schemas.sources import digests, sources
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
+from stickslip_sim_core.protocols.dense import dense_master
 
 from stickslip_workers.builds import solver_build
 from stickslip_workers.certificate_page import certificate_page
@@ -50,7 +52,7 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         cpu, wall = time.process_time(), time.monotonic()
         try:
             result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
-            report = ProtocolReport.model_validate(result.as_dict())
+            report = ProtocolReport.model_validate(_with_dense_curves(result))
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
         except Exception as error:  # whatever it is, the certificate has to say so
             report = _broken_off(name, error)
@@ -82,6 +84,13 @@ def verdict(report: ProtocolReport) -> str:
         return f"broke off: {report.message}"
     error = "infinite" if report.error is None else f"{report.error:.1e}"
     return f"{'passed' if report.passed else 'FAILED'}, largest error {error} of {report.tolerance:g} allowed"
+
+
+def _with_dense_curves(result: ProtocolResult) -> dict[str, Any]:
+    document = result.as_dict()
+    for shown, curve in zip(document["curves"], result.curves, strict=True):
+        shown["dense_x"], shown["dense_master"] = (v.tolist() for v in dense_master(result.protocol, curve))
+    return document
 
 
 def _broken_off(name: str, error: Exception) -> ProtocolReport:

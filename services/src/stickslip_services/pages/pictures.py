@@ -2,7 +2,8 @@
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -25,51 +26,87 @@ def png(pixels: npt.NDArray[np.uint8]) -> bytes:
     )
 
 
+Points = Sequence[tuple[float, float]]
+
+
 def line_plot(
-    x: Sequence[float],
-    curves: dict[str, Sequence[float]],
+    curves: Mapping[str, Points],
     *,
     x_name: str,
     y_name: str,
-    dots: dict[str, Sequence[float]] | None = None,
+    dots: Mapping[str, Points] | None = None,
+    is_log: bool = False,
 ) -> Markup:
-    """Return an SVG of curves over `x`; `dots` are drawn as points. What is not finite is left out."""
-    dots = dots or {}
-    values = np.array([*curves.values(), *dots.values()], dtype=float)
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    pad = 0.06 * (high - low) or max(abs(high), 1.0) * 0.1
-    low, high = low - pad, high + pad
-    first, last = (float(min(x)), float(max(x))) if len(x) else (0.0, 1.0)
-    span = (last - first) or 1.0
+    """Return an SVG of curves of points (x, y); `dots` are drawn one by one. What is not finite is left out.
 
-    def place(at: float, value: float) -> tuple[float, float]:
-        across = _LEFT + (at - first) / span * (_WIDTH - _LEFT - _RIGHT)
-        return across, _TOP + (high - value) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
+    With `is_log`, both scales are logarithmic where all values are positive.
+    """
+    dots = dots or {}
+    values = np.array([point for line in (*curves.values(), *dots.values()) for point in line], dtype=float)
+    values = values.reshape(-1, 2)[np.isfinite(values.reshape(-1, 2)).all(axis=1)]
+    across = _Scale.of(values[:, 0], is_log=is_log, pad=0.02)
+    up = _Scale.of(values[:, 1], is_log=is_log, pad=0.06)
+    width, height = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        return _LEFT + across.share(point[0]) * width, _TOP + (1 - up.share(point[1])) * height
 
     parts = [f'<svg class="plot" role="img" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}">']
     parts.append(f"<title>{escape(y_name)} over {escape(x_name)}: {escape(', '.join([*curves, *dots]))}</title>")
-    for tick in _ticks(low, high):
-        _, y = place(first, tick)
+    for tick in up.ticks():
+        y = _TOP + (1 - up.share(tick)) * height
         parts.append(f'<line class="rule" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text class="y" x="{_LEFT - 6}" y="{y + 4:.1f}">{tick:g}</text>')
-    for tick in _ticks(first, last):
-        across, _ = place(tick, low)
-        parts.append(f'<text class="x" x="{across:.1f}" y="{_HEIGHT - 18:.1f}">{tick:g}</text>')
+    for tick in across.ticks():
+        x = _LEFT + across.share(tick) * width
+        parts.append(f'<text class="x" x="{x:.1f}" y="{_HEIGHT - 18:.1f}">{tick:g}</text>')
     parts.append(f'<text class="x" x="{_WIDTH / 2:.0f}" y="{_HEIGHT - 3:.0f}">{escape(x_name)}</text>')
-    for position, (_, line) in enumerate(curves.items()):
-        points = [place(at, value) for at, value in zip(x, line, strict=True) if np.isfinite(value)]
-        text = " ".join(f"{across:.1f},{y:.1f}" for across, y in points)
+    for position, line in enumerate(curves.values()):
+        text = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(point) for point in line if np.isfinite(point).all()))
         parts.append(f'<polyline class="line c{position % 6}" points="{text}"/>')
-    for position, (_, line) in enumerate(dots.items()):
-        for across, y in (place(at, value) for at, value in zip(x, line, strict=True) if np.isfinite(value)):
-            parts.append(f'<circle class="dot c{position % 6}" cx="{across:.1f}" cy="{y:.1f}" r="3"/>')
+    for line in dots.values():
+        for x, y in (place(point) for point in line if np.isfinite(point).all()):
+            parts.append(f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="3"/>')
     parts.append("</svg>")
     legend = "".join(
-        f'<li><span class="swatch c{position % 6}"></span>{escape(name)}</li>'
-        for position, name in enumerate(dict.fromkeys([*curves, *dots]))
+        [f'<li><span class="swatch c{position % 6}"></span>{escape(name)}</li>' for position, name in enumerate(curves)]
+        + [f'<li><span class="swatch round"></span>{escape(name)}</li>' for name in dots]
     )
     return Markup(f"<figure>{''.join(parts)}<figcaption>{escape(y_name)}<ul>{legend}</ul></figcaption></figure>")
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """One axis of a plot: the values at its ends, and whether it is logarithmic."""
+
+    low: float
+    high: float
+    is_log: bool
+
+    @classmethod
+    def of(cls, values: npt.NDArray[np.float64], *, is_log: bool, pad: float) -> "_Scale":
+        """Return a scale that holds all values, and a share `pad` more on both sides."""
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+        if is_log and low > 0.0:
+            room = (high / low) ** pad if high > low else 1.5
+            return cls(low / room, high * room, True)
+        room = pad * (high - low) or 0.1 * max(abs(high), 1.0)
+        return cls(low - room, high + room, False)
+
+    def share(self, value: float) -> float:
+        """Return where a value lies, from 0 at the lower end to 1 at the upper one."""
+        if self.is_log:
+            return float(np.log(value / self.low) / np.log(self.high / self.low))
+        return (value - self.low) / (self.high - self.low)
+
+    def ticks(self) -> list[float]:
+        """Return some round numbers between the ends."""
+        if not self.is_log or self.high < 5 * self.low:
+            return _ticks(self.low, self.high)
+        decades = range(int(np.floor(np.log10(self.low))), int(np.ceil(np.log10(self.high))) + 1)
+        factors = (1,) if len(decades) > 4 else (1, 3)
+        ticks = [factor * 10.0**decade for decade in decades for factor in factors]
+        return [tick for tick in ticks if self.low <= tick <= self.high]
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stickslip_sim_core.protocols.bend_twist import POISSON, lower_boundary, upper_boundary
+from stickslip_sim_core.protocols.dense import dense_master
 from stickslip_sim_core.protocols.result import ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import extrapolated
 from stickslip_sim_core.protocols.stick_slip import EXTENDED, SLIP, STICK
@@ -48,7 +49,7 @@ def plot(result: ProtocolResult) -> "Figure":
         label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items() if name != "mesh")
         if first := label not in drawn:
             drawn[label] = next(colours)
-            above.plot(curve.x, curve.master, color=drawn[label], label=f"master curve {label}".strip())
+            above.plot(*dense_master(result.protocol, curve), color=drawn[label], label=f"master curve {label}".strip())
         measured = "measured" if first else None
         above.plot(curve.x, curve.measured, "o", color=drawn[label], markerfacecolor="none", label=measured)
         below.plot(curve.x, np.maximum(np.abs(curve.errors), floor), "o", color=drawn[label], markersize=3)

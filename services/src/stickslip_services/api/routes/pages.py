@@ -13,7 +13,7 @@ import yaml
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 from sqlalchemy import Connection
-from stickslip_schemas.certificate import Certificate
+from stickslip_schemas.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
@@ -360,8 +360,8 @@ def _plot(data: SampleData, name: str, slot: int) -> str:
     x, x_name = np.linspace(0, 1, len(values)), "arc length over L"
     if rate is not None:
         x, x_name = np.arange(len(values)) / rate, "time [s]"
-    curves = {part: values[:, i].tolist() for i, part in enumerate(parts)}
-    return line_plot(x.tolist(), curves, x_name=x_name, y_name=f"{name}: {array.description}")
+    curves = {part: list(zip(x.tolist(), values[:, i].tolist(), strict=True)) for i, part in enumerate(parts)}
+    return line_plot(curves, x_name=x_name, y_name=f"{name}: {array.description}")
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")
@@ -437,22 +437,22 @@ def _builds(coordinator: Coordinator, connection: Connection) -> set[str]:
     return {builds.sim_core for worker in coordinator.alive_workers(connection) for builds in worker.builds.values()}
 
 
-def _curves(protocol: Any) -> Iterator[str]:
+def _curves(protocol: ProtocolReport) -> Iterator[str]:
     for curve in protocol.curves[:6]:
-        order = np.argsort([np.inf if value is None else value for value in curve.x])
-        x = [curve.x[i] for i in order if curve.x[i] is not None]
-
-        def column(values: Any, order: Any = order, curve: Any = curve) -> list[float]:
-            return [np.nan if values[i] is None else values[i] for i in order if curve.x[i] is not None]
-
+        dense = curve.dense_x, curve.dense_master
+        line = dense if curve.dense_x else (curve.x, curve.master)  # of a certificate without dense curves
         name = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
         yield line_plot(
-            x,
-            {"master curve": column(curve.master)},
-            dots={"measured": column(curve.measured)},
+            {"master curve": _known(*line)},
+            dots={"measured": _known(curve.x, curve.measured)},
             x_name=protocol.x,
             y_name=f"{protocol.y}{f' ({name})' if name else ''}",
+            is_log=True,
         )
+
+
+def _known(x: Numbers, y: Numbers) -> list[tuple[float, float]]:
+    return sorted((a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None)
 
 
 @router.get("/workers")
