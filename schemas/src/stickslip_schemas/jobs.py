@@ -104,8 +104,14 @@ class JobSpec(Document):
         default="product",
         description="product: every combination of the axes; zip: the axes have one length and go together",
     )
-    splits: Splits = Splits()
-    samples_per_shard: Int = Field(default=64, ge=1, le=4096)
+    splits: Splits = Field(default=Splits(), description="shares of the simulations in each split; they add up to 1")
+    samples_per_shard: Int = Field(
+        default=64,
+        ge=1,
+        le=4096,
+        description="samples in one file of an array",
+        json_schema_extra={"x-cost": "more samples a file: fewer files, and a longer wait for the first file of a grid"},
+    )
     seed: Seed = 0
 
     # --- what every kind says of itself ---------------------------------------------------------------------------

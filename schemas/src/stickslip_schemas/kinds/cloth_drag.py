@@ -51,8 +51,8 @@ HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_V
 class ClothDragAxes(ClothAxes):
     """What a clip of dragged cloth depends on."""
 
-    texture: TextureAxis
-    viewpoint: Annotated[ListAxis[Viewpoint], SHORTHAND]
+    texture: TextureAxis = Field(description="pattern of the cloth; those held out are to test with")
+    viewpoint: Annotated[ListAxis[Viewpoint], SHORTHAND] = Field(description="camera of the rig, by name")
     lighting: LightingAxis | None = Field(default=None, description="which lamps to draw from; by default `drawn`")
     substrate: SubstrateAxis | None = Field(default=None, description="finishes of the floor; by default `matt`")
 

@@ -36,9 +36,9 @@ class SphereViewpoint(StrEnum):
 class ClothSphereAxes(ClothAxes):
     """What a clip of cloth on a turning sphere depends on."""
 
-    angular_speed: AngularSpeedAxis
-    texture: TextureAxis
-    viewpoint: Annotated[ListAxis[SphereViewpoint], SHORTHAND]
+    angular_speed: AngularSpeedAxis = Field(description="of the sphere about its vertical axis [rad/s]")
+    texture: TextureAxis = Field(description="pattern of the cloth; those held out are to test with")
+    viewpoint: Annotated[ListAxis[SphereViewpoint], SHORTHAND] = Field(description="camera of the rig, by name")
 
 
 class ClothSphereSimulation(ClothSimulation):

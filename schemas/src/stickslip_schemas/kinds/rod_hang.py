@@ -17,7 +17,7 @@ Gamma = Annotated[
     float, quantity("Gamma"), Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness")
 ]
 Phi = Annotated[
-    float, quantity("Phi"), Field(strict=True, ge=-40, le=40, description="natural curvature times L [rad]")
+    float, quantity("Phi"), Field(strict=True, ge=-40, le=40, description="an angle over the length of the rod [rad]")
 ]
 
 _TAGGED = Field(discriminator="type")
@@ -28,9 +28,9 @@ PhiAxis = Annotated[ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolA
 class RodHangAxes(Document):
     """Non-dimensional parameters of a suspended rod [Bertails-Descoubes et al. 2018]."""
 
-    gamma: GammaAxis
-    phi0: PhiAxis
-    phi1: PhiAxis
+    gamma: GammaAxis = Field(description="weight over bending stiffness, rho A g L^3 / EI")
+    phi0: PhiAxis = Field(description="natural twist times L [rad]")
+    phi1: PhiAxis = Field(description="natural curvature times L [rad]")
 
 
 class RodHangSimulation(Simulation):
@@ -62,9 +62,13 @@ class RodHangSpec(JobSpec):
 
     kind: Literal["rod_hang"]
     axes: RodHangAxes
-    poisson: Float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio; GJ/EI = 1/(1+nu)")
+    poisson: Float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio nu; GJ/EI = 1/(1 + nu)")
     views: Literal["rod-4"] | None = Field(default="rod-4", description="camera rig; null renders nothing")
-    quality: Quality = Quality.standard
+    quality: Quality = Field(
+        default=Quality.standard,
+        description="of the pictures",
+        json_schema_extra={"x-cost": "CPU time of a view: draft 26 to 35 ms, standard 74 to 110 ms"},
+    )
 
     @property
     def certified_preset(self) -> str:

@@ -1,0 +1,129 @@
+"""Every code block of README.md and of the documentation site runs as it is printed.
+
+Python blocks of a page run one after the other in one namespace, and so do shell blocks, whose variables live on; all in a
+directory of their own with `examples/`. YAML blocks are specs: they are checked, and written to the file that their first
+line names. The service is a real one. A block after `<!-- skip: REASON -->` is not run.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from harness import STICKSLIP, Service
+from stickslip_schemas.kinds import job_spec_adapter
+
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+RUN_ELSEWHERE = {"from-four-pngs.md"}  # test_docs.py runs it, and looks at what comes out
+MOST_SKIPPED = 10
+
+_RUN = ("python", "sh", "yaml")
+_FENCE = re.compile(r"(?:<!-- skip: (?P<reason>.+?) -->\n)?^```(?P<language>\S*)\n(?P<code>.*?)^```$", re.M | re.S)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of code, and where it stands."""
+
+    language: str
+    code: str
+    line: int
+    reason: str | None
+
+
+def blocks(page: Path) -> list[Block]:
+    text = page.read_text()
+    return [
+        Block(match["language"], match["code"], text.count("\n", 0, match.start("code")), match["reason"])
+        for match in _FENCE.finditer(text)
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_block_says_what_it_is(page: Path) -> None:
+    for block in blocks(page):
+        assert block.language.startswith("{") or block.language in ("python", "sh", "yaml", "ini", "text"), block
+        assert block.reason is None or len(block.reason) > 20, block
+    outside = _FENCE.sub("", page.read_text())
+    assert "```" not in outside
+    assert not re.search(r"^\n {4}[a-z]+[.(]", outside, re.M), "an indented block of code: nobody runs it"
+
+
+def test_few_blocks_are_not_run() -> None:
+    skipped = [(page.name, block.line, block.reason) for page in PAGES for block in blocks(page) if block.reason]
+    assert len(skipped) <= MOST_SKIPPED, skipped
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A directory to run a page in."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    shutil.rmtree(tmp_path, ignore_errors=True)
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.name not in RUN_ELSEWHERE and any(b.language in _RUN for b in blocks(page))],
+    ids=lambda page: page.name,
+)
+def test_every_block_runs(
+    page: Path, service: Service, place: Path, monkeypatch: pytest.MonkeyPatch, rods: Path
+) -> None:
+    monkeypatch.setenv("STICKSLIP_URL", service.url)
+    monkeypatch.setenv("PATH", f"{STICKSLIP.parent}:{os.environ['PATH']}")
+    if page.name == "dataset.md":
+        shutil.copytree(rods, place / "my-rods")
+    names: dict[str, Any] = {"__name__": page.stem}
+    state = place / ".state"
+    state.write_text("")
+    for block in blocks(page):
+        if block.reason is not None:
+            continue
+        where = f"{page.name}, line {block.line + 1}"
+        if block.language == "python":
+            exec(compile("\n" * block.line + block.code, str(page), "exec"), names)
+        elif block.language == "sh":
+            script = f"set -euo pipefail; source {state}; set -a\n{block.code}\nexport -p > {state}\n"
+            done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=500)
+            assert done.returncode == 0, f"{where}:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+        elif block.language == "yaml":
+            job_spec_adapter.validate_python(yaml.safe_load(block.code))
+            if name := re.match(r"# (\S+\.yaml)\n", block.code):
+                (place / name[1]).write_text(block.code)
+
+
+@pytest.fixture(scope="module")
+def rods(service: Service, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of four rods, pulled."""
+    axes = {"gamma": [300, 900], "phi0": 0.2, "phi1": [6, 12]}
+    job = service.finished(service.submit({"kind": "rod_hang", "axes": axes, "quality": "draft"}))
+    target = tmp_path_factory.mktemp("rods") / "my-rods"
+    name = f"{job['dataset']['dataset']}:v1"
+    subprocess.run([STICKSLIP, "pull", name, target, "--url", service.url], check=True)
+    return target
+
+
+def test_the_reference_of_specs_is_up_to_date() -> None:
+    made = subprocess.run([sys.executable, ROOT / "tools/spec_reference.py"], capture_output=True, text=True, check=True)
+    assert made.stdout == (ROOT / "docs/spec.md").read_text(), "run: python tools/spec_reference.py > docs/spec.md"
+
+
+@pytest.mark.filterwarnings("default")
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx", reason="pip install sphinx myst-parser furo")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    pages = {page.stem for page in (tmp_path / "site").glob("*.html")}
+    assert {page.stem for page in PAGES[1:]} <= pages
