@@ -1,11 +1,11 @@
-# make demo | test | check | bench | constraints | clean. Every target sets up what it needs; a second call is quick.
+# make demo | test | check | docs | bench | constraints | clean. Every target sets up what it needs; a second call is quick.
 
 PYTHON ?= python3.11
 PY = .venv/bin/python
 BLENDER_PY = .venv-blender/bin/python
 PIP_FLAGS = --quiet --disable-pip-version-check
 
-SOURCES = $(addsuffix /src,schemas services training workers workers/blender) sim_core/python examples benchmarks
+SOURCES = $(addsuffix /src,schemas services training workers workers/blender) sim_core/python examples benchmarks tools
 # One by one: test modules of different components have the same names. The other tests are not typed.
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
@@ -19,7 +19,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_familie
   natural_from_pictures.py render_cloth.py render_trajectory.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup demo test test-parts test-service test-whole test-blender check bench constraints clean
+.PHONY: setup demo test test-parts test-service test-whole test-blender check docs bench constraints clean
 
 setup: .venv/core.stamp .venv-blender/raster.stamp
 
@@ -77,6 +77,11 @@ check: setup
 	$(PY) -m mypy $(SOURCES)
 	@for tests in $(TESTS); do $(PY) -m mypy $$tests || exit 1; done
 	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
+
+# A warning is an error; tests/test_docs_code.py does the same, and runs the code of the pages.
+docs: setup
+	$(PY) -m sphinx -W --keep-going -q -b html docs build/docs
+	@echo "build/docs/index.html"
 
 bench: setup
 	@for script in $(BENCHMARKS); do \

@@ -63,6 +63,7 @@ def test_nobody_there_is_said_at_once_and_a_restart_is_waited_for() -> None:
         answer = next(answers)
         if isinstance(answer, Exception):
             raise answer
+        assert isinstance(answer, httpx.Response)
         return answer
 
     async def use() -> None:

@@ -25,7 +25,6 @@ from stickslip_schemas.responses import (
 from stickslip_schemas.states import TaskState
 from tenacity import AsyncRetrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
-from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.client import calls
 from stickslip_services.client.calls import (
     PATIENCE_SECONDS,
@@ -47,14 +46,17 @@ class AsyncClient:
 
     def __init__(
         self,
-        url: str = DEFAULT_URL,
+        url: str | None = None,
         *,
         key: str | None = None,
         patience: float = PATIENCE_SECONDS,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        """Speak to the coordinator at `url`, with an API key: `key`, or else that in STICKSLIP_KEY, if there is one."""
-        self.url = url.rstrip("/")
+        """Speak to the coordinator at `url`, with an API key.
+
+        Without `url`, it is STICKSLIP_URL or this machine; without `key`, that in STICKSLIP_KEY, if there is one.
+        """
+        self.url = calls.coordinator_url(url)
         self.patience = patience
         self._key = key
         self._was_answered = False
