@@ -115,7 +115,9 @@ def rods(service: Service, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_reference_of_specs_is_up_to_date() -> None:
-    made = subprocess.run([sys.executable, ROOT / "tools/spec_reference.py"], capture_output=True, text=True, check=True)
+    made = subprocess.run(
+        [sys.executable, ROOT / "tools/spec_reference.py"], capture_output=True, text=True, check=True
+    )
     assert made.stdout == (ROOT / "docs/spec.md").read_text(), "run: python tools/spec_reference.py > docs/spec.md"
 
 

@@ -1,6 +1,6 @@
 """Write docs/spec.md, the reference of every key of a spec, from the models that check specs.
 
-    python tools/spec_reference.py > docs/spec.md
+python tools/spec_reference.py > docs/spec.md
 """
 
 import json

@@ -110,7 +110,9 @@ class JobSpec(Document):
         ge=1,
         le=4096,
         description="samples in one file of an array",
-        json_schema_extra={"x-cost": "more samples a file: fewer files, and a longer wait for the first file of a grid"},
+        json_schema_extra={
+            "x-cost": "more samples a file: fewer files, and a longer wait for the first file of a grid"
+        },
     )
     seed: Seed = 0
 

@@ -42,10 +42,10 @@ class PresetNotCertifiedError(StickslipError):
     def __init__(self, preset: str, sim_core: str) -> None:
         self.preset = preset
         self.rule = (
-            f"the preset needs a passing certificate for the workers' sim_core build {sim_core[:12]}: run `stickslip "
-            f"certify --preset {preset}` with that build, or say `allow_uncertified: true` in the spec"
+            f"run `stickslip certify --preset {preset}` with the workers' build {sim_core[:12]} (a few minutes; quick "
+            "certificates do not count), or write `allow_uncertified: true` in the spec"
         )
-        super().__init__(f"preset {preset!r} is not certified: {self.rule}")
+        super().__init__(f"preset {preset!r} has no passing certificate: {self.rule}")
 
 
 class UnknownWorkerError(StickslipError):

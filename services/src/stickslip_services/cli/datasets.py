@@ -9,7 +9,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColu
 
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli import wording
-from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table
+from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client import pulling
 from stickslip_services.client.http import Client, ClientError
@@ -43,7 +43,7 @@ def pull_dataset(
     target: Annotated[Path, typer.Argument(metavar="DEST", help="directory to write to")],
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Download a dataset, every file checked; what is there already is not loaded again."""
+    """Download a dataset. Every file is checked, and files that are already there are not downloaded again."""
     screen = console()
     with Client(url) as client:
         name, version = _resolve(client, dataset)
@@ -61,8 +61,9 @@ def pull_dataset(
     there = done.files - done.downloaded_files
     screen.print(
         f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files downloaded "
-        f"({wording.size(done.downloaded_bytes)}), {there} cached"
+        f"({wording.size(done.downloaded_bytes)}), {there} already there"
     )
+    say(f"{target / 'README.md'} says what it holds and how to read it. To check it again: stickslip verify {target}")
 
 
 def _resolve(client: Client, dataset: str) -> tuple[str, int]:
@@ -83,12 +84,14 @@ def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset
     screen = console()
     faults = pulling.verify(target)
     if not faults:
-        screen.print(f"{escape(str(target))}: every file is as the manifest says")
+        screen.print(f"{escape(str(target))}: every file is there, and no byte has changed")
         return
     shown = table("file", "fault", "detail")
     for fault in faults:
         shown.add_row(escape(fault.path), fault.fault, escape(fault.detail))
     screen.print(shown)
     files = "1 file is" if len(faults) == 1 else f"{len(faults)} files are"
-    screen.print(f"{files} missing, damaged or not part of the dataset. `stickslip pull` mends it.", style="red")
+    screen.print(
+        f"{files} missing, damaged or not part of the dataset. To mend it, run `stickslip pull` again.", style="red"
+    )
     raise typer.Exit(1)

@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 from rich.table import Table
+from stickslip_schemas.counting import count
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import JobDetail
@@ -32,7 +33,7 @@ SHOWN_REJECTS = 50
 
 @shows_errors
 def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """Check a spec and count what it asks for, without submitting it. Works without a coordinator, too."""
+    """Check a spec and count its samples, without submitting it. Works offline, too."""
     document = read_spec(file)
     spec = check_spec(document, file)
     try:
@@ -44,23 +45,37 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
         return _validate_offline(spec, url)
     if as_json:
         return print_json(answer)
-    cached = "unknown, as no worker has registered yet" if answer.cached_count is None else f"{answer.cached_count}"
-    shown = Table.grid(padding=(0, 2))
-    shown.add_row("samples", f"{answer.sample_count}")
-    shown.add_row("simulations", f"{answer.simulation_count}")
-    shown.add_row("tasks done already", cached)
-    shown.add_row("arrays before compression", wording.size(answer.bytes_estimate))
-    shown.add_row("spec", answer.spec_digest)
-    return console().print(shown)
+    cached = "unknown" if answer.cached_count is None else f"{answer.cached_count}"
+    shown = _counts(answer.spec)
+    shown.add_row("tasks cached", f"{cached} of {answer.task_count}")
+    if answer.stored_bytes_estimate is not None:
+        shown.add_row("size of the files, about", wording.size(answer.stored_bytes_estimate))
+    shown.add_row("certificate", answer.certificate or "none")
+    console().print(shown)
+    if answer.refusal is not None:
+        say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
+        raise typer.Exit(1)
+    return say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
 
 
 def _validate_offline(spec: JobSpec, url: str) -> None:
+    console().print(_counts(spec))
+    say(
+        f"the spec is valid. No coordinator answers at {url}, so nothing is known of cached tasks and certificates. "
+        "To start one on this machine: stickslip up"
+    )
+
+
+def _counts(spec: JobSpec) -> Table:
+    counts = count(spec)
+    splits = ", ".join(f"{split} {number}" for split, number in counts.expected_splits.items())
     shown = Table.grid(padding=(0, 2))
-    shown.add_row("samples", f"{spec.sample_count}")
+    shown.add_row("samples", f"{counts.samples} ({splits}, about)")
+    shown.add_row("simulations", f"{counts.simulations}")
+    shown.add_row("renders", f"{counts.renders}")
     shown.add_row("arrays before compression", wording.size(bytes_estimate(spec)))
-    shown.add_row("spec", spec.content_digest)
-    console().print(shown)
-    say(f"the spec is valid. No coordinator answers at {url}, so nothing is known of cached tasks and certificates")
+    shown.add_row("digest of the spec", spec.content_digest)
+    return shown
 
 
 @shows_errors
@@ -69,12 +84,13 @@ def submit(
     url: UrlOption = DEFAULT_URL,
     then_watch: Annotated[bool, typer.Option("--watch", help="watch the job until it ends")] = False,
     idempotency_key: Annotated[
-        str | None, typer.Option(help="a word of yours: the same one twice makes one job")
+        str | None, typer.Option(help="a key that you choose; two submissions with the same key make one job")
     ] = None,
 ) -> None:
     """Submit a job and print its id."""
+    document = read_spec(file)
     with Client(url) as client:
-        job = client.submit(read_spec(file), idempotency_key=idempotency_key)
+        job = client.submit(document, idempotency_key=idempotency_key)
         typer.echo(job.id)
         if not then_watch:
             say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
@@ -168,15 +184,17 @@ def watch_job(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
 
 @shows_errors
 def cancel(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
-    """Cancel a job. What is finished or published stays."""
+    """Cancel a job. Finished tasks stay cached, and published datasets stay."""
     with Client(url) as client:
         job = client.cancel(job_id)
-    console().print(f"{job.id} is {wording.state(job.state)}")
+    console().print(
+        f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: finished tasks are cached"
+    )
 
 
 @shows_errors
 def pause(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
-    """Pause a job: nothing more is started for it, and what runs finishes."""
+    """Pause a job: no further task is started, and running tasks finish."""
     with Client(url) as client:
         job = client.pause(job_id)
     console().print(f"{job.id} is {wording.state(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
@@ -184,7 +202,7 @@ def pause(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
 
 @shows_errors
 def resume(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
-    """Let a paused job go on."""
+    """Resume a paused job."""
     with Client(url) as client:
         job = client.resume(job_id)
-    console().print(f"{job.id} is {wording.state(job.state)}")
+    console().print(f"{job.id} is {wording.state(job.state)}. To watch it: stickslip watch {job.id}")

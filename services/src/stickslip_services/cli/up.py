@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from stickslip_services.addresses import DEFAULT_PORT
+from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
 from stickslip_services.cli.common import console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.http import ClientError
@@ -29,6 +29,10 @@ def require_server(command: str) -> None:
         )
 
 
+def _url_option(url: str) -> str:
+    return "" if url == DEFAULT_URL else f" --url {url}"
+
+
 @shows_errors
 def up(
     data: Annotated[Path, typer.Option(help="directory of everything: database, store, logs")] = Path("stickslip-data"),
@@ -45,8 +49,10 @@ def up(
     status = supervisor.run(
         supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher),
         on_ready=lambda url: screen.print(
-            f"stickslip is up at [bold]{url}[/] (data in {escape(str(data))}). Open it in a browser, or submit a job: "
-            f"stickslip submit SPEC.yaml --watch --url {url}\nlogs: {escape(str(data / 'logs'))}; Ctrl-C stops it"
+            f"stickslip is up. Dashboard: [bold]{url}[/]\n"
+            f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"
+            f"Data are in {escape(str(data))}, logs in {escape(str(data / 'logs'))}. "
+            "Ctrl-C stops the service; jobs go on when you start it again."
         ),
     )
     raise typer.Exit(status)

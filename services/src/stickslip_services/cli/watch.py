@@ -18,7 +18,8 @@ from stickslip_services.client.http import Client
 
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
 
-_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed, TaskState.cancelled)
+_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed)
+"""Done; a cancelled task is not."""
 
 
 class _Screen(Protocol):
@@ -103,7 +104,7 @@ class _Bars:
             notes += [f"{counted.cached} cached"] if counted.cached else []
             notes += [
                 f"{counted.counts[state]} {state}"
-                for state in (TaskState.rejected, TaskState.soft_failed, TaskState.failed)
+                for state in (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
                 if counted.counts.get(state)
             ]
             self._bars.update(self._ids[stage], total=total, completed=over, extra=", ".join(notes))

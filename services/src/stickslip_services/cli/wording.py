@@ -13,7 +13,8 @@ _COLORS = {
     JobState.failed: "red",
 }
 
-_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed, TaskState.cancelled)
+_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed)
+"""Done; a cancelled task is not."""
 
 
 def duration(seconds: float) -> str:

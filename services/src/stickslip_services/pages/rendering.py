@@ -12,7 +12,8 @@ from stickslip_schemas.states import TaskState
 
 STATIC = Path(__file__).parent / "static"
 
-_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed, TaskState.cancelled)
+_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed)
+"""Done; a cancelled task is not."""
 
 
 def render(template: str, **context: Any) -> str:
@@ -42,9 +43,11 @@ def _environment() -> Environment:
 
 
 def duration(seconds: float | None) -> str:
-    """Return a time span: 0.4 s, 9 s, 4 min, 2 h 10 min."""
+    """Return a time span: 4 ms, 0.4 s, 9 s, 4 min, 2 h 10 min."""
     if seconds is None:
         return "unknown"
+    if 0 < seconds < 0.1:
+        return f"{1000 * seconds:.2g} ms"
     if seconds < 10:
         return f"{seconds:.1f} s"
     if seconds < 90:
@@ -82,7 +85,7 @@ def ago(value: datetime) -> str:
 
 
 def over(progress: StageProgress) -> int:
-    """Return how many tasks of a stage are over."""
+    """Return how many tasks of a stage are done, whether they succeeded or not."""
     return sum(progress.counts.get(state, 0) for state in _OVER)
 
 
