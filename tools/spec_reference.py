@@ -15,9 +15,10 @@ HEAD = """# Every key of a spec
 
 <!-- Written by tools/spec_reference.py from the models that check specs; do not edit. -->
 
-A spec is a YAML or JSON document. It names a `kind` and the axes of a parameter grid. This page lists every key, with its
-range, its unit and what it costs. `stickslip validate FILE` checks a spec and counts its samples, also offline. Every CPU
-time on this page is of one core of a shared virtual AMD EPYC; [measurements](measurements.md) say how it was measured.
+A spec is a YAML or JSON document. It names a `kind` and the axes of a parameter grid. This page lists every key, with
+its range, its unit and what it costs. `stickslip validate FILE` checks a spec and counts its samples, also offline.
+Every CPU time on this page is of one core of a shared virtual AMD EPYC; [measurements](measurements.md) say how it was
+measured.
 
 ## Axes
 
@@ -29,7 +30,7 @@ Each axis of a grid has one of these forms:
 | list | `[0.1, 0.2]` | these values; no value twice |
 | linspace | `{type: linspace, start: 0, stop: 1, num: 5}` | `num` equal steps from `start` to `stop`, both included |
 | random | `{type: random, low: 0, high: 1, num: 5, seed: 0}` | `num` independent uniform values in [low, high) |
-| sobol | `{type: sobol, low: 0, high: 1, num: 5, seed: 0}` | `num` values of a scrambled Sobol sequence in [low, high) |
+| sobol | `{type: sobol, low: 0, high: 1, num: 5, seed: 0}` | `num` values of a scrambled Sobol sequence |
 
 An axis of names, such as `material`, takes one name or a list. A job has at most 1,000,000 samples.
 """

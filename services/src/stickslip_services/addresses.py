@@ -1,5 +1,6 @@
 """Where a coordinator listens, and where its clients look for it."""
 
+import os
 from ipaddress import ip_address
 
 DEFAULT_PORT = 8765
@@ -19,3 +20,8 @@ def is_loopback(host: str) -> bool:
 def http_url(host: str, port: int) -> str:
     """Return the URL of a server at `host`, a name or an address of IPv4 or IPv6."""
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def coordinator_url(url: str | None) -> str:
+    """Return where the coordinator is: at `url`, at STICKSLIP_URL, or on this machine."""
+    return (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")

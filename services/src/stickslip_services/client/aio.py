@@ -25,6 +25,7 @@ from stickslip_schemas.responses import (
 from stickslip_schemas.states import TaskState
 from tenacity import AsyncRetrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
+from stickslip_services.addresses import coordinator_url
 from stickslip_services.client import calls
 from stickslip_services.client.calls import (
     PATIENCE_SECONDS,
@@ -56,7 +57,7 @@ class AsyncClient:
 
         Without `url`, it is STICKSLIP_URL or this machine; without `key`, that in STICKSLIP_KEY, if there is one.
         """
-        self.url = calls.coordinator_url(url)
+        self.url = coordinator_url(url)
         self.patience = patience
         self._key = key
         self._was_answered = False

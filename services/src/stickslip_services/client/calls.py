@@ -34,8 +34,6 @@ from stickslip_schemas.responses import (
 )
 from stickslip_schemas.states import TaskState
 
-from stickslip_services.addresses import DEFAULT_URL
-
 T = TypeVar("T")
 
 Event = JobStateEvent | JobProgressEvent | TaskStateEvent | DatasetPublishedEvent
@@ -54,11 +52,6 @@ PATIENCE_SECONDS = 60.0
 SILENCE_SECONDS = 60.0
 """How long an event stream may be silent, whose keep-alives come every 15 s, before it is taken for dead [s]."""
 STREAM_TIMEOUT = httpx.Timeout(SILENCE_SECONDS, connect=5.0)
-
-
-def coordinator_url(url: str | None) -> str:
-    """Return where the coordinator is: at `url`, at STICKSLIP_URL, or on this machine."""
-    return (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")
 
 
 def connection_options(url: str, key: str | None) -> dict[str, Any]:

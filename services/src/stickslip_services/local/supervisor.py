@@ -267,6 +267,8 @@ def _stop_signals() -> Iterator[list[int]]:
     caught: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
+        if not caught:
+            os.write(2, b"stopping; another Ctrl-C stops at once. Jobs go on when you start the service again\n")
         caught.append(number)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

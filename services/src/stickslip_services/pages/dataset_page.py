@@ -31,7 +31,8 @@ def dataset_page(manifest: Manifest) -> str:
     maps = "".join(_map(across, up, points, lost) for across, up in combinations(axes, 2))
     title = f"{escape(manifest.dataset)}, version {manifest.version}"
     return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title><style>{_STYLE}</style></head><body>
 <h1>{title}</h1>
 <p class="rate"><b>{manifest.acceptance_rate:.2%}</b> accepted: {manifest.valid_count:,} of
 {manifest.sample_count:,} samples</p>
@@ -54,7 +55,7 @@ def _facts(manifest: Manifest) -> str:
         ("grid", " × ".join(f"{name} ({axis.num})" for name, axis in spec.named_axes.items()) + f", {spec.combine}"),
         ("valid samples", splits or "none"),
         ("files", f"{len(manifest.files):,}, {manifest.size / 1e6:,.1f} MB"),
-        ("certificate", manifest.certificate or "none: the physics of this build is not vouched for"),
+        ("certificate", manifest.certificate or "none: no certificate vouches for the physics of this build"),
         ("spec", manifest.spec_digest),
     ]
     return "<table>" + "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in rows) + "</table>"
@@ -62,7 +63,7 @@ def _facts(manifest: Manifest) -> str:
 
 def _losses(manifest: Manifest) -> str:
     if not manifest.rejections:
-        return "<p>Nothing: every sample of the grid is in the dataset.</p>"
+        return "<p>No sample was rejected.</p>"
     reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
     rows = "".join(
         f"<tr><td>{escape(reason)}</td><td>{count:,}</td><td>{count / manifest.sample_count:.2%}</td></tr>"
@@ -75,7 +76,7 @@ def _where(manifest: Manifest, maps: str) -> str:
     if not maps:
         return "The grid has fewer than two axes with more than one value: there is no map to draw."
     if not manifest.rejections:
-        return "Nowhere. Each cell of the maps is a region of the grid; none has lost a sample."
+        return "Each cell of the maps is a region of the grid. No region has lost a sample."
     return "Each cell is a region of the grid, the redder the larger the share of its samples that was rejected."
 
 
@@ -176,10 +177,13 @@ def _color(share: float) -> str:
 
 
 _STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; max-width: 68rem; margin: 2rem auto; padding: 0 1rem }
+:root { color-scheme: light dark; --ink: #1a1a1a; --quiet: #4f5863; --paper: #fff }
+@media (prefers-color-scheme: dark) { :root { --ink: #e8eeeb; --quiet: #a3b0aa; --paper: #121715 } }
+body { font: 15px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper);
+  max-width: 68rem; margin: 2rem auto; padding: 0 1rem; overflow-wrap: anywhere }
 h1 { font-size: 1.4rem } h2 { font-size: 1.1rem; margin-top: 2rem } .rate b { font-size: 2rem }
 table { border-collapse: collapse } th, td { text-align: left; padding: .2rem .9rem .2rem 0; vertical-align: top }
-th { color: #5b6470; font-weight: 500 } .maps { display: flex; flex-wrap: wrap; gap: 1rem }
-svg text { font: 11px system-ui, sans-serif; fill: #5b6470 } svg .x { text-anchor: middle } svg .y { text-anchor: end }
-rect { stroke: #fff; stroke-width: 1 }
+th { color: var(--quiet); font-weight: 500; overflow-wrap: normal } .maps { display: flex; flex-wrap: wrap; gap: 1rem }
+svg { max-width: 100%; height: auto } svg text { font: 11px system-ui, sans-serif; fill: var(--quiet) }
+svg .x { text-anchor: middle } svg .y { text-anchor: end } rect { stroke: var(--paper); stroke-width: 1 }
 """

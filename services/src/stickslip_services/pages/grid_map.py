@@ -34,7 +34,9 @@ class GridMap:
     """The cells over two axes, in a square of 100 by 100."""
 
     across: str
+    across_range: str
     up: str
+    up_range: str
     cells: tuple[Cell, ...]
 
 
@@ -60,4 +62,9 @@ def _map(across: Axis, up: Axis, points: Sequence[dict[str, Any]], states: Seque
         region = f"{across.name} {across.bounds(i)}" + (f", {up.name} {up.bounds(j)}" if up.name else "")
         name = f"{region}: {done[i, j]} of {count} done" + (f", {lost[i, j]} lost" if lost[i, j] else "")
         cells.append(Cell(i * width, 100 - (j + 1) * height, width, height, name, done[i, j] / count, lost[i, j]))
-    return GridMap(across.name, up.name, tuple(cells))
+    return GridMap(across.name, _range(across), up.name, _range(up), tuple(cells))
+
+
+def _range(axis: Axis) -> str:
+    """Return the first and the last value of an axis."""
+    return axis.labels[0] if len(axis.labels) == 1 else f"{axis.labels[0]} to {axis.labels[-1]}"

@@ -18,7 +18,7 @@ from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.responses import Dataset, DatasetVersion, JobDetail
-from stickslip_schemas.samples import grid
+from stickslip_schemas.samples import SPLITS, grid
 from stickslip_schemas.states import JobState, TaskState
 from stickslip_schemas.store import Store
 
@@ -99,8 +99,16 @@ def get_job(job_id: str, coordinator: CoordinatorDep) -> Response:
         context = _job(coordinator, connection, job_id)
     spec: JobSpec = context["job"].spec
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    return _page("job.html", here="jobs", spec=text, url=coordinator.settings.url, **context)
+    document["axes"] = {name: _short_form(axis) for name, axis in document["axes"].items()}
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return _page("job.html", here="jobs", spec=text, **context)
+
+
+def _short_form(axis: dict[str, Any]) -> Any:
+    """Return an axis as people write it: a list, or its only value."""
+    if axis["type"] != "list":
+        return axis
+    return axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
 
 
 @router.get("/ui/jobs/{job_id}")
@@ -122,6 +130,7 @@ def _job(coordinator: Coordinator, connection: Connection, job_id: str) -> dict[
         "rejected": rejected,
         "failed": failed_tasks(connection, seq, coordinator.settings, SHOWN_LOST),
         "states": JobState,
+        "url": coordinator.settings.url,
     }
 
 
@@ -215,6 +224,8 @@ def get_version(request: Request, dataset: str, version: Version, coordinator: C
         manifest=data.manifest,
         sliders=_sliders(data.manifest.spec),
         histograms=_histograms(data),
+        splits=SPLITS,
+        card=next((file.path for file in data.manifest.files if file.path == "README.md"), None),
         url=coordinator.settings.url,
         **context,
     )
@@ -274,6 +285,7 @@ def _thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str,
         "chosen": len(chosen),
         "next_start": start + SHOWN_THUMBS if start + SHOWN_THUMBS < len(chosen) else None,
         "kept_query": keep,
+        "varying": {axis["name"] for axis in _sliders(data.manifest.spec)},
         "pictured": _pictured(data),
         "picture_index": _telling_picture(data),
     }
@@ -297,7 +309,8 @@ def _histograms(data: SampleData) -> list[dict[str, Any]]:
     shown = []
     for name, array in data.arrays.items():
         is_axis = name in data.manifest.spec.named_axes
-        if array.shape or is_axis or array.per_sample or array.dtype == "bool" or name in ("split", "valid"):
+        is_number = not (array.dtype == "bool" or name in ("split", "valid") or name.endswith("_seed"))
+        if array.shape or is_axis or array.per_sample or not is_number:
             continue
         values = np.asarray(data.label(name), dtype=float)
         values = values[np.isfinite(values) & valid]
@@ -346,6 +359,8 @@ def _sample(data: SampleData, slot: int) -> dict[str, Any]:
             plots.append(_plot(data, name, slot))
         elif len(array.shape) <= 1 and name != "sample_key" and (not array.shape or array.shape[0] <= 8):
             labels[name] = (data.named(array, data.read(name, slot)), array.description)
+    axes = [name for name in data.manifest.spec.named_axes if name in labels]
+    labels = {name: labels[name] for name in (*axes, *(name for name in labels if name not in axes))}
     return {"pictures": pictures, "plots": plots, "shapes": shapes, "labels": labels}
 
 
