@@ -62,7 +62,7 @@ def register(
 
 
 def _say_registered(entry: CertificateEntry, url: str) -> None:
-    console().print(f"certificate {entry.digest} is registered: {url.rstrip('/')}{entry.page}")
+    console().print(f"certificate {entry.digest} is registered: {url.rstrip('/')}/certificates/{entry.digest}")
 
 
 @shows_errors

@@ -62,7 +62,11 @@ def line_plot(
         parts.append(f'<text class="x" x="{x:.1f}" y="{_HEIGHT - 18:.1f}">{tick:g}</text>')
     parts.append(f'<text class="x" x="{_WIDTH / 2:.0f}" y="{_HEIGHT - 3:.0f}">{escape(x_name)}</text>')
     for position, line in enumerate(curves.values()):
-        text = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(point) for point in line if np.isfinite(point).all()))
+        known = [place(point) for point in line if np.isfinite(point).all()]
+        if len(known) == 1:  # one value of it is known: a short stroke
+            ((x, y),) = known
+            known = [(x - 12, y), (x + 12, y)]
+        text = " ".join(f"{x:.1f},{y:.1f}" for x, y in known)
         parts.append(f'<polyline class="line c{position % 6}" points="{text}"/>')
     for line in dots.values():
         for x, y in (place(point) for point in line if np.isfinite(point).all()):
@@ -88,9 +92,10 @@ class _Scale:
         """Return a scale that holds all values, and a share `pad` more on both sides."""
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
         if is_log and low > 0.0:
-            room = (high / low) ** pad if high > low else 1.5
+            room = max((high / low) ** pad, 1.005) if high > low else 1.5
             return cls(low / room, high * room, True)
-        room = pad * (high - low) or 0.1 * max(abs(high), 1.0)
+        # A scale is never so fine that its numbers look the same.
+        room = max(pad * (high - low), 0.005 * max(abs(low), abs(high))) or 0.1
         return cls(low - room, high + room, False)
 
     def share(self, value: float) -> float:
