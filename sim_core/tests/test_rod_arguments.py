@@ -18,7 +18,6 @@ GOOD = {"gamma": [100.0, 200.0], "phi0": [1.0, 2.0], "phi1": [6.0, 7.0]}
         ([1.0, np.nan], r"must be finite, got nan at index 1"),
         ([np.inf, 1.0], r"must be finite, got inf at index 0"),
         ([[1.0, 2.0]], r"must be one-dimensional, got shape \(1, 2\)"),
-        (1.0, r"must be one-dimensional, got shape \(\)"),
         (["a", "b"], r"must be real numbers, got dtype <U1"),
         ([1j, 2.0], r"must be real numbers, got dtype complex128"),
         ([1.0, 2.0, 3.0], r"lengths must be equal, got "),
@@ -101,3 +100,9 @@ def test_other_threads_run_meanwhile() -> None:
     finished.set()
     thread.join()
     assert progress > 1000
+
+
+def test_numbers_are_a_single_rod() -> None:
+    one, same = solve_rods(500, 4, 12), solve_rods([500.0], [4.0], [12.0])
+    assert one.centerline.shape == (1, 150, 3)
+    assert (one.centerline == same.centerline).all()

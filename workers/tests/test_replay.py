@@ -42,3 +42,11 @@ def test_describe_names_the_builds(capsys: pytest.CaptureFixture[str]) -> None:
     assert described["builds"].keys() == KINDS.keys()
     for builds in described["builds"].values():
         assert {stage: len(digest) for stage, digest in builds.items()} == {"sim_core": 64, "simulate": 64, "pack": 64}
+
+
+def test_a_task_that_is_none_is_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(tmp_path / "nope.json"), "--store", str(tmp_path)]) == 2
+    assert "nope.json cannot be read: No such file" in capsys.readouterr().err
+    (tmp_path / "other.json").write_text("{}")
+    assert main(["replay", str(tmp_path / "other.json"), "--store", str(tmp_path)]) == 2
+    assert "other.json is not a task" in capsys.readouterr().err

@@ -82,3 +82,11 @@ def test_both_a_time_and_epochs_is_a_mistake(rods, tmp_path):
     )
     assert result.exit_code == 1
     assert "exactly one of minutes and epochs must be given" in result.stderr
+
+
+@pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="this torch has CUDA")
+def test_a_device_that_torch_cannot_use_is_said_in_a_line(rods, tmp_path):
+    result = runner.invoke(app, ["curvature", str(rods.root), "--out", str(tmp_path / "out"), "--device", "cuda"])
+    assert result.exit_code == 1
+    assert "device must be one that this torch can use" in result.output
+    assert "Traceback" not in result.output

@@ -8,6 +8,7 @@ import signal
 import sys
 from pathlib import Path
 
+from pydantic import ValidationError
 from stickslip_schemas.tasks import task_adapter
 
 from stickslip_workers.coordinator_client import CoordinatorError
@@ -37,7 +38,9 @@ def main(arguments: list[str] | None = None) -> int:
     certify = commands.add_parser("certify", help="run the physical protocols of a preset with this build")
     certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
     certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json and certificate.html")
-    certify.add_argument("--quick", action="store_true", help="a few points only; certifies nothing")
+    certify.add_argument(
+        "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
+    )
 
     commands.add_parser("describe", help="print the builds of this environment")
 
@@ -102,8 +105,16 @@ def _dispatch(options: argparse.Namespace) -> int:
 def _replay(options: argparse.Namespace) -> int:
     from stickslip_workers.replay import replay
 
+    try:
+        task = task_adapter.validate_json(options.task.read_bytes())
+    except OSError as error:
+        sys.stderr.write(f"error: {options.task} cannot be read: {error.strerror}\n")
+        return 2
+    except ValidationError as error:
+        sys.stderr.write(f"error: {options.task} is not a task as GET /v1/tasks/ID returns it: {error}\n")
+        return 2
     result = replay(
-        task_adapter.validate_json(options.task.read_bytes()),
+        task,
         store=options.store,
         blender_python=options.blender_python.absolute(),
     )

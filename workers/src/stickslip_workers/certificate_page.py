@@ -29,7 +29,7 @@ def certificate_page(certificate: Certificate, results: Sequence[ProtocolResult]
         "<p>What this build of the simulator measures on physical protocols, against their master curves.</p>",
     ]
     if certificate.extent == "quick":
-        parts.append('<p class="failed">A quick look with few points: it certifies nothing.</p>')
+        parts.append('<p class="failed">A quick run over a few points: it does not count as a certificate.</p>')
     parts += [
         _facts(
             {

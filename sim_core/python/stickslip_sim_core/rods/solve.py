@@ -68,7 +68,7 @@ def solve_rods(
     depend on its own three numbers and the settings only, not on the batch.
 
     Args:
-        gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0.
+        gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0; one number is a single rod.
         phi0: Natural twist times L [rad], shape (n,).
         phi1: Natural bend about d3 times L [rad], shape (n,).
         poisson: Poisson's ratio [-], in (-1, 0.5].
@@ -94,8 +94,8 @@ def solve_rods(
 
 
 def _finite_vector(name: str, values: ArrayLike) -> Floats:
-    """Return `values` as contiguous float64 of shape (n,)."""
-    vector = np.asarray(values)
+    """Return `values`, or a single number, as contiguous float64 of shape (n,)."""
+    vector = np.atleast_1d(values)
     if vector.ndim != 1:
         raise ValueError(f"{name}: must be one-dimensional, got shape {vector.shape}")
     return finite_array(name, vector, (None,))

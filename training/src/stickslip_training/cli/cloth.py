@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.cli.errors import DatasetArgument, check_device, errors_told
 from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def train(
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
     with errors_told():
-        settings = ClothTraining(steps=steps, seed=seed, threads=threads, device=device)
+        settings = ClothTraining(steps=steps, seed=seed, threads=threads, device=check_device(device))
         source, parts = _splits(runs, split_seed)
         source["split_seed"] = split_seed
         model = train_friction(

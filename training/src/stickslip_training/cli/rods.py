@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.cli.errors import DatasetArgument, check_device, errors_told
 from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def curvature(
             seed=seed,
             batch_size=batch_size,
             threads=threads,
-            device=device,
+            device=check_device(device),
         )
         report = train_curvature(config, resume=resume, on_epoch=tell)
         console.print(_results(report))
