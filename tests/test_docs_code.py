@@ -114,6 +114,16 @@ def rods(service: Service, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+def test_the_code_of_a_dataset_card_runs(rods: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(rods)
+    names: dict[str, Any] = {}
+    for block in blocks(rods / "README.md"):
+        if block.language == "python":
+            exec(block.code, names)
+    assert names["sample"].shape == (4, 224, 224, 3)
+    assert names["train"].kind == "rod_hang"
+
+
 def test_the_reference_of_specs_is_up_to_date() -> None:
     made = subprocess.run(
         [sys.executable, ROOT / "tools/spec_reference.py"], capture_output=True, text=True, check=True

@@ -64,6 +64,7 @@ def test_counts_are_those_of_the_grid(document: dict[str, Any]) -> None:
     assert counts.simulations == len({point.simulation_key for point in points})
     assert counts.renders == len({point.render_key for point in points if point.render_key is not None})
     assert counts.shards == -(-len(points) // spec.samples_per_shard)
+    assert sum(counts.expected_splits.values()) == counts.samples
     assert counts.tasks == counts.simulations + counts.renders + counts.shards + 1
 
 

@@ -80,7 +80,7 @@ def test_a_cancelled_job_is_no_success(cli: Any, tmp_path: Path, shared_server: 
     assert "cancelled" in cli("cancel", job).stdout
     watched = cli("watch", job)
     assert watched.exit_code == 1
-    assert "is cancelled" in watched.stdout
+    assert ": cancelled" in watched.stdout
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_watching_survives_a_restart_of_the_coordinator(tmp_path: Path) -> None:
     watching.join(30)
     again.stop()
     assert results[0].exit_code == 0, results[0].output
-    assert results[0].stdout.count("is succeeded") == 1
+    assert results[0].stdout.count(": succeeded\n") == 1
 
 
 def test_pausing_and_resuming(cli: Any, tmp_path: Path, shared_server: RunningServer) -> None:

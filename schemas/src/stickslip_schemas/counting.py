@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import pairwise
 from math import ceil, prod
 
 import numpy as np
@@ -37,13 +38,14 @@ def count(spec: JobSpec) -> Counts:
     """
     physical = _axes_of(spec, spec.simulation_type, spec.simulation_seeds)
     seen = physical | _axes_of(spec, spec.render_type, spec.render_seeds)
-    shares = (spec.splits.train, spec.splits.validation, spec.splits.test)
+    bounds = [0.0, spec.splits.train, spec.splits.train + spec.splits.validation, 1.0]
+    ends = [round(bound * spec.sample_count) for bound in bounds]
     return Counts(
         samples=spec.sample_count,
         simulations=_distinct(spec, physical),
         renders=0 if spec.render_settings() is None else _distinct(spec, seen),
         shards=ceil(spec.sample_count / spec.samples_per_shard),
-        expected_splits={name: round(share * spec.sample_count) for name, share in zip(SPLITS, shares, strict=True)},
+        expected_splits={name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(ends), strict=True)},
     )
 
 

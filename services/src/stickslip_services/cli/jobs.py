@@ -53,8 +53,7 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
     shown.add_row("certificate", answer.certificate or "none")
     console().print(shown)
     if answer.refusal is not None:
-        say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
-        raise typer.Exit(1)
+        return say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
     return say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
 
 

@@ -45,7 +45,7 @@ def _follow(client: Client, job_id: str, console: Console, state: JobState) -> J
                     screen.progress(event.progress)
                 case JobStateEvent():
                     state = event.state
-                    screen.line(f"{job_id} is {wording.state(state)}{_because(event.message)}")
+                    screen.line(f"{job_id}: {wording.state(state)}{_because(event.message)}")
                 case TaskStateEvent():
                     screen.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
                 case DatasetPublishedEvent():
