@@ -35,7 +35,7 @@ class SolverSettings:
     refactor_after: int = 15
     """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
 
-    flips_max: int = 32
+    flips_max: int = 4
     """Contacts that may change between open, stick and slip before the factor is made anew."""
 
     patience: int = 10
