@@ -2,15 +2,18 @@
 
 Python blocks of a page run one after the other in one namespace, and so do shell blocks, whose variables live on;
 all in a directory of their own with `examples/`. YAML blocks are specs: they are checked, and written to the file that
-their first line names. The service is a real one. A block after `<!-- skip: REASON -->` is not run.
+their first line names. What a comment after `print(...)` promises must be printed. The service is a real one. A block
+after `<!-- skip: REASON -->` is not run.
 """
 
+import io
 import os
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,7 +95,12 @@ def test_every_block_runs(
             continue
         where = f"{page.name}, line {block.line + 1}"
         if block.language == "python":
-            exec(compile("\n" * block.line + block.code, str(page), "exec"), names)
+            printed = io.StringIO()
+            with redirect_stdout(printed):
+                exec(compile("\n" * block.line + block.code, str(page), "exec"), names)
+            for promised in re.findall(r"print\(.*\)  # (.+)", block.code):
+                start = promised.removesuffix(" ...")
+                assert any(line.startswith(start) for line in printed.getvalue().splitlines()), (where, promised)
         elif block.language == "sh":
             script = f"set -euo pipefail; source {state}; set -a\n{block.code}\nexport -p > {state}\n"
             done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=500)
