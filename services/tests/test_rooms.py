@@ -69,7 +69,7 @@ ALLOWED = {
     "api": {"queue", "catalog", "database", "pages"},
     "client": set(),
     "local": set(),
-    "cli": {"client", "local"},
+    "cli": {"client", "local", "database"},
 }
 """Which rooms the modules of a room may import, besides their own and the single modules beside the rooms."""
 

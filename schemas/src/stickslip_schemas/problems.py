@@ -17,6 +17,7 @@ class ProblemCode(StrEnum):
     malformed_body = "malformed_body"
     body_too_large = "body_too_large"
     unauthorized = "unauthorized"
+    scope_missing = "scope_missing"
     host_not_allowed = "host_not_allowed"
     origin_not_allowed = "origin_not_allowed"
     not_found = "not_found"

@@ -27,12 +27,13 @@ from starlette.staticfiles import StaticFiles
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
-from stickslip_services.api.doors import DoorMiddleware, worker_key
+from stickslip_services.api.doors import DoorMiddleware, KeyMiddleware
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, workers
 from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.keys import KeyRing, local_worker_key
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
 from stickslip_services.pages.rendering import STATIC
@@ -75,14 +76,15 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     )
     app.state.coordinator = coordinator
     app.state.metrics = metrics
-    app.state.worker_key = worker_key(settings.worker_key_path)
+    app.state.worker_key = local_worker_key(settings.worker_key_path)
     for module in (jobs, datasets, certificates, tasks, workers, health, pages):
         app.include_router(module.router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
-    app.add_middleware(DoorMiddleware, allowed_hosts=settings.allowed_hosts)
+    app.add_middleware(KeyMiddleware, ring=KeyRing(coordinator.database), required=settings.keys_required)
+    app.add_middleware(DoorMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
     app.add_middleware(RequestIdMiddleware)
     app.add_middleware(TimingMiddleware, observe=metrics.observe)
     return app
@@ -125,6 +127,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")
+    parser.add_argument("--allow-host", action="append", dest="allowed_hosts", help="name to be asked by; repeatable")
+    parser.add_argument("--require-keys", action="store_true", default=None, help="no request without a key")
+    parser.add_argument("--behind-proxy", action="store_true", default=None, help="a proxy in front speaks TLS")
+    parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
+    parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
@@ -145,7 +152,14 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     settings = settings.model_copy(update={"port": listener.getsockname()[1]})
     config = uvicorn.Config(
-        make_app(settings), log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS, lifespan="on"
+        make_app(settings),
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=GRACE_SECONDS,
+        lifespan="on",
+        proxy_headers=False,
+        ssl_certfile=settings.tls_certificate,
+        ssl_keyfile=settings.tls_key,
     )
     server = _Server(config, settings.url)
     server.run(sockets=[listener])

@@ -6,7 +6,7 @@ from typing import Self
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback
+from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback, reachable
 
 
 class Settings(BaseSettings):
@@ -22,7 +22,15 @@ class Settings(BaseSettings):
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 
     allowed_hosts: tuple[str, ...] = ()
-    """Names, besides those of loopback, under which the coordinator may be asked: those of a proxy on this machine."""
+    """Names, besides those of loopback and `host`, under which the coordinator may be asked."""
+    require_keys: bool = False
+    """Whether every request needs a key. Always so where others than this machine can send some."""
+    behind_proxy: bool = False
+    """Whether a proxy in front of the coordinator speaks TLS to the world. Requests then need keys."""
+    tls_certificate: Path | None = None
+    """File with the certificate, and its chain, with which the coordinator speaks TLS itself."""
+    tls_key: Path | None = None
+    """File with the private key of `tls_certificate`."""
 
     durable: bool = True
     """Wait for the disk at each commit. Without it a power cut may lose what was accepted; for tests."""
@@ -42,13 +50,25 @@ class Settings(BaseSettings):
     """The largest request body that is read [bytes]."""
 
     @model_validator(mode="after")
-    def _loopback_only(self) -> Self:
-        if not is_loopback(self.host):
+    def _closed_to_strangers(self) -> Self:
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key must be given together; one of them is missing")
+        for name in ("tls_certificate", "tls_key"):
+            path: Path | None = getattr(self, name)
+            if path is not None and not path.is_file():
+                raise ValueError(f"{name} must be a file, and {path} is none")
+        if not (is_loopback(self.host) or self.tls_certificate or self.behind_proxy):
             raise ValueError(
-                f"host must be a loopback address, because this version has no API keys and anyone who reaches the "
-                f"port may submit and cancel jobs; it is {self.host!r}. Use 127.0.0.1, and an SSH tunnel from afar."
+                f"host must be a loopback address unless the coordinator speaks TLS or a proxy does it, because keys "
+                f"would be readable on the way; it is {self.host!r}. Give --tls-certificate and --tls-key, or "
+                "--behind-proxy, or use 127.0.0.1 and an SSH tunnel."
             )
         return self
+
+    @property
+    def keys_required(self) -> bool:
+        """Whether a request without a key is refused, whatever it asks for."""
+        return self.require_keys or self.behind_proxy or self.tls_certificate is not None or not is_loopback(self.host)
 
     @property
     def database_path(self) -> Path:
@@ -67,5 +87,5 @@ class Settings(BaseSettings):
 
     @property
     def url(self) -> str:
-        """Where the coordinator can be reached."""
-        return http_url(self.host, self.port)
+        """Where the coordinator can be reached from this machine."""
+        return http_url(reachable(self.host), self.port, tls=self.tls_certificate is not None)

@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
@@ -364,9 +364,10 @@ def serving(app: FastAPI) -> Iterator[str]:
         listener.close()
 
 
-def start_server(data: Path, port: int = 0) -> RunningServer:
+def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> RunningServer:
     """Start a coordinator and wait until it answers."""
     command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", str(port)]
+    command += options
     log = (data.parent / f"{data.name}.log").open("ab")
     with log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)

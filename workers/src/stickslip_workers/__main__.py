@@ -25,6 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     dispatch.add_argument("--store", type=Path, required=True, help="root of the store")
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
+    dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
     dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
     dispatch.add_argument("--ray-address", help="an existing Ray cluster (default: a cluster of its own)")
     dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
@@ -68,6 +69,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         store=options.store,
         name=options.name,
         key=None if options.key_file is None else options.key_file.read_text(encoding="ascii").strip(),
+        tls_certificate=options.tls_certificate,
         slots=options.slots,
         ray_address=options.ray_address,
         # Not resolved: a virtual environment is known by the path of its link.

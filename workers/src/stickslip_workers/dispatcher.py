@@ -107,7 +107,7 @@ class Dispatcher:
             )
         )
         self._store = Store(settings.store)
-        self._coordinator = CoordinatorClient(settings.url, settings.key)
+        self._coordinator = CoordinatorClient(settings.url, settings.key, settings.tls_certificate)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
         self._heartbeat: HeartbeatThread | None = None

@@ -21,6 +21,8 @@ class Settings:
     """Name of this dispatcher; a second one of the same name takes the first one's place."""
     key: str | None = None
     """What the coordinator wants to be shown by workers; None where it wants nothing."""
+    tls_certificate: Path | None = None
+    """The coordinator's own certificate, which is then trusted by itself; None: certificates are checked as usual."""
     slots: int | None = None
     """How many tasks run at once; by default the CPUs of the cluster."""
     ray_address: str | None = None

@@ -32,6 +32,13 @@ def describe(app: FastAPI) -> dict[str, Any]:
     if not app.openapi_schema:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = document.setdefault("components", {}).setdefault("schemas", {})
+        document["components"]["securitySchemes"] = {
+            "key": {
+                "type": "http",
+                "scheme": "bearer",
+                "description": "an API key, as `stickslip keys create` makes it",
+            }
+        }
         for name, schema in body_components(_DOCUMENTS).items():
             components.setdefault(name, schema)
         _drop_foreign_errors(document)

@@ -9,6 +9,7 @@ from stickslip_services import __version__
 from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import datasets, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, resume, show, submit, validate, watch_job
+from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.up import up
 from stickslip_services.cli.workers import workers
 
@@ -49,3 +50,5 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 
 for _name, _command in _COMMANDS.items():
     app.command(name=_name)(_command)
+
+app.add_typer(keys, name="keys")

@@ -1,7 +1,9 @@
 """A client of the coordinator: typed answers, problems as exceptions, patience while a coordinator restarts."""
 
 import json
+import os
 import secrets
+import ssl
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -87,17 +89,28 @@ class Client:
         self,
         url: str = DEFAULT_URL,
         *,
+        key: str | None = None,
         patience: float = PATIENCE_SECONDS,
         transport: httpx.BaseTransport | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        """Speak to the coordinator at `url`, with an API key: `key`, or else that in STICKSLIP_KEY, if there is one."""
         self.url = url.rstrip("/")
         self.patience = patience
         self._sleep = sleep
         self._was_answered = False
         """A coordinator that has answered once may be restarting; one that never has is not there."""
+        key = key or os.environ.get("STICKSLIP_KEY")
+        # A proxy of the environment is for the world outside. SSL_CERT_FILE counts: a coordinator's certificate may
+        # be of an authority that only this machine trusts.
+        authorities = os.environ.get("SSL_CERT_FILE")
         self._http = httpx.Client(
-            base_url=self.url, timeout=httpx.Timeout(60.0, connect=5.0), transport=transport, trust_env=False
+            base_url=self.url,
+            timeout=httpx.Timeout(60.0, connect=5.0),
+            headers={} if key is None else {"Authorization": f"Bearer {key}"},
+            verify=ssl.create_default_context(cafile=authorities) if authorities and url.startswith("https") else True,
+            transport=transport,
+            trust_env=False,
         )
 
     def __enter__(self) -> Self:

@@ -35,6 +35,7 @@ from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.keys import admit_local_worker
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.events import set_job_state
@@ -97,6 +98,7 @@ class Coordinator:
         """Bring the database up to date and take up the work where it was left."""
         with self.database.write() as connection:
             migrate.upgrade(connection)
+            admit_local_worker(connection, self.settings.worker_key_path, self.clock())
             renew_all_leases(connection, self.clock(), self.settings)
         self.plan_waiting_jobs()
 

@@ -30,8 +30,8 @@ PageDep = Annotated[PageRequest, Depends(_page)]
 
 _TITLES = {
     400: "The body is not JSON",
-    401: "The key is missing or wrong",
-    403: "The request comes under a foreign name, or from a page of another site",
+    401: "The key is missing or not known",
+    403: "The key lacks the scope, or the request comes under a foreign name or from a page of another site",
     404: "There is no such thing",
     409: "It cannot be done in the state that the thing is in",
     413: "The body is too large",
@@ -44,11 +44,14 @@ _TITLES = {
 
 BODY_PROBLEMS = (400, 413, 415, 422)
 
+KEYED: dict[str, Any] = {"security": [{"key": []}]}
+"""What OpenAPI says of a route that needs a key, also on loopback."""
+
 
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return what OpenAPI says of the problems that a route may answer with."""
     schema = {"$ref": "#/components/schemas/Problem"}
     return {
         status: {"description": _TITLES[status], "content": {MEDIA_TYPE: {"schema": schema}}}
-        for status in sorted({*statuses, 403, 500, 503})
+        for status in sorted({*statuses, 401, 403, 500, 503})
     }

@@ -1,6 +1,6 @@
 """The worker API: a dispatcher registers, leases tasks, says that it lives, and reports."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Response
 from stickslip_schemas.responses import WorkerEntry
@@ -16,14 +16,11 @@ from stickslip_schemas.worker_api import (
 )
 
 from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.doors import require_worker_key
-from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses
+from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.workers import show_workers
 
 router = APIRouter(tags=["workers"])
-
-_KEY: dict[str, Any] = {"dependencies": [Depends(require_worker_key)]}
 
 CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
@@ -37,10 +34,9 @@ def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
 
 @router.post(
     "/v1/workers",
-    **_KEY,
     status_code=201,
-    responses=problem_responses(401, *BODY_PROBLEMS),
-    openapi_extra=body_schema("WorkerRegistration"),
+    responses=problem_responses(*BODY_PROBLEMS),
+    openapi_extra=body_schema("WorkerRegistration") | KEYED,
 )
 def post_worker(
     registration: Annotated[WorkerRegistration, Depends(JsonBody(WorkerRegistration))], coordinator: CoordinatorDep
@@ -51,10 +47,9 @@ def post_worker(
 
 @router.post(
     "/v1/worker/lease",
-    **_KEY,
     response_model=LeaseBatch,
-    responses=problem_responses(401, 404, 409, *BODY_PROBLEMS),
-    openapi_extra=body_schema("LeaseRequest"),
+    responses=problem_responses(404, 409, *BODY_PROBLEMS),
+    openapi_extra=body_schema("LeaseRequest") | KEYED,
 )
 def post_lease(
     request: Annotated[LeaseRequest, Depends(JsonBody(LeaseRequest))], coordinator: CoordinatorDep
@@ -66,9 +61,8 @@ def post_lease(
 
 @router.post(
     "/v1/worker/heartbeat",
-    **_KEY,
-    responses=problem_responses(401, 404, *BODY_PROBLEMS),
-    openapi_extra=body_schema("Heartbeat"),
+    responses=problem_responses(404, *BODY_PROBLEMS),
+    openapi_extra=body_schema("Heartbeat") | KEYED,
 )
 def post_heartbeat(
     heartbeat: Annotated[Heartbeat, Depends(JsonBody(Heartbeat))], coordinator: CoordinatorDep
@@ -79,9 +73,8 @@ def post_heartbeat(
 
 @router.post(
     "/v1/worker/report",
-    **_KEY,
-    responses=problem_responses(401, 404, *BODY_PROBLEMS),
-    openapi_extra=body_schema("ReportBatch"),
+    responses=problem_responses(404, *BODY_PROBLEMS),
+    openapi_extra=body_schema("ReportBatch") | KEYED,
 )
 def post_report(
     batch: Annotated[ReportBatch, Depends(JsonBody(ReportBatch))], coordinator: CoordinatorDep
