@@ -126,7 +126,7 @@ def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -
     start()
     double.offer(full=_render(fake_renderer.DISK_FULL), bug=_render(fake_renderer.BUG), fine=_render(0))
     double.until(lambda: len(double.results) == 3)
-    assert double.results["full"].reason is Reason.storage_error
+    assert double.results["full"].reason is Reason.store_unavailable
     assert "No space left on device" in double.results["full"].message
     assert double.results["bug"].reason is Reason.internal_error
     assert "a bug" in double.results["bug"].message

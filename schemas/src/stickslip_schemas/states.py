@@ -66,6 +66,7 @@ class Reason(StrEnum):
     oom_killed = "oom_killed"
     renderer_crash = "renderer_crash"
     storage_error = "storage_error"
+    store_unavailable = "store_unavailable"
     internal_error = "internal_error"
     # The sample itself: deterministic, never retried.
     solver_diverged = "solver_diverged"

@@ -44,6 +44,8 @@ class Settings(BaseSettings):
     """Time between two looks at expired leases and due retries [s]."""
     lease_limit: int = Field(default=1000, ge=1)
     """The most tasks of one stage that one request is granted."""
+    min_free_bytes: int = Field(default=256 * 2**20, ge=0)
+    """Space that must stay free on the disks of store and database [bytes]; jobs are paused where less is left."""
     previews_per_job: int = Field(default=24, ge=0)
     """How many samples of a job, evenly spread over its slots, are rendered with a preview."""
     body_limit: int = Field(default=16 * 2**20, ge=1024)

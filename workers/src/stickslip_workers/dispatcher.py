@@ -31,7 +31,7 @@ from stickslip_workers.kinds import kind, kind_names
 from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import Settings
-from stickslip_workers.stages.run import AnyTask, damaged_inputs
+from stickslip_workers.stages.run import AnyTask, with_damaged_inputs
 from stickslip_workers.together import apart, together, trace_of
 
 log = logging.getLogger(__name__)
@@ -212,10 +212,7 @@ class Dispatcher:
                 log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
                 pool.note_death(assignment.process)
             result = process_failure(error, renders=assignment.stage is Stage.render)
-            results = [
-                result.model_copy(update={"damaged_inputs": damaged_inputs(lease.task, self._store)})
-                for lease in assignment.leases
-            ]
+            results = [with_damaged_inputs(result, lease.task, self._store) for lease in assignment.leases]
         else:
             pool.give_back(assignment.process, resident)
             results = _read_results(answer, assignment.leases)

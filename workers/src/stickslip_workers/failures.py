@@ -2,6 +2,7 @@
 
 from stickslip_schemas.chunks import CorruptChunkError
 from stickslip_schemas.states import Reason
+from stickslip_schemas.store import is_unavailable
 from stickslip_schemas.tasks import TaskResult
 
 MESSAGE_LENGTH = 2000
@@ -16,6 +17,8 @@ def failed(reason: Reason, message: str) -> TaskResult:
 def failure(error: Exception) -> TaskResult:
     """Return the result of a stage that raised `error`."""
     message = f"{type(error).__name__}: {error}"
+    if isinstance(error, OSError) and is_unavailable(error):
+        return failed(Reason.store_unavailable, message)
     if isinstance(error, OSError | CorruptChunkError):
         return failed(Reason.storage_error, message)
     if isinstance(error, MemoryError):

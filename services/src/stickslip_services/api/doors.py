@@ -23,8 +23,8 @@ _SAFE = ("GET", "HEAD", "OPTIONS")
 
 _CHALLENGE = 'Bearer realm="stickslip", Basic realm="stickslip: a key as password"'
 _HOW = (
-    ", as `Authorization: Bearer KEY` or as the password of Basic; `stickslip keys create` makes keys, and local workers "
-    "use the one in the file `worker-key` of the data directory"
+    ", as `Authorization: Bearer KEY` or as the password of Basic; `stickslip keys create` makes keys, and local "
+    "workers use the one in the file `worker-key` of the data directory"
 )
 
 

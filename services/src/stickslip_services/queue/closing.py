@@ -167,7 +167,10 @@ def _finish_pausing(connection: Connection, now: float) -> None:
     for job in _jobs_in(connection, JobState.pausing):
         held = _held_tasks(connection, job)
         if not set(held) - runnable_tasks(connection, held):
-            set_job_state(connection, job, JobState.paused, now, message="paused; resume it to go on")
+            reason, message = connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job)).one()
+            if reason is None:
+                message = "paused; resume it to go on"
+            set_job_state(connection, job, JobState.paused, now, reason=reason, message=message)
 
 
 def _jobs_in(connection: Connection, state: JobState) -> list[int]:

@@ -3,6 +3,7 @@
 What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 """
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import CertificateEntry, JobDetail, Validation
 from stickslip_schemas.states import JobState, Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, is_unavailable
 from stickslip_schemas.tasks import PublishOutput
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -45,18 +46,22 @@ from stickslip_services.queue.jobs import (
     find_replay,
     fingerprint,
     has_runnable_job,
+    held_jobs,
+    hold_jobs,
     keep_replay,
     pause_job,
+    release_jobs,
     resume_job,
     show_job,
     unplanned_jobs,
 )
 from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
-from stickslip_services.queue.ledger import Ledger
+from stickslip_services.queue.ledger import RUNNABLE, Ledger
 from stickslip_services.queue.planning import Plan, collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
+from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.queue.stranded import find_stranded, note_stranded
 from stickslip_services.queue.submitting import count_settled, insert_job, plan_job
 from stickslip_services.queue.terms import Terms, terms_for
@@ -76,6 +81,8 @@ _NO_BUILDS = Builds(**dict.fromkeys(Builds.model_fields, "0" * 64))
 CHECKED_AT_ONCE = 64 * 2**20
 """The largest dataset that is checked while the request that asks for it again waits [bytes]."""
 
+logger = logging.getLogger(__name__)
+
 BUSY_POLL_SECONDS = 0.2
 IDLE_POLL_SECONDS = 1.0
 
@@ -89,10 +96,17 @@ class Coordinator:
     bell: Bell = field(default_factory=Bell)
     database: Database = field(init=False)
     store: Store = field(init=False)
+    store_watch: StoreWatch = field(init=False)
 
     def __post_init__(self) -> None:
         self.database = Database(self.settings.database_path, durable=self.settings.durable)
         self.store = Store(self.settings.store_root)
+        self.store_watch = StoreWatch(
+            self.settings.store_root,
+            self.settings.data,
+            min_free_bytes=self.settings.min_free_bytes,
+            clock=lambda: self.clock(),
+        )
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
@@ -175,7 +189,9 @@ class Coordinator:
         return self._shown(job)
 
     def resume(self, job_id: str) -> JobDetail:
-        """Let a paused job go on, with the builds that it was planned for."""
+        """Let a paused job go on, with the builds that it was planned for; raise ConflictError while no job can."""
+        if trouble := self.store_watch.trouble:
+            raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
         with self._book() as book:
             job = resume_job(book, job_id)
         self.plan_waiting_jobs()
@@ -188,7 +204,11 @@ class Coordinator:
 
     def show(self, connection: Connection, job: int) -> JobDetail:
         """Return a job as a transaction sees it."""
-        return show_job(connection, job, self.alive_workers(connection))
+        shown = show_job(connection, job, self.alive_workers(connection))
+        if self.store_watch.trouble and shown.state in RUNNABLE:  # perhaps not even the database could be told
+            update = {"reason": Reason.store_unavailable, "message": self.store_watch.trouble}
+            return shown.model_copy(update=update)
+        return shown
 
     def add_certificate(self, upload: CertificateUpload) -> CertificateEntry:
         """Register a certificate."""
@@ -216,6 +236,8 @@ class Coordinator:
         if worker.superseded:
             raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
         wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+        if self.store_watch.trouble:
+            return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
         with self.database.read() as connection:
             ready = has_ready_task(connection, worker, wanted.keys())
             waiting = has_runnable_job(connection)
@@ -242,7 +264,12 @@ class Coordinator:
         with self._book() as book:
             taken = take_reports(book, worker.id, reports, versions)
             give_back(book, taken.released)
-            fail_tries(book, taken.failures, self.settings)
+            for _, reason, message in taken.failures:
+                if reason is Reason.store_unavailable:
+                    self.store_watch.note(f"worker {worker.name} cannot use the store: {message}")
+            give_back(book, [task for task, reason, _ in taken.failures if reason is Reason.store_unavailable])
+            charged = [failure for failure in taken.failures if failure[1] is not Reason.store_unavailable]
+            fail_tries(book, charged, self.settings)
             for task, digests in taken.damaged:
                 make_again(book, task, digests)
         return ReportAnswer(verdicts=taken.verdicts)
@@ -259,7 +286,9 @@ class Coordinator:
                 check_output(self.store, output)
         except (OSError, ValueError) as error:
             message = f"the result does not hold: {error}"[:2000]
-            update = {"outcome": "failed", "reason": Reason.storage_error, "message": message, "output": None}
+            unavailable = isinstance(error, OSError) and is_unavailable(error)
+            reason = Reason.store_unavailable if unavailable else Reason.storage_error
+            update = {"outcome": "failed", "reason": reason, "message": message, "output": None}
             return report.model_copy(update={"result": report.result.model_copy(update=update)})
         return report
 
@@ -277,9 +306,24 @@ class Coordinator:
 
     def sweep(self) -> None:
         """Take back expired leases, let due retries go on, and let jobs that nobody serves say so."""
+        self._watch_store()
         self._take_back()
         self._note_stranded()
         self.check_made_datasets(at_most=CHECKED_AT_ONCE)
+
+    def _watch_store(self) -> None:
+        """Pause jobs while the store takes no results, and let them go on afterwards."""
+        trouble = self.store_watch.look()
+        with self.database.read() as connection:
+            due = has_runnable_job(connection) if trouble else bool(held_jobs(connection))
+        if not due:
+            return
+        with self._book() as book:
+            if trouble:
+                hold_jobs(book, trouble)
+            else:
+                release_jobs(book)
+        logger.warning("jobs are paused: %s", trouble) if trouble else logger.info("the store takes results again")
 
     def check_made_datasets(self, *, at_most: int | None = None) -> None:
         """Check the datasets that jobs found made before; where a file is damaged or lost, it is made again.

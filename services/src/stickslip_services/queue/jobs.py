@@ -84,9 +84,9 @@ def cancel_job(book: Ledger, job_id: str) -> int:
 def pause_job(book: Ledger, job_id: str) -> int:
     """Pause a job: nothing more is started for it, what runs finishes. Raise ConflictError if it has ended."""
     row = find_job(book.connection, job_id)
-    if row.state in (JobState.pausing, JobState.paused):
+    if row.state in (JobState.pausing, JobState.paused) and row.reason is None:
         return int(row.seq)
-    if row.state not in RUNNABLE:
+    if row.state not in (*RUNNABLE, JobState.pausing, JobState.paused):
         raise ConflictError(f"job {job_id} is {row.state}, and only a job that is queued or running can be paused")
     message = "nothing more is started; tasks that are running finish"
     set_job_state(book.connection, row.seq, JobState.pausing, book.now, message=message)
@@ -106,6 +106,27 @@ def resume_job(book: Ledger, job_id: str) -> int:
     set_job_state(book.connection, row.seq, state, book.now, reason=reason, message=message)
     charge_waiting_tasks(book.connection, row.seq)
     return int(row.seq)
+
+
+def hold_jobs(book: Ledger, trouble: str) -> None:
+    """Pause the jobs that could run because the store takes no results, and let them say so."""
+    message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
+    for seq in book.connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))).all():
+        reason = Reason.store_unavailable
+        set_job_state(book.connection, seq, JobState.pausing, book.now, reason=reason, message=message)
+        charge_waiting_tasks(book.connection, seq)
+
+
+def release_jobs(book: Ledger) -> None:
+    """Let the jobs go on that waited for the store."""
+    for job_id in held_jobs(book.connection):
+        resume_job(book, job_id)
+
+
+def held_jobs(connection: Connection) -> list[str]:
+    """Return the jobs that wait for the store."""
+    waiting = jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable
+    return list(connection.scalars(select(jobs.c.id).where(*waiting).order_by(jobs.c.seq)))
 
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
