@@ -77,7 +77,7 @@ def local_worker_key(path: Path) -> str:
 
 
 def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
-    """Let the secret in the file of the local workers be a key of the scope `work`; one that was revoked is replaced."""
+    """Let the secret in the file of the local workers be a key of the scope `work`; replace one that was revoked."""
     digest = sha256(local_worker_key(path).encode())
     row = connection.execute(select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)).one_or_none()
     if row is not None and row.revoked_at is not None:

@@ -51,8 +51,8 @@ def check(path: Path) -> None:
         found = str(error)
     if found not in ("ok", "") and not revision:
         raise DatabaseRefusedError(
-            f"{path} is damaged ({found.splitlines()[-1]}): move it away and run `stickslip reindex --data {path.parent}`, "
-            "which finds the datasets in the store again"
+            f"{path} is damaged ({found.splitlines()[-1]}): move it away and run "
+            f"`stickslip reindex --data {path.parent}`, which finds the datasets in the store again"
         )
     known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
     if revision and revision not in known:
