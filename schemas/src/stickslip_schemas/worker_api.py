@@ -39,6 +39,9 @@ class LeaseRequest(Document):
 
     worker_id: str
     wanted: dict[Stage, int]
+    at_most_seconds: float | None = Field(
+        default=None, gt=0, description="leave out tasks of which it is known that they take longer [s]"
+    )
 
 
 class Lease(Document):
@@ -47,6 +50,9 @@ class Lease(Document):
     task_id: str
     token: int
     attempt: int = Field(ge=1)
+    limit_seconds: float | None = Field(
+        default=None, gt=0, description="end the call after this time; null: nothing like it has been measured [s]"
+    )
     task: Task
 
 
@@ -63,6 +69,7 @@ class LeaseState(Document):
     task_id: str
     token: int
     started: bool
+    frames: tuple[int, int] | None = Field(default=None, description="of a simulation: frames done, and frames")
 
 
 class Heartbeat(Document):

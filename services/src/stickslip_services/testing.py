@@ -217,7 +217,7 @@ class PretendWorker:
             output = PackOutput(files=(entry, named))
         else:
             output = self._publish(task)
-        return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0)
+        return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0, call_seconds=1.0)
 
     def _publish(self, task: PublishTask) -> PublishOutput:
         zarr = {file.path: file for file in self._zarr(len(task.sample_keys))}

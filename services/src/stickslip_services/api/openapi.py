@@ -9,6 +9,7 @@ from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.problems import Problem
+from stickslip_schemas.responses import JobPatch
 from stickslip_schemas.tasks import task_adapter
 from stickslip_schemas.worker_api import Heartbeat, LeaseRequest, ReportBatch, WorkerRegistration
 
@@ -22,6 +23,7 @@ _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
     "Heartbeat": Heartbeat,
     "ReportBatch": ReportBatch,
     "CertificateUpload": CertificateUpload,
+    "JobPatch": JobPatch,
     "Manifest": Manifest,
     "Problem": Problem,
 }

@@ -50,6 +50,7 @@ from stickslip_services.queue.jobs import (
     hold_jobs,
     keep_replay,
     pause_job,
+    prioritise_job,
     release_jobs,
     resume_job,
     show_job,
@@ -97,6 +98,8 @@ class Coordinator:
     database: Database = field(init=False)
     store: Store = field(init=False)
     store_watch: StoreWatch = field(init=False)
+    _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
+    """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
 
     def __post_init__(self) -> None:
         self.database = Database(self.settings.database_path, durable=self.settings.durable)
@@ -146,12 +149,12 @@ class Coordinator:
             certificate=plan.certificate,
         )
 
-    def submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
+    def submit(self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
         with collector_at_rest():
-            return self._submit(spec, idempotency_key)
+            return self._submit(spec, idempotency_key, priority)
 
-    def _submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
+    def _submit(self, spec: JobSpec, idempotency_key: str | None, priority: int) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
         while True:
@@ -168,7 +171,7 @@ class Coordinator:
                     continue  # a worker with other builds has registered in between, or a certificate
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, plan)
+                    job = insert_job(book, spec, plan, priority=priority)
                 shown = self.show(connection, job)
                 if idempotency_key:
                     keep_replay(connection, idempotency_key, print_, job, shown.model_dump_json(), now)
@@ -180,6 +183,12 @@ class Coordinator:
         """Cancel a job."""
         with self._book() as book:
             job = cancel_job(book, job_id)
+        return self._shown(job)
+
+    def prioritise(self, job_id: str, priority: int) -> JobDetail:
+        """Give a job another priority."""
+        with self._book() as book:
+            job = prioritise_job(book, job_id, priority)
         return self._shown(job)
 
     def pause(self, job_id: str) -> JobDetail:
@@ -204,7 +213,7 @@ class Coordinator:
 
     def show(self, connection: Connection, job: int) -> JobDetail:
         """Return a job as a transaction sees it."""
-        shown = show_job(connection, job, self.alive_workers(connection))
+        shown = show_job(connection, job, self.alive_workers(connection), self.frames)
         if self.store_watch.trouble and shown.state in RUNNABLE:  # perhaps not even the database could be told
             update = {"reason": Reason.store_unavailable, "message": self.store_watch.trouble}
             return shown.model_copy(update=update)
@@ -239,17 +248,21 @@ class Coordinator:
         if self.store_watch.trouble:
             return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
         with self.database.read() as connection:
-            ready = has_ready_task(connection, worker, wanted.keys())
+            ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
             waiting = has_runnable_job(connection)
         if not ready:
             return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
         with self._book() as book:
-            leases = grant_leases(book, find_worker(book.connection, worker.id), wanted, self.settings)
+            worker = find_worker(book.connection, worker.id)
+            leases = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         """Renew a worker's leases and tell it what to drop."""
         worker = self._meet(heartbeat.worker_id)
+        self._frames[worker.id] = {
+            lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None
+        }
         if not heartbeat.leases:
             return HeartbeatAnswer(drop=())
         with self._book() as book:
@@ -268,7 +281,11 @@ class Coordinator:
                 if reason is Reason.store_unavailable:
                     self.store_watch.note(f"worker {worker.name} cannot use the store: {message}")
             give_back(book, [task for task, reason, _ in taken.failures if reason is Reason.store_unavailable])
-            charged = [failure for failure in taken.failures if failure[1] is not Reason.store_unavailable]
+            for task, reason, message in taken.failures:
+                if reason is Reason.worker_lost:
+                    lose(book, [task], self.settings, message=message)
+            innocent = (Reason.store_unavailable, Reason.worker_lost)
+            charged = [failure for failure in taken.failures if failure[1] not in innocent]
             fail_tries(book, charged, self.settings)
             for task, digests in taken.damaged:
                 make_again(book, task, digests)
@@ -384,6 +401,11 @@ class Coordinator:
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""
         return present_workers(connection, seen_since=self.alive_since)
+
+    @property
+    def frames(self) -> dict[str, tuple[int, int]]:
+        """Of the simulations that run and tell, by task: frames done, and frames."""
+        return {task: frames for told in list(self._frames.values()) for task, frames in told.items()}
 
     @property
     def alive_since(self) -> float:

@@ -3,9 +3,10 @@
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
-from sqlalchemy import Connection, Row, func, insert, select
+from sqlalchemy import Connection, Row, func, insert, select, update
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
@@ -16,10 +17,11 @@ from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, make_page
 from stickslip_services.database.tables import idempotency_keys, job_stages, jobs, previews, samples, tasks
 from stickslip_services.errors import ConflictError, IdempotencyKeyReusedError, NotFoundError
+from stickslip_services.queue.costs import read_costs
 from stickslip_services.queue.eta import StageTimings
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
-from stickslip_services.queue.progress import read_progress, rejected_samples
+from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.workers import NO_WORKER, RegisteredWorker, count_slots
 
 
@@ -108,6 +110,16 @@ def resume_job(book: Ledger, job_id: str) -> int:
     return int(row.seq)
 
 
+def prioritise_job(book: Ledger, job_id: str, priority: int) -> int:
+    """Give a job another priority. Raise ConflictError if it has ended."""
+    row = find_job(book.connection, job_id)
+    if JobState(row.state).is_terminal:
+        raise ConflictError(f"job {job_id} has ended ({row.state}); its priority cannot be changed")
+    book.connection.execute(update(jobs).where(jobs.c.seq == row.seq).values(priority=priority))
+    charge_waiting_tasks(book.connection, row.seq)
+    return int(row.seq)
+
+
 def hold_jobs(book: Ledger, trouble: str) -> None:
     """Pause the jobs that could run because the store takes no results, and let them say so."""
     message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
@@ -137,10 +149,14 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     return row
 
 
-def show_job(connection: Connection, job: int, workers: Collection[RegisteredWorker]) -> JobDetail:
+def show_job(
+    connection: Connection, job: int, workers: Collection[RegisteredWorker], frames: Frames = MappingProxyType({})
+) -> JobDetail:
     """Return a job with its spec."""
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
-    return JobDetail(**dict(_shown(connection, [row], workers)[0]), spec=job_spec_adapter.validate_json(row.spec))
+    return JobDetail(
+        **dict(_shown(connection, [row], workers, frames)[0]), spec=job_spec_adapter.validate_json(row.spec)
+    )
 
 
 def list_jobs(connection: Connection, page: PageRequest, workers: Collection[RegisteredWorker]) -> Page[Job]:
@@ -149,7 +165,7 @@ def list_jobs(connection: Connection, page: PageRequest, workers: Collection[Reg
     if page.after is not None:
         query = query.where(jobs.c.seq < page.after)
     rows = connection.execute(query).all()
-    shown = dict(zip((row.seq for row in rows), _shown(connection, rows, workers), strict=True))
+    shown = dict(zip((row.seq for row in rows), _shown(connection, rows, workers, {}), strict=True))
     return make_page(rows, page, position=lambda row: int(row.seq), item=lambda row: shown[row.seq])
 
 
@@ -228,10 +244,13 @@ def is_preview(connection: Connection, digest: str) -> bool:
 
 
 def _shown(
-    connection: Connection, rows: Sequence[Row[tuple[object, ...]]], workers: Collection[RegisteredWorker]
+    connection: Connection,
+    rows: Sequence[Row[tuple[object, ...]]],
+    workers: Collection[RegisteredWorker],
+    frames: Frames,
 ) -> list[Job]:
     slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows}
-    progress = read_progress(connection, rows, slots)
+    progress = read_progress(connection, rows, slots, costs=read_costs(connection), frames=frames)
     return [
         Job(
             id=row.id,
@@ -240,6 +259,7 @@ def _shown(
             state=row.state,
             reason=row.reason,
             message=row.message,
+            priority=row.priority,
             created_at=as_datetime(row.created_at),
             started_at=None if row.started_at is None else as_datetime(row.started_at),
             finished_at=None if row.finished_at is None else as_datetime(row.finished_at),

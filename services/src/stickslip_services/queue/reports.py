@@ -29,8 +29,10 @@ class _Row(NamedTuple):
     key: bytes
     stage: Stage
     kind: str
+    cost_group: str
     state: TaskState
     tries: int
+    losses: int
     owner: str | None
     token: int
     reported_by: str | None
@@ -41,6 +43,7 @@ class _Row(NamedTuple):
 class _Ended:
     task: HeldTask
     kind: str
+    cost_group: str
     result: TaskResult
 
 
@@ -74,11 +77,11 @@ def take_reports(
         elif row is not None and (row.owner, row.token) == (worker_id, report.token):
             verdict = "accepted"
             rows[report.task_id] = row._replace(owner=None, reported_by=worker_id, reported_token=report.token)
-            task = HeldTask(row.seq, row.key, row.stage, row.state, row.tries)
+            task = HeldTask(row.seq, row.key, row.stage, row.state, row.tries, row.losses)
             if report.result is None:
                 released.append(task)
             else:
-                ended.append(_Ended(task, row.kind, _checked(book, task, report.result, versions)))
+                ended.append(_Ended(task, row.kind, row.cost_group, _checked(book, task, report.result, versions)))
         verdicts.append(ReportVerdict(task_id=report.task_id, verdict=verdict))
     accepted = [*released, *(end.task for end in ended)]
     for batch in batches(accepted):
@@ -101,8 +104,10 @@ def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
             row.key,
             Stage(row.stage),
             row.kind,
+            row.cost_group,
             TaskState(row.state),
             row.tries,
+            row.losses,
             row.owner,
             row.token,
             row.reported_by,
@@ -115,8 +120,10 @@ def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
                 columns.key,
                 columns.stage,
                 columns.kind,
+                columns.cost_group,
                 columns.state,
                 columns.tries,
+                columns.losses,
                 columns.owner,
                 columns.token,
                 columns.reported_by,
@@ -222,7 +229,8 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
         task, result = end.task, end.result
         state = TaskState(result.outcome)
         book.moved(task.seq, task.stage, TaskState.running, state)
-        book.ran(Run(task.seq, task.stage, end.kind, result.cpu_seconds, result.wall_seconds))
+        cost = (result.cpu_seconds, result.wall_seconds, result.call_seconds)
+        book.ran(Run(task.seq, task.stage, end.kind, end.cost_group, *cost))
         if result.reason is not None:
             rejected[task.seq] = (result.reason, result.message)
             name = task_id(task.stage, task.key)

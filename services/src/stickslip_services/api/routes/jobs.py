@@ -7,7 +7,7 @@ from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.problems import ProblemCode
-from stickslip_schemas.responses import Job, JobDetail, Page, Preview, SampleState, Validation
+from stickslip_schemas.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
 from stickslip_schemas.states import TaskState
 
 from stickslip_services.api import sse
@@ -54,9 +54,12 @@ def post_job(
             description="a word that is yours alone; a request that comes twice with it makes one job. Kept for ever.",
         ),
     ] = None,
+    priority: Annotated[
+        int, Query(ge=-100, le=100, description="tasks of the job with the highest number come first")
+    ] = 0,
 ) -> Response:
     """Submit a job. What of it is there already is not done again; what had failed is tried again."""
-    job = coordinator.submit(spec, idempotency_key)
+    job = coordinator.submit(spec, idempotency_key, priority=priority)
     if isinstance(job, Replay):
         return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
     return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})
@@ -94,6 +97,18 @@ def get_job(
     if if_none_match is not None and (if_none_match.strip() == "*" or etag in if_none_match):
         return Response(status_code=304, headers={"ETag": etag})
     return _json(content, headers={"ETag": etag})
+
+
+@router.patch(
+    "/v1/jobs/{job_id}",
+    responses=problem_responses(404, 409, *BODY_PROBLEMS),
+    openapi_extra=body_schema("JobPatch"),
+)
+def patch_job(
+    job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], coordinator: CoordinatorDep
+) -> JobDetail:
+    """Give a job another priority, from its next task on. 409: it has ended."""
+    return coordinator.prioritise(job_id, patch.priority)
 
 
 @router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=problem_responses(404, 409))

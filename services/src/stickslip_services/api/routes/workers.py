@@ -29,7 +29,7 @@ CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
     """List the workers that have registered, the newest session of each name, newest first."""
     with coordinator.database.read() as connection:
-        return show_workers(connection, alive_since=coordinator.alive_since)
+        return show_workers(connection, alive_since=coordinator.alive_since, frames=coordinator.frames)
 
 
 @router.post(
