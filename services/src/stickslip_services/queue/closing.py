@@ -13,6 +13,7 @@ from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.tables import job_counts, job_groups, job_stages, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.costs import add_costs
+from stickslip_services.queue.eta import Run
 from stickslip_services.queue.events import append_published, append_task_state, set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
@@ -22,7 +23,6 @@ from stickslip_services.queue.ledger import (
     Holder,
     Ledger,
     Move,
-    Run,
     give_up_tasks,
     live_jobs,
     runnable_tasks,

@@ -287,8 +287,8 @@ class Coordinator:
             innocent = (Reason.store_unavailable, Reason.worker_lost)
             charged = [failure for failure in taken.failures if failure[1] not in innocent]
             fail_tries(book, charged, self.settings)
-            for task, digests in taken.damaged:
-                make_again(book, task, digests)
+            for consumer, digests in taken.damaged:
+                make_again(book, consumer, digests)
         return ReportAnswer(verdicts=taken.verdicts)
 
     def _checked(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:

@@ -21,11 +21,12 @@ TIMES = 3.0
 def read_costs(connection: Connection) -> dict[Group, Cost]:
     """Return what tasks cost so far."""
     return {
-        (Stage(row.stage), row.kind, row.cost_group): Cost(
-            StageTimings(row.count, row.wall_sum, row.wall_squares),
-            StageTimings(row.count, row.call_sum, row.call_squares),
+        (Stage(stage), kind, group): Cost(
+            StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)
         )
-        for row in connection.execute(select(cost_groups))
+        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in connection.execute(
+            select(cost_groups)
+        )
     }
 
 

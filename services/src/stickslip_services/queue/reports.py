@@ -18,8 +18,9 @@ from stickslip_schemas.worker_api import Report, ReportVerdict
 from stickslip_services.catalog.versions import ManifestSummary, commit_version, find_committed, find_reserved
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
+from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import task_id, task_key
-from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, Run, start_tasks
+from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, start_tasks
 
 Verdict = Literal["accepted", "duplicate", "stale"]
 
