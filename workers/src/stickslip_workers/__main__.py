@@ -75,7 +75,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
-    from stickslip_workers.cluster import ray_cluster
+    from stickslip_workers.cluster import ClusterLostError, ray_cluster
     from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.processes import StartError
 
@@ -90,12 +90,12 @@ def _dispatch(options: argparse.Namespace) -> int:
         dispatcher.stop()
 
     try:
-        with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cpus:
-            dispatcher = Dispatcher(settings, cluster_cpus=cpus)
+        with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cluster:
+            dispatcher = Dispatcher(settings, cluster)
             for number in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(number, stop)  # after Ray has set its own
             dispatcher.run()
-    except (StartError, CoordinatorError) as error:
+    except (ClusterLostError, StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
     return 0

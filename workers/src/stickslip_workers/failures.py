@@ -35,7 +35,6 @@ def process_failure(error: Exception, *, renders: bool) -> TaskResult:
         return failure(error.cause) if isinstance(error.cause, Exception) else failed(Reason.internal_error, str(error))
     if isinstance(error, ray_errors.OutOfMemoryError):
         return failed(Reason.oom_killed, str(error))
-    node_died = "its node has died" in str(error)
-    if renders and isinstance(error, ray_errors.RayActorError) and not node_died:
-        return failed(Reason.renderer_crash, str(error))
+    if isinstance(error, ray_errors.RayActorError) and "its node has died" not in str(error):
+        return failed(Reason.renderer_crash if renders else Reason.process_crash, str(error))
     return failed(Reason.worker_lost, str(error))

@@ -41,6 +41,8 @@ class Settings:
     )
     """Limit of one task, or batch of simulations, by stage; then its process is killed. Cloth takes minutes, and hours
     with the thesis's time steps."""
+    clog_seconds: float = 10
+    """With all slots taken for longer than this, tasks that take less go on beside them."""
     start_seconds: float = 120
     """Limit for a process to be scheduled by Ray and to start; then the dispatcher ends with an error."""
     drop_seconds: float = 5
