@@ -13,6 +13,7 @@ import json
 import logging
 import socket
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
+from stickslip_schemas.store import Store
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
@@ -33,11 +35,15 @@ from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMidd
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, workers
 from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.database.opening import check as check_database
+from stickslip_services.database.opening import locked, opened
+from stickslip_services.errors import DatabaseRefusedError
 from stickslip_services.keys import KeyRing, local_worker_key
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.reindexing import reindex as find_versions
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -120,6 +126,24 @@ class _Server(uvicorn.Server):
             sys.stdout.flush()
 
 
+def reindex(settings: Settings) -> int:
+    """Find the datasets in the store again; return the exit status."""
+    counts = Counter[str]()
+    with locked(settings.data), opened(settings.data, durable=settings.durable) as database:
+        for found in find_versions(database, Store(settings.store_root)):
+            name = f"{found.place.parent.name}:{found.place.name}"
+            if found.fault:
+                sys.stderr.write(f"left out: {found.place}: {found.fault}\n")
+            elif found.is_new:
+                sys.stdout.write(f"{name}  {found.samples} samples\n")
+            counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
+    sys.stderr.write(
+        f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out\n"
+        "certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`\n"
+    )
+    return 1 if counts["bad"] else 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run until a signal comes; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
@@ -133,18 +157,26 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
     parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
+    parser.add_argument("--reindex", action="store_true", default=None, help="find the datasets in the store, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
     if chosen.pop("openapi", False):
         sys.stdout.write(openapi_text())
         return 0
-    descriptor = chosen.pop("fd", None)
+    descriptor, is_reindexing = chosen.pop("fd", None), chosen.pop("reindex", False)
     try:
         settings = Settings(**chosen)
     except ValidationError as error:
         sys.stderr.write("".join(f"error: {item['msg'].removeprefix('Value error, ')}\n" for item in error.errors()))
         return 2
     configure_logging()
+    try:
+        if is_reindexing:
+            return reindex(settings)
+        check_database(settings.database_path, settings.store_root)
+    except DatabaseRefusedError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
     try:
         listener = listen(settings.host, settings.port) if descriptor is None else socket.socket(fileno=descriptor)
     except OSError as error:

@@ -10,6 +10,7 @@ from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import datasets, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, resume, show, submit, validate, watch_job
 from stickslip_services.cli.keys import app as keys
+from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.up import up
 from stickslip_services.cli.workers import workers
 
@@ -43,6 +44,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "datasets": datasets,
     "pull": pull_dataset,
     "verify": verify,
+    "reindex": reindex,
     "certify": certify,
     "register": register,
     "certificates": certificates,

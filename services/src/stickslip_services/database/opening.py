@@ -1,6 +1,9 @@
 """Opening the database of a data directory, or refusing it in one sentence that says what to do."""
 
+import fcntl
+import os
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -31,9 +34,17 @@ def opened(data: Path, *, durable: bool = True) -> Iterator[Database]:
         database.close()
 
 
-def check(path: Path) -> None:
-    """Raise DatabaseRefusedError where a database cannot be used; one that is not there can be made."""
+def check(path: Path, store: Path | None = None) -> None:
+    """Raise DatabaseRefusedError where a database cannot be used.
+
+    One that is not there can be made, unless there are datasets in the `store`: then it was lost.
+    """
     if not path.exists():
+        if store is not None and next(store.glob("datasets/*/v*/manifest.json"), None) is not None:
+            raise DatabaseRefusedError(
+                f"{store} holds datasets, and the database {path} is gone: run `stickslip reindex --data "
+                f"{path.parent}` to find them again"
+            )
         return
     revision = ""
     try:
@@ -60,3 +71,43 @@ def check(path: Path) -> None:
             f"{path} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
             "install that version again, or name another --data"
         )
+
+
+@contextmanager
+def locked(data: Path) -> Iterator[int]:
+    """Hold the lock of a data directory; the coordinator inherits it, so that it is held while one of them lives.
+
+    Yield its file descriptor; raise DatabaseRefusedError where another process holds it.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    path = data / "lock"
+    with path.open("a+") as file:
+        deadline = time.monotonic() + 10
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                holder = path.read_text(encoding="utf-8").strip()
+                # If the holder was killed, its coordinator is about to follow it.
+                if _is_alive(holder) or time.monotonic() > deadline:
+                    message = f"{path.parent} is in use by another `stickslip up` (pid {holder})"
+                    raise DatabaseRefusedError(message) from None
+                time.sleep(0.1)
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        os.set_inheritable(file.fileno(), True)
+        yield file.fileno()
+
+
+def _is_alive(pid: str) -> bool:
+    if not pid.isdecimal():
+        return False
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -6,7 +6,6 @@ it starts ends the whole with its last words.
 """
 
 import ctypes
-import fcntl
 import os
 import shlex
 import signal
@@ -25,6 +24,7 @@ import httpx
 from pydantic import ValidationError
 from stickslip_schemas.store import write_durably
 
+from stickslip_services.database.opening import check, locked
 from stickslip_services.errors import SupervisorError
 from stickslip_services.local.sockets import listen
 from stickslip_services.settings import Settings
@@ -140,7 +140,8 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
     settings = _settings(service, data)
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        lock = stack.enter_context(_locked(data / "lock"))
+        lock = stack.enter_context(locked(data))
+        check(settings.database_path, settings.store_root)
         signals = stack.enter_context(_stop_signals())
         # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
         listener = _listen(service.host, service.port)
@@ -240,40 +241,6 @@ def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int
                 )
             time.sleep(_TICK / 2)
     return False
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[int]:
-    """Hold the lock of a data directory; the coordinator inherits it, so that it is held while one of them lives."""
-    with path.open("a+") as file:
-        deadline = time.monotonic() + 10
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                holder = path.read_text(encoding="utf-8").strip()
-                # If the holder was killed, its coordinator is about to follow it.
-                if _is_alive(holder) or time.monotonic() > deadline:
-                    raise SupervisorError(f"{path.parent} is in use by another `stickslip up` (pid {holder})") from None
-                time.sleep(_TICK)
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
-        os.set_inheritable(file.fileno(), True)
-        yield file.fileno()
-
-
-def _is_alive(pid: str) -> bool:
-    if not pid.isdecimal():
-        return False
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 @contextmanager
