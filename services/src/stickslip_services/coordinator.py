@@ -29,6 +29,7 @@ from stickslip_schemas.store import Store
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
+from stickslip_services.api.connections import PatientProtocol, allow_many_files
 from stickslip_services.api.doors import DoorMiddleware, KeyMiddleware
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
@@ -190,9 +191,11 @@ def main(arguments: list[str] | None = None) -> int:
         timeout_graceful_shutdown=GRACE_SECONDS,
         lifespan="on",
         proxy_headers=False,
+        http=PatientProtocol,
         ssl_certfile=settings.tls_certificate,
         ssl_keyfile=settings.tls_key,
     )
+    allow_many_files()
     server = _Server(config, settings.url)
     server.run(sockets=[listener])
     return 0 if server.started else 1

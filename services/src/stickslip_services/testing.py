@@ -53,6 +53,7 @@ from stickslip_schemas.worker_api import (
     WorkerSession,
 )
 
+from stickslip_services.api.connections import PatientProtocol
 from stickslip_services.catalog import datasets
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.local.sockets import listen
@@ -351,7 +352,7 @@ class HttpApi:
 def serving(app: FastAPI) -> Iterator[str]:
     """Serve an application from a thread of this process; yield its URL."""
     listener = listen("127.0.0.1", 0)
-    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1, http=PatientProtocol)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()

@@ -8,7 +8,7 @@ import typer
 from stickslip_services import __version__
 from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import datasets, pull_dataset, verify
-from stickslip_services.cli.jobs import cancel, jobs, pause, resume, show, submit, validate, watch_job
+from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
 from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.up import up
@@ -40,6 +40,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "watch": watch_job,
     "pause": pause,
     "resume": resume,
+    "priority": prioritise,
     "cancel": cancel,
     "datasets": datasets,
     "pull": pull_dataset,

@@ -129,10 +129,11 @@ class Client:
         """Ask what a job would be."""
         return self._get("POST", "/v1/jobs:validate", Validation, json=spec)
 
-    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None) -> JobDetail:
+    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0) -> JobDetail:
         """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
         headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
-        return self._get("POST", "/v1/jobs", JobDetail, json=spec, headers=headers)
+        query = {"priority": str(priority)} if priority else {}
+        return self._get("POST", "/v1/jobs", JobDetail, json=spec, headers=headers, params=query)
 
     def job(self, job_id: str) -> JobDetail:
         """Return a job."""
@@ -150,6 +151,10 @@ class Client:
     def previews(self, job_id: str) -> list[Preview]:
         """Return the previews of a job."""
         return self._get("GET", f"/v1/jobs/{job_id}/previews", TypeAdapter(list[Preview]))
+
+    def prioritise(self, job_id: str, priority: int) -> JobDetail:
+        """Give a job another priority: tasks of the job with the highest number come first."""
+        return self._get("PATCH", f"/v1/jobs/{job_id}", JobDetail, json={"priority": priority})
 
     def cancel(self, job_id: str) -> JobDetail:
         """Cancel a job."""
