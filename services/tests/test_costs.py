@@ -2,9 +2,11 @@
 
 import pytest
 from sqlalchemy import select
+from stickslip_schemas.responses import Eta
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.tasks import TaskResult
 from stickslip_schemas.worker_api import Heartbeat, Lease, LeaseRequest, LeaseState
+from stickslip_services.api.metrics import Metrics
 from stickslip_services.database.tables import cost_groups
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.audit import audit
@@ -329,3 +331,34 @@ def test_a_failed_result_tells_no_cost(coordinator: Coordinator, worker: Pretend
     worker.report((lease, result))
     with coordinator.database.read() as connection:
         assert connection.execute(select(cost_groups)).all() == []
+
+
+def test_it_is_counted_how_often_the_time_left_held(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    submit(coordinator, gamma=(1.0, 2.0, 3.0, 4.0), phi1=(1.0,), views=None)  # to learn from: 10 s a simulation
+    while leases := worker.lease():
+        for lease in leases:
+            finish(worker, lease, 10.0)
+    paused = submit(coordinator, gamma=(5.0, 6.0), phi1=(1.0,), views=None)
+    coordinator.sweep()
+    assert coordinator.eta_watch.watched == {paused}
+    coordinator.pause(paused)
+    clock.advance(5)
+    coordinator.sweep()
+    assert coordinator.eta_watch.watched == frozenset()
+    coordinator.cancel(paused)
+    job = show_job(coordinator, submit(coordinator, gamma=(11.0, 12.0), phi1=(1.0,), views=None))
+    watch, begin = coordinator.eta_watch, clock()
+    for low, high in ((0.0, 50.0), (90.0, 110.0), (20.0, 200.0)):  # it will end after 100 s
+        eta = Eta(seconds=(low + high) / 2, low=low, high=high)
+        told = job.model_copy(update={"progress": job.progress.model_copy(update={"eta": eta})})
+        watch.look({job.id: told}, begin)
+    assert watch.held == {}
+    clock.advance(100)
+    worker.work()
+    clock.advance(60)
+    coordinator.sweep()
+    assert watch.held == {("rod_hang", True): 2, ("rod_hang", False): 1}
+    metrics = Metrics(coordinator.database, coordinator.alive_workers, watch.held).text().decode()
+    assert 'stickslip_eta_predictions_total{held="true",kind="rod_hang"} 2.0' in metrics

@@ -56,7 +56,7 @@ GRACE_SECONDS = 3
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
     coordinator = Coordinator(settings, clock or steady_clock())
-    metrics = Metrics(coordinator.database, coordinator.alive_workers)
+    metrics = Metrics(coordinator.database, coordinator.alive_workers, coordinator.eta_watch.held)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:

@@ -39,10 +39,12 @@ from stickslip_services.errors import ConflictError, KindNotAvailableError, Pres
 from stickslip_services.keys import admit_local_worker
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.eta_watch import EtaWatch
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import (
     Replay,
     cancel_job,
+    find_job,
     find_replay,
     fingerprint,
     has_runnable_job,
@@ -53,6 +55,7 @@ from stickslip_services.queue.jobs import (
     prioritise_job,
     release_jobs,
     resume_job,
+    runnable_jobs,
     show_job,
     unplanned_jobs,
 )
@@ -98,6 +101,7 @@ class Coordinator:
     database: Database = field(init=False)
     store: Store = field(init=False)
     store_watch: StoreWatch = field(init=False)
+    eta_watch: EtaWatch = field(init=False, default_factory=EtaWatch)
     _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
     """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
 
@@ -326,7 +330,16 @@ class Coordinator:
         self._watch_store()
         self._take_back()
         self._note_stranded()
+        self._watch_etas()
         self.check_made_datasets(at_most=CHECKED_AT_ONCE)
+
+    def _watch_etas(self) -> None:
+        if not self.eta_watch.is_due(self.clock()):
+            return
+        with self.database.read() as connection:
+            ids = self.eta_watch.watched | set(runnable_jobs(connection))
+            jobs = {job_id: self.show(connection, find_job(connection, job_id).seq) for job_id in ids}
+        self.eta_watch.look(jobs, self.clock())
 
     def _watch_store(self) -> None:
         """Pause jobs while the store takes no results, and let them go on afterwards."""

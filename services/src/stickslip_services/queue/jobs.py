@@ -64,6 +64,11 @@ def has_runnable_job(connection: Connection) -> bool:
     return connection.scalar(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1)) is not None
 
 
+def runnable_jobs(connection: Connection) -> list[str]:
+    """Return the jobs that there is something to do for, oldest first."""
+    return list(connection.scalars(select(jobs.c.id).where(jobs.c.state.in_(RUNNABLE)).order_by(jobs.c.seq)))
+
+
 def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any, Any]]:
     """Return (seq, kind, spec) of the jobs that wait for the first worker."""
     query = select(jobs.c.seq, jobs.c.kind, jobs.c.spec).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
