@@ -10,10 +10,10 @@ from stickslip_schemas.problems import ProblemCode
 from stickslip_schemas.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
 from stickslip_schemas.states import TaskState
 
-from stickslip_services.api import sse
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
+from stickslip_services.api.sse import Feeds
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.jobs import Replay, find_job, list_jobs, list_previews, list_samples
 
@@ -178,7 +178,8 @@ def get_events(
         raise ProblemError(422, ProblemCode.validation_failed, detail)
     with coordinator.database.read() as connection:
         job = int(find_job(connection, job_id).seq)
-    return sse.stream(coordinator.database, coordinator.bell, coordinator.show, job, after=int(after))
+    feeds: Feeds = request.app.state.feeds
+    return feeds.stream(job, after=int(after))
 
 
 def _json(content: str, *, status: int = 200, headers: dict[str, str] | None = None) -> Response:
