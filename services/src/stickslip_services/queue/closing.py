@@ -8,10 +8,10 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
-from sqlalchemy import Connection, bindparam, func, select, text, update
+from sqlalchemy import Connection, func, select, text, update
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
-from stickslip_services.database.tables import job_counts, job_groups, job_stages, job_tasks, jobs, task_counts, tasks
+from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks
 from stickslip_services.queue.costs import add_costs
 from stickslip_services.queue.eta import Run
 from stickslip_services.queue.events import append_published, append_task_state, set_job_state
@@ -29,7 +29,30 @@ from stickslip_services.queue.ledger import (
 )
 
 _OPEN = text("jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')")  # the partial index's words
+_OPEN_JOBS = text(
+    "SELECT seq, state, (SELECT SUM(count) FROM job_counts WHERE job = jobs.seq AND state = 'failed') FROM jobs "
+    "WHERE jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"
+)
+_QUEUED_JOBS = text(f"SELECT seq FROM jobs WHERE {_OPEN.text} AND jobs.state = 'queued'")
 _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # likewise
+
+
+# Made once: composing a statement costs more than running it.
+_ADD_TO_TASK_COUNTS = text(
+    "INSERT INTO task_counts (stage, state, count) VALUES (:stage, :state, :change) "
+    "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
+)
+_ADD_TO_JOB_COUNTS = text(
+    "UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state"
+)
+_ADD_TO_JOB_GROUPS = text(
+    'UPDATE job_groups SET "left" = "left" + :b_change '
+    "WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
+)
+_ADD_TO_JOB_STAGES = text(
+    "UPDATE job_stages SET cpu_seconds = cpu_seconds + :b_cpu, wall_count = wall_count + :b_count, "
+    "wall_sum = wall_sum + :b_wall, wall_squares = wall_squares + :b_squares WHERE job = :b_job AND stage = :b_stage"
+)
 
 
 @contextmanager
@@ -43,14 +66,18 @@ def ledger(connection: Connection, now: float) -> Iterator[Ledger]:
 def close(book: Ledger) -> None:
     """Bring counters and jobs up to date with what the ledger has noted."""
     given_up = _settle(book, frozenset())
-    for job in _blocked_jobs(book.connection):
+    open_jobs = book.connection.execute(_OPEN_JOBS).all()
+    for job in _blocked_jobs(
+        book.connection, [seq for seq, state, failed in open_jobs if state in RUNNABLE and failed]
+    ):
         book.end_job(job, _set_aside(book.connection, job))
     _settle(book, given_up)
     _tell(book)
     for job, ending in book.endings.items():
         _end_job(book, job, ending)
-    _finish_cancelling(book.connection, book.now)
-    _finish_pausing(book.connection, book.now)
+    if not {JobState.cancelling, JobState.pausing}.isdisjoint(state for _, state, _ in open_jobs):
+        _finish_cancelling(book.connection, book.now)
+        _finish_pausing(book.connection, book.now)
 
 
 def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
@@ -70,17 +97,17 @@ def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
     return frozenset(book.endings)
 
 
-def _blocked_jobs(connection: Connection) -> list[int]:
-    """Return the runnable jobs with tasks set aside for which nothing runs, and nothing can."""
+def _blocked_jobs(connection: Connection, set_aside: list[int]) -> list[int]:
+    """Return those of the runnable jobs with tasks set aside for which nothing runs, and nothing can."""
+    if not set_aside:
+        return []
     counts = job_counts.c
-    failed = func.sum(counts.count).filter(counts.state == TaskState.failed)
-    busy = func.sum(counts.count).filter(counts.state.in_((TaskState.leased, TaskState.running, TaskState.soft_failed)))
+    busy = (TaskState.leased, TaskState.running, TaskState.soft_failed)
     idle = connection.scalars(
         select(counts.job)
-        .join(jobs, jobs.c.seq == counts.job)
-        .where(_OPEN, jobs.c.state.in_(RUNNABLE))
+        .where(counts.job.in_(set_aside))
         .group_by(counts.job)
-        .having(failed > 0, busy == 0)
+        .having(func.sum(counts.count).filter(counts.state.in_(busy)) == 0)
     ).all()
     ready = select(tasks.c.seq).join(job_tasks, job_tasks.c.task == tasks.c.seq).where(_READY)
     return [job for job in idle if connection.scalar(ready.where(job_tasks.c.job == job).limit(1)) is None]
@@ -138,16 +165,7 @@ def _count(connection: Connection, moves: list[Move], holders: dict[int, list[Ho
         if change
     ]
     if changes:
-        connection.execute(
-            update(job_counts)
-            .where(
-                job_counts.c.job == bindparam("b_job"),
-                job_counts.c.stage == bindparam("b_stage"),
-                job_counts.c.state == bindparam("b_state"),
-            )
-            .values(count=job_counts.c.count + bindparam("b_change")),
-            changes,
-        )
+        connection.execute(_ADD_TO_JOB_COUNTS, changes)
 
 
 def _count_left(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
@@ -163,17 +181,7 @@ def _count_left(connection: Connection, moves: list[Move], holders: dict[int, li
         if change
     ]
     if rows:
-        groups = job_groups.c
-        connection.execute(
-            update(job_groups)
-            .where(
-                groups.job == bindparam("b_job"),
-                groups.stage == bindparam("b_stage"),
-                groups.cost_group == bindparam("b_group"),
-            )
-            .values(left=groups.left + bindparam("b_change")),
-            rows,
-        )
+        connection.execute(_ADD_TO_JOB_GROUPS, rows)
 
 
 def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[Holder]]) -> None:
@@ -182,26 +190,26 @@ def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[
         for holder in holders.get(run.task, ()):
             if not holder.cached:
                 by_job.setdefault((holder.job, run.stage), []).append(run)
-    for (job, stage), group in by_job.items():
-        connection.execute(
-            update(job_stages)
-            .where(job_stages.c.job == job, job_stages.c.stage == stage)
-            .values(
-                cpu_seconds=job_stages.c.cpu_seconds + sum(run.cpu_seconds for run in group),
-                wall_count=job_stages.c.wall_count + len(group),
-                wall_sum=job_stages.c.wall_sum + sum(run.wall_seconds for run in group),
-                wall_squares=job_stages.c.wall_squares + sum(run.wall_seconds**2 for run in group),
-            )
-        )
+    rows = [
+        {
+            "b_job": job,
+            "b_stage": stage,
+            "b_cpu": sum(run.cpu_seconds for run in group),
+            "b_count": len(group),
+            "b_wall": sum(run.wall_seconds for run in group),
+            "b_squares": sum(run.wall_seconds**2 for run in group),
+        }
+        for (job, stage), group in by_job.items()
+    ]
+    if rows:
+        connection.execute(_ADD_TO_JOB_STAGES, rows)
     add_costs(connection, runs)
 
 
 def _start_jobs(book: Ledger, job_seqs: Collection[int]) -> None:
     if not job_seqs:
         return
-    queued = book.connection.scalars(
-        select(jobs.c.seq).where(jobs.c.seq.in_(job_seqs), jobs.c.state == JobState.queued)
-    ).all()
+    queued = [seq for seq in book.connection.scalars(_QUEUED_JOBS) if seq in job_seqs]
     for job in queued:
         set_job_state(book.connection, job, JobState.running, book.now)
 
@@ -210,13 +218,7 @@ def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, Ta
     """Change the number of tasks by stage and state."""
     rows = [{"stage": stage, "state": state, "change": change} for (stage, state), change in changes.items() if change]
     if rows:
-        connection.execute(
-            text(
-                f"INSERT INTO {task_counts.name} (stage, state, count) VALUES (:stage, :state, :change) "
-                "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
-            ),
-            rows,
-        )
+        connection.execute(_ADD_TO_TASK_COUNTS, rows)
 
 
 def _finish_cancelling(connection: Connection, now: float) -> None:

@@ -14,6 +14,8 @@ from stickslip_services.queue.eta import Cost, Group, Run, StageTimings
 KEPT_RUNS = 200
 """Beyond so many tasks of a group the sums are halved: what was measured long ago fades."""
 
+_ALL_COSTS = select(cost_groups)
+
 TIMES = 3.0
 """A call is ended after so many times what it is expected to take."""
 
@@ -24,9 +26,7 @@ def read_costs(connection: Connection) -> dict[Group, Cost]:
         (Stage(stage), kind, group): Cost(
             StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)
         )
-        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in connection.execute(
-            select(cost_groups)
-        )
+        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in connection.execute(_ALL_COSTS)
     }
 
 
@@ -56,12 +56,7 @@ def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
             by_group.setdefault((run.stage, run.kind, run.cost_group), []).append((run.wall_seconds, run.call_seconds))
     for (stage, kind, group), costs in by_group.items():
         connection.execute(
-            text(
-                "INSERT INTO cost_groups (stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, "
-                "call_squares) VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
-                "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET "
-                + ", ".join(_faded(column) for column in ("count", *_SUMS))
-            ),
+            _ADD_TO_COST_GROUPS,
             {
                 "stage": stage,
                 "kind": kind,
@@ -81,3 +76,10 @@ _SUMS = ("wall_sum", "wall_squares", "call_sum", "call_squares")
 def _faded(column: str) -> str:
     keep = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"
     return f"{column} = cost_groups.{column} / ({keep}) + excluded.{column}"
+
+
+_ADD_TO_COST_GROUPS = text(
+    "INSERT INTO cost_groups (stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, call_squares) "
+    "VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
+    "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET " + ", ".join(_faded(column) for column in ("count", *_SUMS))
+)

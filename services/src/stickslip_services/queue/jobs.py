@@ -59,9 +59,12 @@ def fingerprint(spec: JobSpec) -> str:
     return sha256(spec.model_dump_json().encode())
 
 
+_RUNNABLE_JOB = select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1)
+
+
 def has_runnable_job(connection: Connection) -> bool:
     """Tell whether there is any job to work for."""
-    return connection.scalar(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1)) is not None
+    return connection.scalar(_RUNNABLE_JOB) is not None
 
 
 def runnable_jobs(connection: Connection) -> list[str]:

@@ -51,6 +51,53 @@ class _Ready:
     attempts: int
 
 
+# Made once: composing a statement costs more than running it.
+_OF_GROUP = (
+    _READY,
+    tasks.c.stage == bindparam("b_stage"),
+    tasks.c.build == bindparam("b_build"),
+    tasks.c.kind == bindparam("b_kind"),
+    tasks.c.cost_group.not_in(bindparam("b_left_out", expanding=True)),
+)
+_READY_TASK = (
+    select(tasks.c.seq)
+    .where(*_OF_GROUP, tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))))
+    .limit(1)
+)
+_READY_TASKS = (
+    select(
+        *(tasks.c[name] for name in ("seq", "key", "payload", "preview", "token", "attempts", "cost_group", "tries"))
+    )
+    .where(*_OF_GROUP, tasks.c.job == bindparam("b_job"))
+    .order_by(tasks.c.seq)
+    .limit(bindparam("b_count"))
+    .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
+)
+_JOBS_WITH_PENDING = (
+    select(
+        job_counts.c.job,
+        jobs.c.priority,
+        func.coalesce(
+            func.sum(job_counts.c.count).filter(job_counts.c.state.in_((TaskState.leased, TaskState.running))), 0
+        ),
+    )
+    .join(jobs, jobs.c.seq == job_counts.c.job)
+    .where(jobs.c.state.in_(RUNNABLE), job_counts.c.stage == bindparam("b_stage"))
+    .group_by(job_counts.c.job, jobs.c.priority)
+    .having(func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.pending) > 0)
+)
+_LEASE = (
+    update(tasks)
+    .where(tasks.c.seq == bindparam("b_seq"))
+    .values(
+        state=TaskState.leased,
+        token=bindparam("b_token"),
+        owner=bindparam("b_owner"),
+        expires_at=bindparam("b_expires_at"),
+    )
+)
+
+
 def has_ready_task(
     connection: Connection, worker: RegisteredWorker, stages: Iterable[Stage], *, at_most: float | None
 ) -> bool:
@@ -58,16 +105,13 @@ def has_ready_task(
     costs = {} if at_most is None else read_costs(connection)
     return any(
         connection.scalar(
-            select(tasks.c.seq)
-            .where(
-                _READY,
-                tasks.c.stage == stage,
-                tasks.c.build == build,
-                tasks.c.kind == kind,
-                tasks.c.cost_group.not_in(long_groups(costs, stage, kind, at_most)),
-                tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))),
-            )
-            .limit(1)
+            _READY_TASK,
+            {
+                "b_stage": stage,
+                "b_build": build,
+                "b_kind": kind,
+                "b_left_out": long_groups(costs, stage, kind, at_most),
+            },
         )
         for kind in worker.kinds
         for stage, build in worker.stage_builds(kind).items()
@@ -89,17 +133,8 @@ def grant_leases(
         return ()
     for task in granted:
         book.moved(task.seq, task.stage, TaskState.pending, TaskState.leased)
-    book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(
-            state=TaskState.leased,
-            token=bindparam("b_token"),
-            owner=worker.id,
-            expires_at=book.now + settings.lease_seconds,
-        ),
-        [{"b_seq": task.seq, "b_token": task.token + 1} for task in granted],
-    )
+    lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
+    book.connection.execute(_LEASE, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
     stored = [StoredTask(task.seq, task.stage, task.payload, task.preview) for task in granted]
     for publish in (task for task in stored if task.stage is Stage.publish):
         reserve_version(book.connection, publish)
@@ -152,17 +187,7 @@ def _pick(
 
 def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int, int]]:
     """Return (job, priority, number of tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
-    counts = job_counts.c
-    on_lease = func.sum(counts.count).filter(counts.state.in_((TaskState.leased, TaskState.running)))
-    pending = func.sum(counts.count).filter(counts.state == TaskState.pending)
-    rows = connection.execute(
-        select(counts.job, jobs.c.priority, func.coalesce(on_lease, 0))
-        .join(jobs, jobs.c.seq == counts.job)
-        .where(jobs.c.state.in_(RUNNABLE), counts.stage == stage)
-        .group_by(counts.job, jobs.c.priority)
-        .having(pending > 0)
-    )
-    return [(job, priority, held) for job, priority, held in rows]
+    return [(job, priority, held) for job, priority, held in connection.execute(_JOBS_WITH_PENDING, {"b_stage": stage})]
 
 
 def _ready_tasks(
@@ -174,29 +199,16 @@ def _ready_tasks(
     count: int,
     left_out: Sequence[str],
 ) -> list[_Ready]:
-    columns = tasks.c
     rows = connection.execute(
-        select(
-            columns.seq,
-            columns.key,
-            columns.payload,
-            columns.preview,
-            columns.token,
-            columns.attempts,
-            columns.cost_group,
-            columns.tries,
-        )
-        .where(
-            _READY,
-            columns.stage == stage,
-            columns.build == worker.stage_builds(kind)[stage],
-            columns.kind == kind,
-            columns.job == job,
-            columns.cost_group.not_in(left_out),
-        )
-        .order_by(columns.seq)
-        .limit(count)
-        .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
+        _READY_TASKS,
+        {
+            "b_stage": stage,
+            "b_build": worker.stage_builds(kind)[stage],
+            "b_kind": kind,
+            "b_left_out": left_out,
+            "b_job": job,
+            "b_count": count,
+        },
     )
     return [
         _Ready(

@@ -82,6 +82,14 @@ class HeldTask:
     losses: int
 
 
+_HOLDERS = (
+    select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
+    .join(jobs, jobs.c.seq == job_tasks.c.job)
+    .join(tasks, tasks.c.seq == job_tasks.c.task)
+    .where(job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)), jobs.c.state.in_(OPEN))
+)
+
+
 class Ledger:
     """What one write transaction does to tasks."""
 
@@ -115,13 +123,7 @@ class Ledger:
         """Return the open jobs of each task."""
         found: dict[int, list[Holder]] = {}
         for batch in batches(set(task_seqs)):
-            rows = self.connection.execute(
-                select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
-                .join(jobs, jobs.c.seq == job_tasks.c.job)
-                .join(tasks, tasks.c.seq == job_tasks.c.task)
-                .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(OPEN))
-            )
-            for task, job, cached, cost_group in rows:
+            for task, job, cached, cost_group in self.connection.execute(_HOLDERS, {"b_tasks": batch}):
                 found.setdefault(task, []).append(Holder(job, cached, cost_group))
         return found
 
@@ -194,14 +196,17 @@ def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) ->
     book.moved(task.seq, task.stage, task.state, state)
 
 
+_START = (
+    update(tasks)
+    .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
+    .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=bindparam("b_now"))
+)
+
+
 def start_tasks(book: Ledger, leased: Collection[tuple[int, str]]) -> None:
     """Note that leased tasks (seq, stage) have been started: from here on they may fail."""
     for batch in batches(leased):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([seq for seq, _ in batch]))
-            .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=book.now)
-        )
+        book.connection.execute(_START, {"b_tasks": [seq for seq, _ in batch], "b_now": book.now})
     for seq, stage in leased:
         book.moved(seq, stage, TaskState.leased, TaskState.running)
 

@@ -59,6 +59,40 @@ class Taken:
     """Of failed tasks, the inputs that were damaged or missing."""
 
 
+# Made once: composing a statement costs more than running it.
+_NOTE_REPORT = (
+    update(tasks)
+    .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
+    .values(reported_by=bindparam("b_worker"), reported_token=tasks.c.token)
+)
+_FIND = select(*(tasks.c[name] for name in _Row._fields)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
+_SETTLE = (
+    update(tasks)
+    .where(tasks.c.seq == bindparam("b_seq"))
+    .values(
+        state=bindparam("b_state"),
+        reason=bindparam("b_reason"),
+        message=bindparam("b_message"),
+        output=bindparam("b_output"),
+        cpu_seconds=bindparam("b_cpu"),
+        wall_seconds=bindparam("b_wall"),
+        owner=None,
+        expires_at=None,
+        finished_at=bindparam("b_now"),
+    )
+)
+_DEPENDENTS = (
+    select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
+    .join(tasks, tasks.c.seq == task_dependencies.c.task)
+    .where(task_dependencies.c.depends_on.in_(bindparam("b_tasks", expanding=True)))
+)
+_COUNT_DOWN = (
+    update(tasks)
+    .where(tasks.c.seq == bindparam("b_seq"))
+    .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled"))
+)
+
+
 def take_reports(
     book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, ManifestSummary]
 ) -> Taken:
@@ -86,11 +120,7 @@ def take_reports(
         verdicts.append(ReportVerdict(task_id=report.task_id, verdict=verdict))
     accepted = [*released, *(end.task for end in ended)]
     for batch in batches(accepted):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([task.seq for task in batch]))
-            .values(reported_by=worker_id, reported_token=tasks.c.token)
-        )
+        book.connection.execute(_NOTE_REPORT, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
     failures = _take_results(book, ended, versions)
     damaged = tuple((end.task.seq, end.result.damaged_inputs) for end in ended if end.result.damaged_inputs)
     return Taken(tuple(verdicts), tuple(released), failures, damaged)
@@ -98,7 +128,6 @@ def take_reports(
 
 def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
     keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
-    columns = tasks.c
     return {
         task_id(row.stage, row.key): _Row(
             row.seq,
@@ -115,22 +144,7 @@ def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
             row.reported_token,
         )
         for batch in batches(keys)
-        for row in book.connection.execute(
-            select(
-                columns.seq,
-                columns.key,
-                columns.stage,
-                columns.kind,
-                columns.cost_group,
-                columns.state,
-                columns.tries,
-                columns.losses,
-                columns.owner,
-                columns.token,
-                columns.reported_by,
-                columns.reported_token,
-            ).where(columns.key.in_(batch))
-        )
+        for row in book.connection.execute(_FIND, {"b_keys": batch})
     }
 
 
@@ -199,19 +213,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
     if not settled:
         return
     book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(
-            state=bindparam("b_state"),
-            reason=bindparam("b_reason"),
-            message=bindparam("b_message"),
-            output=bindparam("b_output"),
-            cpu_seconds=bindparam("b_cpu"),
-            wall_seconds=bindparam("b_wall"),
-            owner=None,
-            expires_at=None,
-            finished_at=book.now,
-        ),
+        _SETTLE,
         [
             {
                 "b_seq": end.task.seq,
@@ -221,6 +223,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
                 "b_output": None if end.result.output is None else end.result.output.model_dump_json(),
                 "b_cpu": end.result.cpu_seconds,
                 "b_wall": end.result.wall_seconds,
+                "b_now": book.now,
             }
             for end in settled
         ],
@@ -247,19 +250,13 @@ def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int
     edges = [
         (row.depends_on, row.task, row.stage, row.state)
         for batch in batches(settled)
-        for row in book.connection.execute(
-            select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
-            .join(tasks, tasks.c.seq == task_dependencies.c.task)
-            .where(task_dependencies.c.depends_on.in_(batch))
-        )
+        for row in book.connection.execute(_DEPENDENTS, {"b_tasks": batch})
     ]
     if not edges:
         return
     waits = Counter(task for _, task, _, _ in edges)
     book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled")),
+        _COUNT_DOWN,
         [{"b_seq": task, "b_settled": count} for task, count in waits.items()],
     )
     doomed = [

@@ -105,11 +105,15 @@ def _count_failed(connection: Connection, job: int) -> int:
     return int(connection.scalar(query.where(job_tasks.c.job == job, tasks.c.state == TaskState.failed)) or 0)
 
 
+_IS_DUE = text(
+    "SELECT EXISTS (SELECT 1 FROM tasks WHERE tasks.owner IS NOT NULL AND tasks.expires_at <= :b_now) "
+    "OR EXISTS (SELECT 1 FROM tasks WHERE tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now)"
+)
+
+
 def is_sweep_due(connection: Connection, now: float) -> bool:
     """Tell whether a lease has expired or a retry is due, without taking the write lock."""
-    expired = select(tasks.c.seq).where(text("tasks.owner IS NOT NULL"), tasks.c.expires_at <= now).limit(1)
-    due = select(tasks.c.seq).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= now).limit(1)
-    return connection.scalar(expired) is not None or connection.scalar(due) is not None
+    return bool(connection.scalar(_IS_DUE, {"b_now": now}))
 
 
 def sweep(book: Ledger, settings: Settings) -> None:

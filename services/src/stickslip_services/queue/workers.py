@@ -4,7 +4,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, Row, func, insert, select, text, update
+from sqlalchemy import Connection, Row, bindparam, func, insert, select, text, update
 from stickslip_schemas import responses
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Stage
@@ -71,9 +71,12 @@ def insert_worker(connection: Connection, registration: WorkerRegistration, now:
     return find_worker(connection, worker_id)
 
 
+_WORKER = select(workers).where(workers.c.id == bindparam("b_id"))
+
+
 def find_worker(connection: Connection, worker_id: str) -> RegisteredWorker:
     """Return a worker, superseded or not; raise UnknownWorkerError."""
-    row = connection.execute(select(workers).where(workers.c.id == worker_id)).one_or_none()
+    row = connection.execute(_WORKER, {"b_id": worker_id}).one_or_none()
     if row is None:
         raise UnknownWorkerError(f"no worker has the id {worker_id!r}: register again")
     return _worker(row)
