@@ -18,7 +18,7 @@ from typing import Any
 
 import httpx
 from stickslip_schemas.worker_api import Lease
-from stickslip_services.testing import PretendWorker, RunningServer, rods, start_server
+from stickslip_services.testing import HttpApi, PretendWorker, RunningServer, rods, start_server
 
 
 def cpu_seconds(server: RunningServer) -> float:
@@ -126,9 +126,12 @@ def main() -> None:
         server = start_server(Path(directory) / "data")
         try:
             worker = server.worker()
-            print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-            report_lease_and_complete(server, worker, 1, 300)
-            report_lease_and_complete(server, worker, 16, 3200)
+            with httpx.Client(trust_env=False, timeout=30) as client:  # as a dispatcher, which keeps its connection
+                key = (server.data / "worker-key").read_text().strip()
+                steady = PretendWorker(HttpApi(server.url, key, client.post), server.store, name="steady").register()
+                print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+                report_lease_and_complete(server, steady, 1, 300)
+                report_lease_and_complete(server, steady, 16, 3200)
             asyncio.run(report_watchers(server, worker, options.watchers, options.seconds))
             asyncio.run(report_clients(server, worker, options.clients, options.seconds))
             print(f"load {os.getloadavg()[0]:.1f}")

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
@@ -320,9 +321,11 @@ class RunningServer:
 class HttpApi:
     """The four verbs of the worker API over HTTP."""
 
-    def __init__(self, url: str, key: str) -> None:
+    def __init__(self, url: str, key: str, post: Callable[..., httpx.Response] | None = None) -> None:
         self._url = url
         self._key = key
+        self._send = post or partial(httpx.post, trust_env=False)
+        """Sends requests; by default each over a connection of its own."""
 
     def register(self, document: WorkerRegistration) -> WorkerSession:
         """Register a worker."""
@@ -343,7 +346,7 @@ class HttpApi:
     def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
         content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
         headers["Authorization"] = f"Bearer {self._key}"
-        response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
+        response = self._send(self._url + path, content=content, headers=headers)
         response.raise_for_status()
         return answer.model_validate_json(response.content)
 
