@@ -9,6 +9,7 @@ the load is printed with them.
 
 import argparse
 import asyncio
+import itertools
 import os
 import tempfile
 import threading
@@ -80,7 +81,7 @@ async def report_watchers(server: RunningServer, worker: PretendWorker, count: i
         await asyncio.to_thread(thread.join)
         await client.post(f"/v1/jobs/{job}:cancel")
         await asyncio.wait_for(asyncio.gather(*watchers), 60)
-    told = {tuple(dict.fromkeys(a for a, b in zip(ids, ids[1:], strict=False) if "job.state" in b)) for ids in heard}
+    told = {tuple(dict.fromkeys(a for a, b in itertools.pairwise(ids) if "job.state" in b)) for ids in heard}
     print(f"{count} watchers: {share:.0%} of a core; every one heard the same states: {len(told) == 1}")
 
 

@@ -143,7 +143,9 @@ def test_ray_listens_on_loopback_and_is_replaced_at_once_when_it_dies(service: S
     assert all("127.0.0.1]:" in place or place.startswith("127.0.0.1:") for place in places), places
     for part in RAY:
         kill(next(pid for pid in descendants(service.process.pid) if part in command_line(pid)))
-        old = before
-        before = wait_for(
-            f"a worker after the death of {part}", lambda old=old: s if (s := session()) != old else None, 45
-        )
+
+        def replaced(old: str = before) -> str | None:
+            new = session()
+            return None if new == old else new
+
+        before = wait_for(f"a worker after the death of {part}", replaced, 45)

@@ -125,7 +125,12 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     looks: list[int] = []
     feeds = app.state.feeds
     show = feeds._show
-    monkeypatch.setattr(feeds, "_show", lambda connection, job: looks.append(job) or show(connection, job))
+
+    def look(connection: Any, job: int) -> Any:
+        looks.append(job)
+        return show(connection, job)
+
+    monkeypatch.setattr(feeds, "_show", look)
     job = submit(client, gamma=(1.0, 2.0, 3.0))
     for _ in range(2):  # events of failed tries
         worker.report(*((lease, failure()) for lease in worker.lease(simulate=6)))
