@@ -13,7 +13,7 @@ from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.costs import KEPT_RUNS, TIMES, limit_seconds
 from stickslip_services.queue.eta import MEASURED, Cost, StageTimings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rods, show_job
+from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rejection, rods, show_job
 
 FLOOR = 60.0
 
@@ -83,6 +83,22 @@ def test_a_call_that_is_not_to_be_gone_by_is_not_counted(coordinator: Coordinato
     worker.report((lease, worker.result(lease.task).model_copy(update={"call_seconds": None})))
     with coordinator.database.read() as connection:
         assert connection.execute(select(cost_groups)).all() == []
+
+
+def test_quick_rejections_do_not_shorten_the_time_left(coordinator: Coordinator, worker: PretendWorker) -> None:
+    """Pictures out of frame are found in milliseconds: after three of them nothing is known of the others."""
+    job = submit(coordinator, gamma=tuple(1.0 + value for value in range(12)), phi1=(1.0,))
+    for lease in worker.lease(simulate=12):
+        finish(worker, lease, 0.1)
+    *quick, one, two, three = worker.lease(render=6)
+    out = rejection().model_copy(update={"wall_seconds": 0.005, "call_seconds": 0.005})
+    worker.report(*((lease, out) for lease in quick))
+    assert show_job(coordinator, job).progress.eta is None
+    for lease in (one, two, three):
+        finish(worker, lease, 100.0)
+    eta = show_job(coordinator, job).progress.eta
+    assert eta is not None
+    assert eta.low < 6 * 100.0 / worker.slots < eta.high
 
 
 def test_what_was_measured_long_ago_fades(coordinator: Coordinator, worker: PretendWorker) -> None:

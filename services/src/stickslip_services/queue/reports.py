@@ -233,7 +233,9 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
         task, result = end.task, end.result
         state = TaskState(result.outcome)
         book.moved(task.seq, task.stage, TaskState.running, state)
-        cost = (result.cpu_seconds, result.wall_seconds, result.call_seconds)
+        # What is rejected is often found at once: it says little of what the others take.
+        call_seconds = None if state is TaskState.rejected else result.call_seconds
+        cost = (result.cpu_seconds, result.wall_seconds, call_seconds)
         book.ran(Run(task.seq, task.stage, end.kind, end.cost_group, *cost))
         if result.reason is not None:
             rejected[task.seq] = (result.reason, result.message)
