@@ -3,25 +3,56 @@
 #include <algorithm>
 
 namespace sim_core {
+namespace {
+
+// Floats of the tiles of a front.
+long front_floats(long columns, long others) {
+  long floats = 0;
+  for (long j = 0; j < columns; j += tile_columns) {
+    const long width = std::min<long>(tile_columns, columns - j);
+    floats += tile_floats(width, columns + others - j - width);
+  }
+  return floats;
+}
+
+// Where things of some length lie that come and go: each in the first gap that holds it.
+struct Shelf {
+  struct Item {
+    int name;
+    long begin, end;
+  };
+  std::vector<Item> items;  // in their order on it
+  long length = 0;
+
+  long put(int name, long size) {
+    long begin = 0;
+    auto next = items.begin();
+    while (next != items.end() && next->begin - begin < size) begin = (next++)->end;
+    items.insert(next, {name, begin, begin + size});
+    length = std::max(length, begin + size);
+    return begin;
+  }
+  void take(int name) {
+    items.erase(std::find_if(items.begin(), items.end(), [&](const Item& item) { return item.name == name; }));
+  }
+};
+
+}  // namespace
 
 FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, const Dissection& dissection)
     : pivot_begin(dissection.pivot_begin) {
   const int fronts = static_cast<int>(dissection.parent.size());
-  children.assign(fronts, 0);
-  waiting.assign(fronts, 0);
-  starts.assign(fronts, 0);
   std::vector<std::vector<int>> structure(fronts), below(fronts);
   for (int f = 0; f < fronts; ++f) {
-    if (dissection.parent[f] >= 0) {
-      ++children[dissection.parent[f]];
-      below[dissection.parent[f]].push_back(f);
-    }
+    if (dissection.parent[f] >= 0) below[dissection.parent[f]].push_back(f);
   }
+  std::vector<std::vector<FrontRun>> runs_of(fronts);
   row_begin.push_back(0);
   entry_begin.push_back(0);
-  long panel_end = 0, stack_top = 0, stack_max = 0;
-  std::vector<long> held(fronts, 0);
-  std::size_t local_max = 0;
+  tile_begin.push_back(0);
+  child_begin.push_back(0);
+  Shelf shelf;
+  long panel_max = 0, local_max = 0;
   const auto pad = [](long rows) { return (rows + front_padding - 1) / front_padding * front_padding; };
   for (int f = 0; f < fronts; ++f) {
     const int first = pivot_begin[f], last = pivot_begin[f + 1];
@@ -46,9 +77,16 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
                  : last - first + static_cast<int>(std::lower_bound(own.begin(), own.end(), node) - own.begin());
     };
     for (int child : below[f]) {
-      for (int r = row_begin[child]; r < row_begin[child + 1]; ++r) {
-        if (static_cast<int>(parent_row.size()) <= r) parent_row.resize(r + 1);
-        parent_row[r] = place(rows[r]);
+      const std::vector<int>& theirs = structure[child];
+      for (int r = 0; r < static_cast<int>(theirs.size()); ++r) {
+        const int at = place(theirs[r]);
+        std::vector<FrontRun>& out = runs_of[child];
+        // A run does not lead from the pivots to the other rows, which are padded apart.
+        if (!out.empty() && at == out.back().place + out.back().count && at != last - first) {
+          ++out.back().count;
+        } else {
+          out.push_back({r, 1, at});
+        }
       }
     }
     for (int j = first; j < last; ++j) {
@@ -65,39 +103,45 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
     entry_begin.push_back(static_cast<long>(entry_slot.size()));
     const long columns = 3L * (last - first), others = 3L * static_cast<long>(own.size());
     const long ld = pad(columns) + pad(others);
-    panel_begin.push_back(panel_end);
-    panel_end += ld * columns;
-    local_max = std::max(local_max, static_cast<std::size_t>(ld));
-    const long update = pad(pad(others) * (others + 6));
-    stack_max = std::max(stack_max, stack_top + update);
-    for (int child : below[f]) stack_top -= held[child];
-    held[f] = own.empty() ? 0 : update;
-    stack_top += held[f];
+    tile_begin.push_back(tile_begin.back() + front_floats(columns, others));
+    panel_max = std::max(panel_max, ld * columns);
+    local_max = std::max(local_max, columns + others);
+    update_begin.push_back(shelf.put(f, pad(others) * others));
+    for (int child : below[f]) shelf.take(child);
+    children.insert(children.end(), below[f].begin(), below[f].end());
+    child_begin.push_back(static_cast<int>(children.size()));
     for (long c = 0; c < columns; ++c) flops += static_cast<double>(columns - c + others) * (columns - c + others);
   }
-  parent_row.resize(rows.size());
-  panels.assign(panel_end + 64, 0.0f);
-  stack.assign(stack_max + 64, 0.0f);
+  run_begin.push_back(0);
+  for (const std::vector<FrontRun>& some : runs_of) {
+    runs.insert(runs.end(), some.begin(), some.end());
+    run_begin.push_back(static_cast<int>(runs.size()));
+  }
+  tiles.assign(tile_begin.back() + 64, 0.0f);
+  panel.assign(panel_max + 64, 0.0f);
+  updates.assign(shelf.length + 64, 0.0f);
   local.assign(local_max + 64, 0.0f);
 }
 
 Factor FactorStorage::view() {
-  return {static_cast<int>(children.size()),
+  return {static_cast<int>(update_begin.size()),
           pivot_begin.data(),
           row_begin.data(),
           rows.data(),
-          parent_row.data(),
+          child_begin.data(),
           children.data(),
-          panel_begin.data(),
+          run_begin.data(),
+          runs.data(),
+          update_begin.data(),
+          tile_begin.data(),
           entry_begin.data(),
           entry_slot.data(),
           entry_block.data(),
           entry_row.data(),
           entry_column.data(),
-          panels.data(),
-          stack.data(),
-          waiting.data(),
-          starts.data(),
+          tiles.data(),
+          panel.data(),
+          updates.data(),
           local.data()};
 }
 

@@ -5,14 +5,16 @@
 
 #include "cloth/ordering.hpp"
 #include "cloth/problem.hpp"
+#include "math/buffer.hpp"
 
 namespace sim_core {
 
 struct FactorStorage {
-  std::vector<int> pivot_begin, row_begin, rows, parent_row, children, waiting;
+  std::vector<int> pivot_begin, row_begin, rows, child_begin, children, run_begin;
   std::vector<int> entry_slot, entry_block, entry_row, entry_column;
-  std::vector<long> panel_begin, entry_begin, starts;
-  std::vector<float> panels, stack, local;
+  std::vector<FrontRun> runs;
+  std::vector<long> tile_begin, entry_begin, update_begin;
+  Buffer<float> tiles, panel, updates, local;
   double flops = 0.0;
 
   // Patterns in the numbers of the order of elimination; that of bending holds that of the membrane.

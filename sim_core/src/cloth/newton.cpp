@@ -12,6 +12,8 @@ using Eigen::Vector3d;
 
 // Contact stiffness of the law over a node's own.
 constexpr double contact_share = 0.1;
+// Iterations after which a contact that turns back is held.
+constexpr int reversals_from = 4;
 
 }  // namespace
 
@@ -59,6 +61,7 @@ void Newton::predict(const StepProblem& problem, Buffer<double>& x, bool from_re
 StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations,
                           StepReport& report, double krylov_tolerance) {
   const int free_nodes = assembly_.numbering.free_nodes;
+  contact.hold_reversed = false;
   predict(problem, x, from_rest);
   assembly_.set_diagonal(problem.dt, problem.damping);
   factors.of(problem.dt);
@@ -72,6 +75,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   trial_ = best_ = x;
   double least = norms.squared;
   for (int iteration = 0; iteration < iterations; ++iteration) {
+    contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && norms.largest <= settings_.tolerance) break;
     if (!std::isfinite(norms.squared)) break;

@@ -14,6 +14,14 @@ constexpr int membrane_lanes = 8;
 // Rows and pivots of a front are padded to this many floats.
 constexpr int front_padding = 16;
 
+// A factor is kept in tiles of so many rows, and of at most so many columns: three of each node.
+constexpr int tile_rows = 16, tile_columns = 12;
+
+// Floats of a block of `width` columns with `below` rows under its triangle.
+constexpr long tile_floats(long width, long below) {
+  return width * (tile_rows + (below + tile_rows - 1) / tile_rows * tile_rows);
+}
+
 // Krylov vectors that one linear solve may use.
 constexpr int krylov_max = 40;
 
@@ -75,25 +83,35 @@ struct ContactRows {
   const float* turning;    // (nodes): stiffness against a turn of friction, N/m
 };
 
+// `count` rows of a front from `row` on are those of its parent from `place` on, in nodes, the parent's pivots first.
+struct FrontRun {
+  int row, count, place;
+};
+
 // A Cholesky factor in single precision by fronts (multifrontal). Front f eliminates nodes pivot_begin[f] ...
 // pivot_begin[f + 1]; its other rows are rows[row_begin[f]] ... . Children come before parents, in postorder.
+//
+// A front's columns go into blocks of `tile_columns`. Of each block come the inverse of its triangle, as one tile, and
+// then the rows below, tile after tile, so that a solve reads memory from one end to the other.
 struct Factor {
   int fronts;
   const int* pivot_begin;   // (fronts + 1)
   const int* row_begin;     // (fronts + 1)
   const int* rows;          // nodes
-  const int* parent_row;    // by row: its place in the parent's front, in nodes: pivots first
-  const int* children;      // (fronts): number of children
-  const long* panel_begin;  // (fronts): offset of the panel, floats
+  const int* child_begin;   // (fronts + 1)
+  const int* children;      // fronts
+  const int* run_begin;     // (fronts + 1): rows of a front that follow each other in its parent's, too
+  const FrontRun* runs;
+  const long* update_begin;  // (fronts): where the part of a front that waits for its parent lies in `updates`
+  const long* tile_begin;   // (fronts + 1): offset of the first tile, floats
   const long* entry_begin;  // (fronts + 1): entries of K that go into the front
   const int* entry_slot;    // of a bending scalar
   const int* entry_block;   // of a membrane block or -1
   const int* entry_row;     // place in the front, nodes
   const int* entry_column;
-  float* panels;
-  float* stack;  // updates of fronts that wait for their parents
-  int* waiting;  // those fronts
-  long* starts;  // and where their updates begin
+  float* tiles;
+  float* panel;  // the front that is being made
+  float* updates;
   float* local;  // one front's right-hand side
 };
 

@@ -209,7 +209,7 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }
 ClothPhases ClothSolver::phases() const { return impl_->newton.phases; }
 double ClothSolver::factor_flops() const { return impl_->newton.factors.latest().storage().flops; }
-std::size_t ClothSolver::factor_floats() const { return impl_->newton.factors.latest().storage().panels.size(); }
+std::size_t ClothSolver::factor_floats() const { return impl_->newton.factors.latest().storage().tiles.size(); }
 std::string ClothSolver::kernel() const { return impl_->assembly.kernel.name; }
 
 }  // namespace sim_core

@@ -49,11 +49,14 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
       norms.count(row.error_squared);
       continue;
     }
+    const bool slipped = mode[i] == contact_slip && touched[i] == which;
     touched[i] = which;
     const ContactSight seen = sight(i, which, gap, x, start, residual, at_start, at_end);
     const ContactRow row = closed_row(seen);
+    const bool reversed =
+        slipped && row.mode == contact_slip && at_node(direction, i).cast<double>().dot(row.direction) < 0.0;
     at_node(normal, i) = gap.normal.cast<float>();
-    write(i, row);
+    write(i, hold_reversed && reversed ? sticking_row(seen) : row);
     norms.count(row.error_squared);
   }
   return norms;

@@ -32,10 +32,10 @@ class SolverSettings:
     krylov_tolerance: float = 0.005
     """Residual over right-hand side at which GMRES stops, below 1."""
 
-    refactor_after: int = 15
+    refactor_after: int = 10
     """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
 
-    flips_max: int = 32
+    flips_max: int = 4
     """Contacts that may change between open, stick and slip before the factor is made anew."""
 
     patience: int = 10
@@ -44,13 +44,13 @@ class SolverSettings:
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
 
-    step_error: float | None = 1e-4
+    step_error: float | None = 5e-5
     """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: `time_step`."""
 
     coarsest: int = 4
     """Steps that a frame of a scene takes at least, a power of two up to 1024."""
 
-    finest: int = 128
+    finest: int = 32
     """Steps that a frame takes at most, before one that does not converge is halved: a power of two."""
 
     unconverged_share_max: float = 0.002
@@ -93,9 +93,9 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
         settings.name: settings
         for settings in (
             SolverSettings("certified", 0.02),
-            SolverSettings("fast", 0.04, tolerance=2e-4, step_error=3e-4, finest=64),
+            SolverSettings("fast", 0.04, tolerance=2e-4, step_error=3e-4),
             # For meshes of 81 vertices a side and more, and where frames are compared.
-            SolverSettings("fine", 0.01, tolerance=5e-5, step_error=5e-5, coarsest=8, finest=256),
+            SolverSettings("fine", 0.01, tolerance=5e-5, step_error=2.5e-5, coarsest=8, finest=64),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
             SolverSettings("thesis-high", 0.0005, step_error=None),
             SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, **_CUT_OFF),

@@ -8,8 +8,9 @@ namespace {
 
 inline int padded(int rows) { return (rows + front_padding - 1) / front_padding * front_padding; }
 
-// C -= A B^T for rows of A in whole vectors and `columns` <= 6 columns; A(i, p) = a[p ld + i], B(j, p) = b[p ld + j].
-template <int vectors, int columns>
+// C -= A B^T, or C = -A B^T where `set`, for rows of A in whole vectors and `columns` <= 6 columns;
+// A(i, p) = a[p ld + i], B(j, p) = b[p ld + j].
+template <int vectors, int columns, bool set>
 inline void multiply_tile(const float* a, const float* b, long ld, int depth, float* c, long ldc) {
   Floats sum[vectors][columns];
   for (int v = 0; v < vectors; ++v) {
@@ -28,54 +29,56 @@ inline void multiply_tile(const float* a, const float* b, long ld, int depth, fl
   }
   for (int j = 0; j < columns; ++j) {
     for (int v = 0; v < vectors; ++v) {
-      *reinterpret_cast<Floats*>(c + j * ldc + CLOTH_FLOATS * v) -= sum[v][j];
+      Floats* out = reinterpret_cast<Floats*>(c + j * ldc + CLOTH_FLOATS * v);
+      *out = set ? -sum[v][j] : *out - sum[v][j];
     }
   }
 }
 
-template <int columns>
+template <int columns, bool set>
 inline void multiply_column(const float* a, const float* b, long ld, int depth, float* c, long ldc, int rows) {
   int i = 0;
-  for (; i + 2 * CLOTH_FLOATS <= rows; i += 2 * CLOTH_FLOATS) {
-    multiply_tile<2, columns>(a + i, b, ld, depth, c + i, ldc);
+  // Sixteen wide registers hold 2 x 6 sums, thirty-two 4 x 6.
+  for (; CLOTH_FLOATS == 16 && i + 4 * CLOTH_FLOATS <= rows; i += 4 * CLOTH_FLOATS) {
+    multiply_tile<4, columns, set>(a + i, b, ld, depth, c + i, ldc);
   }
-  for (; i < rows; i += CLOTH_FLOATS) multiply_tile<1, columns>(a + i, b, ld, depth, c + i, ldc);
+  for (; i + 2 * CLOTH_FLOATS <= rows; i += 2 * CLOTH_FLOATS) {
+    multiply_tile<2, columns, set>(a + i, b, ld, depth, c + i, ldc);
+  }
+  for (; i < rows; i += CLOTH_FLOATS) multiply_tile<1, columns, set>(a + i, b, ld, depth, c + i, ldc);
 }
 
-// Lower part of C -= A A^T (square of `columns`, `rows` >= columns padded): tiles that touch the diagonal are whole.
-inline void subtract_square(const float* a, long ld, int depth, float* c, long ldc, int rows, int columns) {
+// Lower part of C = -A A^T, a square of `columns`, a multiple of 3; A has `rows` >= columns, padded. Tiles that touch the
+// diagonal are whole.
+inline void negative_square(const float* a, long ld, int depth, float* c, long ldc, int rows, int columns) {
   for (int j = 0; j < columns; j += 6) {
     const int from = j / CLOTH_FLOATS * CLOTH_FLOATS;
     const float* left = a + from;
     float* target = c + j * ldc + from;
-    switch (columns - j) {
-      case 1:
-        multiply_column<1>(left, a + j, ld, depth, target, ldc, rows - from);
-        break;
-      case 2:
-        multiply_column<2>(left, a + j, ld, depth, target, ldc, rows - from);
-        break;
-      case 3:
-        multiply_column<3>(left, a + j, ld, depth, target, ldc, rows - from);
-        break;
-      case 4:
-        multiply_column<4>(left, a + j, ld, depth, target, ldc, rows - from);
-        break;
-      case 5:
-        multiply_column<5>(left, a + j, ld, depth, target, ldc, rows - from);
-        break;
-      default:
-        multiply_column<6>(left, a + j, ld, depth, target, ldc, rows - from);
-        break;
+    if (columns - j > 3) {
+      multiply_column<6, true>(left, a + j, ld, depth, target, ldc, rows - from);
+    } else {
+      multiply_column<3, true>(left, a + j, ld, depth, target, ldc, rows - from);
     }
   }
 }
 
-constexpr int block_columns = 16;
+// C -= A B^T for the columns j ... j + width of a panel, A and B being the columns before them.
+inline void subtract_columns(float* panel, long ld, int j, int width, int rows) {
+  const int from = j / CLOTH_FLOATS * CLOTH_FLOATS;
+  for (int q = 0; q < width && j > 0; q += 6) {
+    float* target = panel + (j + q) * ld + from;
+    if (width - q > 3) {
+      multiply_column<6, false>(panel + from, panel + j + q, ld, j, target, ld, rows - from);
+    } else {
+      multiply_column<3, false>(panel + from, panel + j + q, ld, j, target, ld, rows - from);
+    }
+  }
+}
 
 // Factor `width` columns of a panel from its diagonal down to `rows`, all earlier columns being subtracted already.
 inline void factor_columns(float* panel, long ld, int width, int rows) {
-  float l[block_columns][block_columns], inverse[block_columns];
+  float l[tile_columns][tile_columns], inverse[tile_columns];
   for (int j = 0; j < width; ++j) {
     float pivot = panel[j * ld + j];
     const float own = pivot;
@@ -91,7 +94,7 @@ inline void factor_columns(float* panel, long ld, int width, int rows) {
   }
   const int below = (width + CLOTH_FLOATS - 1) / CLOTH_FLOATS * CLOTH_FLOATS;
   for (int i = below; i < rows; i += CLOTH_FLOATS) {
-    Floats v[block_columns];
+    Floats v[tile_columns];
     for (int j = 0; j < width; ++j) {
       Floats sum = *reinterpret_cast<const Floats*>(panel + j * ld + i);
       for (int q = 0; q < j; ++q) sum -= v[q] * l[j][q];
@@ -109,6 +112,19 @@ inline void factor_columns(float* panel, long ld, int width, int rows) {
   }
   for (int j = 0; j < width; ++j) {
     for (int i = j; i < width; ++i) panel[j * ld + i] = l[i][j];
+  }
+}
+
+// The inverse of a lower triangle of `width` columns, in columns of tile_rows.
+inline void invert_triangle(const float* l, long ld, int width, float* inverse) {
+  for (int q = 0; q < width; ++q) {
+    float* x = inverse + q * tile_rows;
+    x[q] = 1.0f / l[q * ld + q];
+    for (int i = q + 1; i < width; ++i) {
+      float sum = 0.0f;
+      for (int p = q; p < i; ++p) sum -= l[p * ld + i] * x[p];
+      x[i] = sum / l[i * ld + i];
+    }
   }
 }
 

@@ -23,18 +23,60 @@ struct FrontSize {
   long place(int node) const { return node < pivots ? 3L * node : pivot_rows + 3L * (node - pivots); }
 };
 
+inline void add_floats(const float* from, float* to, int count) {
+  int i = 0;
+  for (; i + CLOTH_FLOATS <= count; i += CLOTH_FLOATS) {
+    *reinterpret_cast<Floats*>(to + i) += *reinterpret_cast<const Floats*>(from + i);
+  }
+  for (; i < count; ++i) to[i] += from[i];
+}
+
+// Writes the tiles of a block of columns that is done, and returns where they end.
+inline float* keep_tiles(const Factor& factor, const FrontSize& size, int j, int width, float* tile) {
+  const int end = size.columns + 3 * size.rows, first = j + width, own = size.columns - first;
+  __builtin_memset(tile, 0, sizeof(float) * width * tile_rows);
+  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, tile);
+  tile += width * tile_rows;
+  float* rows = factor.local;
+  for (int q = 0; q < width; ++q) {
+    const float* column = factor.panel + (j + q) * size.ld;
+    __builtin_memcpy(rows, column + first, sizeof(float) * own);
+    __builtin_memcpy(rows + own, column + size.pivot_rows, sizeof(float) * 3 * size.rows);
+    __builtin_memset(rows + end - first, 0, sizeof(float) * tile_rows);
+    for (int i = 0; i < end - first; i += tile_rows) {
+      __builtin_memcpy(tile + i * width + q * tile_rows, rows + i, sizeof(float) * tile_rows);
+    }
+  }
+  return tile + tile_floats(width, end - first) - width * tile_rows;
+}
+
+// Adds what waits of a child to those columns of its parent that are pivots, or to the others; column j of the parent
+// begins at parent + j ld.
+inline void add_update(const Factor& factor, int child, const FrontSize& size, bool pivots, float* parent, long ld) {
+  const FrontSize below(factor, child);
+  const float* update = factor.updates + factor.update_begin[child];
+  const FrontRun *end = factor.runs + factor.run_begin[child + 1];
+  for (const FrontRun* run = factor.runs + factor.run_begin[child]; run < end; ++run) {
+    if ((run->place < size.pivots) != pivots) continue;
+    for (int j = 0; j < 3 * run->count; ++j) {
+      const float* from = update + (3L * run->row + j) * below.other_rows;
+      float* to = parent + (size.place(run->place) + j) * ld;
+      int skip = j / 3 * 3;  // the lower triangle is all there is
+      for (const FrontRun* rows = run; rows < end; ++rows, skip = 0) {
+        add_floats(from + 3L * rows->row + skip, to + size.place(rows->place) + skip, 3 * rows->count - skip);
+      }
+    }
+  }
+}
+
 void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagonal& diagonal) {
-  // The stack holds the updates of fronts that wait for their parents; `top` is its end.
-  long top = 0;
-  int waiting = 0;
+  const FlushTiny flush;
   for (int front = 0; front < factor.fronts; ++front) {
     const FrontSize size(factor, front);
-    float* panel = factor.panels + factor.panel_begin[front];
+    float* panel = factor.panel;
     const long ldu = size.other_rows;
-    const long update_size = ldu * (3L * size.rows + 6);
-    float* update = factor.stack + top;
+    float* update = factor.updates + factor.update_begin[front];
     __builtin_memset(panel, 0, sizeof(float) * size.ld * size.columns);
-    __builtin_memset(update, 0, sizeof(float) * update_size);
     const int pivot0 = factor.pivot_begin[front];
     for (int i = 0; i < size.pivots; ++i) {
       const float* own = diagonal.added + 6L * (pivot0 + i);
@@ -62,48 +104,20 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagona
         }
       }
     }
-    for (int child = 0; child < factor.children[front]; ++child) {
-      const int which = waiting - factor.children[front] + child, from = factor.waiting[which];
-      const FrontSize below(factor, from);
-      const float* source = factor.stack + factor.starts[which];
-      const int* map = factor.parent_row + factor.row_begin[from];
-      for (int j = 0; j < below.rows; ++j) {
-        const bool pivot = map[j] < size.pivots;
-        const long ld = pivot ? size.ld : ldu;
-        float* column =
-            pivot ? panel + 3L * map[j] * size.ld : update + 3L * (map[j] - size.pivots) * ldu - size.pivot_rows;
-        for (int i = j; i < below.rows; ++i) {
-          const float* block = source + 3L * j * below.other_rows + 3L * i;
-          float* at = column + size.place(map[i]);
-          for (int c = 0; c < 3; ++c) {
-            for (int r = 0; r < 3; ++r) at[c * ld + r] += block[c * below.other_rows + r];
-          }
-        }
-      }
-    }
-    for (int j = 0; j < size.columns; j += block_columns) {
-      const int width = size.columns - j < block_columns ? size.columns - j : block_columns;
-      float* block = panel + j * size.ld + j;
-      factor_columns(block, size.ld, width, int(size.ld) - j);
-      const int rest = size.columns - j - width;
-      if (rest > 0) {
-        subtract_square(block + width, size.ld, width, block + width * size.ld + width, size.ld,
-                        int(size.ld) - j - width, rest);
-      }
+    const int *child = factor.children + factor.child_begin[front], *last = factor.children + factor.child_begin[front + 1];
+    for (const int* c = child; c < last; ++c) add_update(factor, *c, size, true, panel, size.ld);
+    float* tile = factor.tiles + factor.tile_begin[front];
+    for (int j = 0; j < size.columns; j += tile_columns) {
+      const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
+      subtract_columns(panel, size.ld, j, width, int(size.ld));
+      factor_columns(panel + j * size.ld + j, size.ld, width, int(size.ld) - j);
+      tile = keep_tiles(factor, size, j, width, tile);
     }
     if (size.rows > 0) {
-      subtract_square(panel + size.pivot_rows, size.ld, size.columns, update, ldu, size.other_rows, 3 * size.rows);
-    }
-    if (factor.children[front] > 0) {
-      waiting -= factor.children[front];
-      __builtin_memmove(factor.stack + factor.starts[waiting], update, sizeof(float) * update_size);
-      top = factor.starts[waiting];
-    }
-    if (size.rows > 0) {
-      factor.starts[waiting] = top;
-      factor.waiting[waiting] = front;
-      ++waiting;
-      top += (update_size + 15) / 16 * 16;
+      negative_square(panel + size.pivot_rows, size.ld, size.columns, update, ldu, size.other_rows, 3 * size.rows);
+      for (const int* c = child; c < last; ++c) {
+        add_update(factor, *c, size, false, update - (ldu + 1) * size.pivot_rows, ldu);
+      }
     }
   }
 }

@@ -31,6 +31,7 @@ inline void add_multiple(float* a, float factor, const float* b, long count) {
 // Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `work`: 2 krylov_max + 1 vectors.
 KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b,
                     float* x, float* work, int iterations, double tolerance) {
+  const FlushTiny flush;
   const long count = 4L * matrix.nodes;
   float* basis = work;
   float* images = work + (krylov_max + 1) * count;

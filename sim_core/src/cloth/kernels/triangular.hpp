@@ -6,102 +6,147 @@
 namespace sim_core {
 namespace {
 
+constexpr int tile_vectors = tile_rows / CLOTH_FLOATS;
+
+inline float sum_of(Floats v) {
+  Node quarter[CLOTH_FLOATS / 4];
+  *reinterpret_cast<Floats*>(quarter) = v;
+  for (int q = 1; q < CLOTH_FLOATS / 4; ++q) quarter[0] += quarter[q];
+  return (quarter[0][0] + quarter[0][1]) + (quarter[0][2] + quarter[0][3]);
+}
+
+// y += T z or y -= T z, of the rows of a tile.
+template <int width, bool subtract>
+inline void add_tile(const float* tile, const float* z, float* y) {
+  for (int v = 0; v < tile_vectors; ++v) {
+    Floats* at = reinterpret_cast<Floats*>(y + CLOTH_FLOATS * v);
+    Floats sum = *at, other{};
+#pragma GCC unroll 12
+    for (int q = 0; q < width; ++q) {
+      const Floats part = *reinterpret_cast<const Floats*>(tile + q * tile_rows + CLOTH_FLOATS * v) * z[q];
+      if (q % 2 == 0) {
+        sum = subtract ? sum - part : sum + part;
+      } else {
+        other = subtract ? other - part : other + part;
+      }
+    }
+    *at = sum + other;
+  }
+}
+
+// sum += T^T y.
+template <int width>
+inline void add_transposed(const float* tile, const float* y, Floats* sum) {
+  for (int v = 0; v < tile_vectors; ++v) {
+    const Floats at = *reinterpret_cast<const Floats*>(y + CLOTH_FLOATS * v);
+#pragma GCC unroll 12
+    for (int q = 0; q < width; ++q) {
+      sum[q] += *reinterpret_cast<const Floats*>(tile + q * tile_rows + CLOTH_FLOATS * v) * at;
+    }
+  }
+}
+
+// A block of columns whose own rows begin at y: they are solved for, and leave the `below` rows after them.
+template <int width>
+inline void forward(const float* tile, float* y, int below) {
+  float z[tile_rows];
+  for (int v = 0; v < tile_vectors; ++v) reinterpret_cast<Floats*>(z)[v] = Floats{};
+  add_tile<width, false>(tile, y, z);
+  for (int q = 0; q < width; ++q) y[q] = z[q];
+  tile += width * tile_rows;
+  for (int i = 0; i < below; i += tile_rows, tile += width * tile_rows) {
+    add_tile<width, true>(tile, z, y + width + i);
+  }
+}
+
+template <int width>
+inline void backward(const float* tile, float* y, int below) {
+  Floats sum[width];
+  for (int q = 0; q < width; ++q) sum[q] = Floats{};
+  const float* other = tile + width * tile_rows;
+  for (int i = 0; i < below; i += tile_rows, other += width * tile_rows) {
+    add_transposed<width>(other, y + width + i, sum);
+  }
+  float z[tile_rows];
+  for (int v = 0; v < tile_vectors; ++v) reinterpret_cast<Floats*>(z)[v] = Floats{};
+  for (int q = 0; q < width; ++q) z[q] = y[q] - sum_of(sum[q]);
+  for (int q = 0; q < width; ++q) sum[q] = Floats{};
+  add_transposed<width>(tile, z, sum);
+  for (int q = 0; q < width; ++q) y[q] = sum_of(sum[q]);
+}
+
 // x = K^-1 b; `x` may be `b`.
 void solve(const Factor& factor, int nodes, const float* b, float* x) {
   if (x != b) __builtin_memcpy(x, b, 16L * nodes);
   float* y = factor.local;
   for (int front = 0; front < factor.fronts; ++front) {
     const FrontSize size(factor, front);
-    const float* panel = factor.panels + factor.panel_begin[front];
+    const float* tile = factor.tiles + factor.tile_begin[front];
     const int* rows = factor.rows + factor.row_begin[front];
+    const int height = size.columns + 3 * size.rows;
     float* own = x + 4L * factor.pivot_begin[front];
-    __builtin_memset(y, 0, sizeof(float) * size.ld);
     for (int i = 0; i < size.pivots; ++i) {
       for (int c = 0; c < 3; ++c) y[3 * i + c] = own[4 * i + c];
     }
-    for (int j = 0; j < size.columns; j += block_columns) {
-      const int width = size.columns - j < block_columns ? size.columns - j : block_columns;
-      const float* block = panel + j * size.ld + j;
-      float* z = y + j;
-      for (int q = 0; q < width; ++q) {
-        z[q] /= block[q * size.ld + q];
-        for (int i = q + 1; i < width; ++i) z[i] -= block[q * size.ld + i] * z[q];
+    __builtin_memset(y + size.columns, 0, sizeof(float) * (3 * size.rows + tile_rows));
+    for (int j = 0; j < size.columns; j += tile_columns) {
+      const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
+      const int below = height - j - width;
+      switch (width) {
+        case 3:
+          forward<3>(tile, y + j, below);
+          break;
+        case 6:
+          forward<6>(tile, y + j, below);
+          break;
+        case 9:
+          forward<9>(tile, y + j, below);
+          break;
+        default:
+          forward<12>(tile, y + j, below);
+          break;
       }
-      int i = width;
-      const int length = int(size.ld) - j;
-      for (; i < length && i % CLOTH_FLOATS != 0; ++i) {
-        for (int q = 0; q < width; ++q) z[i] -= block[q * size.ld + i] * z[q];
-      }
-      if (width == block_columns) {
-        for (; i < length; i += CLOTH_FLOATS) {
-          Floats sum = *reinterpret_cast<const Floats*>(z + i), other{};
-#pragma GCC unroll 8
-          for (int q = 0; q < block_columns; q += 2) {
-            sum -= *reinterpret_cast<const Floats*>(block + q * size.ld + i) * z[q];
-            other -= *reinterpret_cast<const Floats*>(block + (q + 1) * size.ld + i) * z[q + 1];
-          }
-          *reinterpret_cast<Floats*>(z + i) = sum + other;
-        }
-      } else {
-        for (; i < length; i += CLOTH_FLOATS) {
-          Floats sum = *reinterpret_cast<const Floats*>(z + i);
-          for (int q = 0; q < width; ++q) sum -= *reinterpret_cast<const Floats*>(block + q * size.ld + i) * z[q];
-          *reinterpret_cast<Floats*>(z + i) = sum;
-        }
-      }
+      tile += tile_floats(width, below);
     }
     for (int i = 0; i < size.pivots; ++i) {
       for (int c = 0; c < 3; ++c) own[4 * i + c] = y[3 * i + c];
     }
     for (int i = 0; i < size.rows; ++i) {
       float* at = x + 4L * rows[i];
-      for (int c = 0; c < 3; ++c) at[c] += y[size.pivot_rows + 3 * i + c];
+      for (int c = 0; c < 3; ++c) at[c] += y[size.columns + 3 * i + c];
     }
   }
   for (int front = factor.fronts - 1; front >= 0; --front) {
     const FrontSize size(factor, front);
-    const float* panel = factor.panels + factor.panel_begin[front];
+    const float* tile = factor.tiles + factor.tile_begin[front + 1];
     const int* rows = factor.rows + factor.row_begin[front];
+    const int height = size.columns + 3 * size.rows;
     float* own = x + 4L * factor.pivot_begin[front];
-    __builtin_memset(y, 0, sizeof(float) * size.ld);
     for (int i = 0; i < size.pivots; ++i) {
       for (int c = 0; c < 3; ++c) y[3 * i + c] = own[4 * i + c];
     }
     for (int i = 0; i < size.rows; ++i) {
       const float* at = x + 4L * rows[i];
-      for (int c = 0; c < 3; ++c) y[size.pivot_rows + 3 * i + c] = at[c];
+      for (int c = 0; c < 3; ++c) y[size.columns + 3 * i + c] = at[c];
     }
-    for (int j = (size.columns - 1) / block_columns * block_columns; j >= 0; j -= block_columns) {
-      const int width = size.columns - j < block_columns ? size.columns - j : block_columns;
-      const float* block = panel + j * size.ld + j;
-      float* z = y + j;
-      const int length = int(size.ld) - j;
-      float head[block_columns] = {};
-      int i = width;
-      for (; i < length && i % CLOTH_FLOATS != 0; ++i) {
-        for (int q = 0; q < width; ++q) head[q] += block[q * size.ld + i] * z[i];
-      }
-      Floats sum[block_columns];
-      for (int q = 0; q < block_columns; ++q) sum[q] = Floats{};
-      if (width == block_columns) {
-        for (; i < length; i += CLOTH_FLOATS) {
-          const Floats at = *reinterpret_cast<const Floats*>(z + i);
-#pragma GCC unroll 16
-          for (int q = 0; q < block_columns; ++q) {
-            sum[q] += *reinterpret_cast<const Floats*>(block + q * size.ld + i) * at;
-          }
-        }
-      } else {
-        for (; i < length; i += CLOTH_FLOATS) {
-          const Floats at = *reinterpret_cast<const Floats*>(z + i);
-          for (int q = 0; q < width; ++q) sum[q] += *reinterpret_cast<const Floats*>(block + q * size.ld + i) * at;
-        }
-      }
-      for (int q = width - 1; q >= 0; --q) {
-        float value = z[q] - head[q];
-        for (int l = 0; l < CLOTH_FLOATS; ++l) value -= sum[q][l];
-        for (int r = q + 1; r < width; ++r) value -= block[q * size.ld + r] * z[r];
-        z[q] = value / block[q * size.ld + q];
+    __builtin_memset(y + height, 0, sizeof(float) * tile_rows);
+    for (int j = (size.columns - 1) / tile_columns * tile_columns; j >= 0; j -= tile_columns) {
+      const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
+      const int below = height - j - width;
+      tile -= tile_floats(width, below);
+      switch (width) {
+        case 3:
+          backward<3>(tile, y + j, below);
+          break;
+        case 6:
+          backward<6>(tile, y + j, below);
+          break;
+        case 9:
+          backward<9>(tile, y + j, below);
+          break;
+        default:
+          backward<12>(tile, y + j, below);
+          break;
       }
     }
     for (int i = 0; i < size.pivots; ++i) {
