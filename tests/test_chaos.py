@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 import yaml
-from harness import Service, descendants, read_arrays, wait_for
+from harness import Service, command_line, descendants, read_arrays, wait_for
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
@@ -123,3 +124,28 @@ def check_dataset(data: Path, reference: dict[str, Any], builds: Builds) -> None
     assert np.array_equal(group["centerline"], solution.centerline.astype(np.float32))
     pictures = {views.tobytes() for views in group["views"]}
     assert len(pictures) == 48
+
+
+RAY = ("raylet/raylet", "gcs/gcs_server")
+
+
+def test_ray_listens_on_loopback_and_is_replaced_at_once_when_it_dies(service: Service) -> None:
+    def session() -> str | None:
+        alive = [worker["id"] for worker in service.get("/v1/workers") if worker["alive"]]
+        return alive[0] if alive else None
+
+    assert service.process is not None
+    before = wait_for("a worker", session, 60)
+    ours = {service.process.pid, *descendants(service.process.pid)}
+    listeners = subprocess.run(["ss", "-ltnpH"], capture_output=True, text=True, check=True).stdout.splitlines()
+    places = [line.split()[3] for line in listeners if any(f"pid={pid}," in line for pid in ours)]
+    assert len(places) >= 3  # the coordinator's and Ray's
+    assert all("127.0.0.1]:" in place or place.startswith("127.0.0.1:") for place in places), places
+    for part in RAY:
+        kill(next(pid for pid in descendants(service.process.pid) if part in command_line(pid)))
+
+        def replaced(old: str = before) -> str | None:
+            new = session()
+            return None if new == old else new
+
+        before = wait_for(f"a worker after the death of {part}", replaced, 45)

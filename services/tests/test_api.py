@@ -339,3 +339,36 @@ def test_metrics_tell_how_tasks_ended_and_what_is_stored(app: FastAPI, client: h
 def test_other_addresses_than_loopback_are_refused(host: str) -> None:
     with pytest.raises(ValueError, match="host must be a loopback address"):
         Settings(host=host)
+
+
+def test_a_job_has_a_priority_that_can_be_changed(client: httpx.Client) -> None:
+    job = client.post("/v1/jobs", params={"priority": 7}, json=rods()).json()
+    assert job["priority"] == 7
+    changed = client.patch(f"/v1/jobs/{job['id']}", json={"priority": -3})
+    assert (changed.status_code, changed.json()["priority"]) == (200, -3)
+    assert client.get(f"/v1/jobs/{job['id']}").json()["priority"] == -3
+    assert client.get("/v1/jobs").json()["items"][0]["priority"] == -3
+    problem(client.patch("/v1/jobs/job-0", json={"priority": 1}), 404, "not_found")
+    for wrong in ({"priority": 101}, {"priority": 1.5}, {}, {"priority": 1, "state": "failed"}):
+        problem(client.patch(f"/v1/jobs/{job['id']}", json=wrong), 422, "validation_failed")
+    problem(client.post("/v1/jobs", params={"priority": 101}, json=rods()), 422, "validation_failed")
+    client.post(f"/v1/jobs/{job['id']}:cancel")
+    problem(client.patch(f"/v1/jobs/{job['id']}", json={"priority": 1}), 409, "conflict")
+
+
+def test_workers_show_what_they_run_and_how_far_it_is(client: httpx.Client, worker: PretendWorker) -> None:
+    job = client.post("/v1/jobs", json=rods()).json()["id"]
+    running, _ = worker.lease(simulate=2)
+    state = {"task_id": running.task_id, "token": running.token, "started": True, "frames": [40, 300]}
+    client.post("/v1/worker/heartbeat", json={"worker_id": worker.id, "leases": [state]}).raise_for_status()
+    (shown,) = client.get("/v1/workers").json()
+    assert shown["leased"] == 2
+    (task,) = shown["running"]
+    assert (task["task_id"], task["stage"], task["job"], task["frames"]) == (
+        running.task_id,
+        "simulate",
+        job,
+        [40, 300],
+    )
+    assert "40 of 300" in client.get("/workers").text
+    assert client.get(f"/v1/jobs/{job}").json()["progress"]["stages"]["simulate"]["frames"] == [40, 300]

@@ -9,7 +9,7 @@ from stickslip_services.queue.eta import MODEL_ERROR, QUANTILE_80, StageTimings,
 
 def half_width(left: int, timings: StageTimings, slots: int) -> float:
     """Return the half width of the interval, of one stage."""
-    eta = estimate({Stage.simulate: StageWork(left, timings)}, slots=slots)
+    eta = estimate({Stage.simulate: [StageWork(left, timings)]}, slots=slots)
     assert eta is not None
     return eta.high - eta.seconds
 
@@ -57,7 +57,7 @@ def test_the_error_of_a_mean_of_few_grows_with_what_is_left() -> None:
 
 
 def test_stages_add_up_and_one_waits_for_the_other() -> None:
-    work = {Stage.simulate: StageWork(4, timings(10.0, 10.0)), Stage.render: StageWork(2, timings(3.0, 3.0))}
+    work = {Stage.simulate: [StageWork(4, timings(10.0, 10.0))], Stage.render: [StageWork(2, timings(3.0, 3.0))]}
     eta = estimate(work, slots=2)
     assert eta is not None
     assert eta.seconds == pytest.approx((40.0 + 6.0) / 2)

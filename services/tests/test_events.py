@@ -115,3 +115,45 @@ def test_many_watchers_hear_the_end(client: httpx.Client, worker: PretendWorker)
     for thread in threads:
         thread.join(20)
     assert [end[-1] for end in ends] == ["succeeded"] * 8
+
+
+def test_watchers_share_one_look_at_the_database_and_miss_nothing(
+    app: FastAPI, client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch, clock: ManualClock
+) -> None:
+    """Twenty watchers, each from another event on, while old events have left the feed's memory."""
+    monkeypatch.setattr(sse, "KEPT_EVENTS", 2)
+    looks: list[int] = []
+    feeds = app.state.feeds
+    show = feeds._show
+
+    def look(connection: Any, job: int) -> Any:
+        looks.append(job)
+        return show(connection, job)
+
+    monkeypatch.setattr(feeds, "_show", look)
+    job = submit(client, gamma=(1.0, 2.0, 3.0))
+    for _ in range(2):  # events of failed tries
+        worker.report(*((lease, failure()) for lease in worker.lease(simulate=6)))
+        clock.advance(5)
+        app.state.coordinator.sweep()
+    known = [str(number) for number in range(1, 14)]
+    heard: dict[str | None, list[str]] = {}
+
+    def listen(last_id: str | None) -> None:
+        heard[last_id] = [event.id for event in follow(client, job, last_id) if event.event != "job.progress"]
+
+    threads = [threading.Thread(target=listen, args=(last_id,)) for last_id in (None, *known[::2], *known[1::2])]
+    for thread in threads:
+        thread.start()
+    for _ in range(3):
+        clock.advance(5)
+        worker.work()
+    for thread in threads:
+        thread.join(20)
+    everything = heard[None]
+    assert len(everything) > 14
+    assert everything == sorted(set(everything), key=int)
+    for last_id, ids in heard.items():
+        assert ids == [number for number in everything if int(number) > int(last_id or 0)]
+    assert len(looks) < len(threads) * 3
+    assert feeds._feeds == {}  # nobody watches any more

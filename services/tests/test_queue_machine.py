@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
 from sqlalchemy import select
-from stickslip_schemas.states import JobState
+from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.worker_api import Lease
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
@@ -37,6 +37,9 @@ SPECS = (
     rods(gamma=(2.0,), views=None),  # and with the second
     rods(gamma=(2.0,), phi1=(1.0,)),  # all of it is rejected
 )
+
+HOW = ("well", "well", "well", "crashed", "crashed", "broken", "lost", "released")
+"""How a task ends, the likely ways more often."""
 
 Held = tuple[PretendWorker, Lease]
 
@@ -111,11 +114,17 @@ class QueueMachine(RuleBasedStateMachine):
             assert self._is_held(worker, lease) or self._expired_unnoticed(worker, lease)
             self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
 
-    @rule(target=reported, held=consumes(leases), how=st.sampled_from(("well", "well", "well", "badly", "released")))
+    @rule(target=reported, held=consumes(leases), how=st.sampled_from(HOW))
     def report(self, held: Held, how: str) -> Held:
         worker, lease = held
         mine = self._is_held(worker, lease) or self._expired_unnoticed(worker, lease)
-        result = {"well": worker.result(lease.task), "badly": failure(), "released": None}[how]
+        bad = {
+            "crashed": failure(),
+            "broken": failure(Reason.internal_error),
+            "lost": failure(Reason.worker_lost),
+            "released": None,
+        }
+        result = worker.result(lease.task) if how == "well" else bad[how]
         verdict = worker.report((lease, result))
         assert verdict == (["accepted"] if mine else ["stale"])
         if mine:
@@ -157,6 +166,13 @@ class QueueMachine(RuleBasedStateMachine):
             assert job in self.ended or show_job(self.coordinator, job).state is JobState.cancelling
         else:
             assert shown.state in (JobState.queued, JobState.running)
+
+    @rule(job=jobs, priority=st.integers(-2, 2))
+    def prioritise(self, job: str, priority: int) -> None:
+        try:
+            assert self.coordinator.prioritise(job, priority).priority == priority
+        except ConflictError:
+            assert job in self.ended
 
     @rule(seconds=st.sampled_from((1.0, 5.0, 29.0, 31.0)))
     def wait(self, seconds: float) -> None:

@@ -68,8 +68,8 @@ ALLOWED = {
     "pages": set(),
     "api": {"queue", "catalog", "database", "pages"},
     "client": set(),
-    "local": set(),
-    "cli": {"client", "local"},
+    "local": {"database"},
+    "cli": {"client", "local", "database"},
 }
 """Which rooms the modules of a room may import, besides their own and the single modules beside the rooms."""
 

@@ -27,6 +27,7 @@ from stickslip_schemas.tasks import (
     RecordRef,
     Rejection,
 )
+from stickslip_workers.cluster import Cluster
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
 from stickslip_workers.stages.records import encode_records
@@ -149,14 +150,14 @@ def make_dataset(store: Store) -> Callable[..., Made]:
 
 
 @pytest.fixture(scope="session")
-def cluster_cpus() -> Iterator[int]:
+def cluster() -> Iterator[Cluster]:
     """A Ray cluster for all tests, with `fake_renderer` in reach of its processes."""
     from stickslip_workers.cluster import ray_cluster
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", HERE)
-        with ray_cluster(name="tests", address=None, cpus=2) as cpus:
+        patch.setenv("PYTHONPATH", os.pathsep.join([HERE, *filter(None, [os.environ.get("PYTHONPATH")])]))
+        with ray_cluster(name="tests", address=None, cpus=2) as cluster:
             processes = [thing for thing in gc.get_objects() if type(thing) is subprocess.Popen]
-            yield cpus
+            yield cluster
         for process in processes:
             process.wait(timeout=30)  # Ray ends its processes and does not wait, of which Python warns

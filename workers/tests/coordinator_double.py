@@ -32,6 +32,7 @@ class CoordinatorDouble:
         self.changed = threading.Condition(self.lock)
         self.registrations: list[WorkerRegistration] = []
         self.waiting: list[tuple[str, Any]] = []
+        self.given: list[tuple[str, Any]] = []
         self.leased: dict[str, int] = {}
         self.started: set[str] = set()
         self.beats = 0
@@ -40,6 +41,9 @@ class CoordinatorDouble:
         self.drop: set[str] = set()
         self.stale: set[str] = set()
         self.superseded = False
+        self.limits: dict[str, float] = {}
+        self.long: set[str] = set()
+        self.frames: dict[str, tuple[int, int]] = {}
         self._token = 0
         self._server: ThreadingHTTPServer | None = None
         self.port = 0
@@ -116,18 +120,22 @@ class CoordinatorDouble:
         wanted = dict(request.wanted)
         granted, left = [], []
         for name, task in self.waiting:
-            if wanted.get(task.stage, 0) > 0:
+            is_left_out = request.at_most_seconds is not None and name in self.long
+            if wanted.get(task.stage, 0) > 0 and not is_left_out:
                 wanted[task.stage] -= 1
                 self._token += 1
                 self.leased[name] = self._token
-                granted.append(Lease(task_id=name, token=self._token, attempt=1, task=task))
+                limit = self.limits.get(name)
+                granted.append(Lease(task_id=name, token=self._token, attempt=1, limit_seconds=limit, task=task))
             else:
                 left.append((name, task))
         self.waiting = left
+        self.given += [(lease.task_id, lease.task) for lease in granted]
         return LeaseBatch(leases=tuple(granted), retry_after_seconds=0 if granted else 0.05)
 
     def _beat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         self.beats += 1
+        self.frames |= {lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None}
         self.started |= {lease.task_id for lease in heartbeat.leases if lease.started}
         return HeartbeatAnswer(drop=tuple(lease.task_id for lease in heartbeat.leases if lease.task_id in self.drop))
 
@@ -142,6 +150,7 @@ class CoordinatorDouble:
             del self.leased[report.task_id]
             if report.result is None:
                 self.released.append(report.task_id)
+                self.waiting += [item for item in self.given if item[0] == report.task_id and item[0] in self.long]
             else:
                 self.results[report.task_id] = report.result
             verdicts.append(ReportVerdict(task_id=report.task_id, verdict="accepted"))

@@ -11,10 +11,12 @@ from typing import Any
 import fake_renderer
 import pytest
 from coordinator_double import CoordinatorDouble
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask
+from stickslip_workers.cluster import Cluster
 from stickslip_workers.coordinator_client import SupersededError
 from stickslip_workers.dispatcher import Dispatcher
 from stickslip_workers.processes import StartError
@@ -26,8 +28,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves
 class Running:
     """A dispatcher in a thread."""
 
-    def __init__(self, settings: Settings, cpus: int) -> None:
-        self.dispatcher = Dispatcher(settings, cluster_cpus=cpus)
+    def __init__(self, settings: Settings, cluster: Cluster) -> None:
+        self.dispatcher = Dispatcher(settings, cluster)
         self.error: BaseException | None = None
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -59,7 +61,7 @@ Start = Callable[..., Running]
 
 
 @pytest.fixture
-def start(double: CoordinatorDouble, store: Store, cluster_cpus: int) -> Iterator[Start]:
+def start(double: CoordinatorDouble, store: Store, cluster: Cluster) -> Iterator[Start]:
     """Start a dispatcher; it is stopped after the test."""
     store.root.mkdir()
     started: list[Running] = []
@@ -75,7 +77,7 @@ def start(double: CoordinatorDouble, store: Store, cluster_cpus: int) -> Iterato
             "drop_seconds": 0.2,
             "stop_seconds": 0.5,
         }
-        started.append(Running(Settings(**{**settings, **changes}), cluster_cpus))
+        started.append(Running(Settings(**{**settings, **changes}), cluster))
         return started[-1]
 
     yield make
@@ -93,6 +95,13 @@ def _simulate(count: int) -> dict[str, SimulateTask]:
         f"rod-{i}": SimulateTask(simulation=RodHangSimulation(gamma=1.0 + i, phi0=2.0, phi1=5.0, poisson=0.5))
         for i in range(count)
     }
+
+
+def _cloth() -> SimulateTask:
+    cloth = ClothDragSimulation(
+        material="gray-interlock", fabric=None, mu=0.3, preset="fast", mesh=21, frames=300, seed=1
+    )
+    return SimulateTask(simulation=cloth)
 
 
 HANG = fake_renderer.UNTIL_RELEASED
@@ -126,7 +135,7 @@ def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -
     start()
     double.offer(full=_render(fake_renderer.DISK_FULL), bug=_render(fake_renderer.BUG), fine=_render(0))
     double.until(lambda: len(double.results) == 3)
-    assert double.results["full"].reason is Reason.storage_error
+    assert double.results["full"].reason is Reason.store_unavailable
     assert "No space left on device" in double.results["full"].message
     assert double.results["bug"].reason is Reason.internal_error
     assert "a bug" in double.results["bug"].message
@@ -156,6 +165,66 @@ def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, 
     assert double.results["slow"].reason is Reason.exec_timeout
     assert f"not done within 0.5 s; process {pid} killed" in double.results["slow"].message
     double.until(lambda: not Path(f"/proc/{pid}").exists())
+
+
+def test_a_lease_has_a_limit_of_its_own_and_a_stopped_process_is_killed(
+    start: Start, double: CoordinatorDouble, store: Store
+) -> None:
+    start()
+    double.limits["stopped"] = 1.5
+    double.offer(stopped=_render(HANG))
+    pid = _wait_for_pid(double, store, HANG)
+    os.kill(pid, signal.SIGSTOP)  # it hears nothing any more, not even Ray's request to end
+    double.until(lambda: "stopped" in double.results)
+    assert double.results["stopped"].reason is Reason.exec_timeout
+    assert f"not done within 1.5 s; process {pid} killed" in double.results["stopped"].message
+    double.until(lambda: _is_gone(pid))
+
+
+def _is_gone(pid: int) -> bool:
+    try:
+        return b") Z " in Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return True
+
+
+def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDouble, store: Store) -> None:
+    """Two long tasks hold both slots; what was leased ahead goes back, and what is short runs at once."""
+    start(clog_seconds=1.0)
+    double.long |= {"one", "two", "three"}
+    double.offer(one=_render(HANG), two=_render(HANG + 1), three=_render(HANG + 2))
+    _wait_for_pid(double, store, HANG)
+    _wait_for_pid(double, store, HANG + 1)
+    double.until(lambda: "three" in double.leased)  # leased ahead
+    double.until(lambda: double.released == ["three"])
+    double.offer(short=_render(fake_renderer.FINE), **_simulate(3))
+    double.until(lambda: {"short", "rod-0", "rod-1", "rod-2"} <= double.results.keys())
+    assert double.leased.keys() == {"one", "two"}
+    assert not (store.root / f"pid-{HANG + 2}").exists()
+    for number in range(3):
+        (store.root / f"release-{HANG + number}").touch()
+    double.until(lambda: len(double.results) == 7)
+    assert {result.outcome for result in double.results.values()} == {"succeeded"}
+
+
+def test_the_first_call_of_a_process_is_not_gone_by(start: Start, double: CoordinatorDouble) -> None:
+    start(slots=1)
+    double.offer(first=_render(fake_renderer.FINE))
+    double.until(lambda: "first" in double.results)
+    double.offer(second=_render(fake_renderer.FINE))
+    double.until(lambda: "second" in double.results)
+    assert double.results["first"].call_seconds is None
+    call = double.results["second"].call_seconds
+    assert call is not None
+    assert 0 < call < 10
+
+
+def test_a_simulation_tells_how_far_it_is(start: Start, double: CoordinatorDouble) -> None:
+    start()
+    double.offer(cloth=_cloth())
+    double.until(lambda: "cloth" in double.frames, timeout=60)
+    done, frames = double.frames["cloth"]
+    assert 0 < done <= frames == 300
 
 
 def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: Store) -> None:
@@ -269,7 +338,7 @@ def test_a_renderer_that_does_not_start_is_told(start: Start, double: Coordinato
     assert double.registrations == []
 
 
-def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: Store, cluster_cpus: int) -> None:
+def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: Store, cluster: Cluster) -> None:
     settings = Settings(
         url=f"http://127.0.0.1:{double.port}",
         store=store.root,
@@ -280,5 +349,5 @@ def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, s
         start_seconds=1.0,
     )
     # As if the cluster had promised more CPUs than it has.
-    with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 50 CPUs"):
-        Dispatcher(settings, cluster_cpus=100).run()
+    with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 25 CPUs"):
+        Dispatcher(settings, Cluster(100)).run()

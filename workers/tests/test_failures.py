@@ -13,7 +13,10 @@ from stickslip_workers.failures import MESSAGE_LENGTH, failure, process_failure
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
-        (OSError(errno.ENOSPC, "No space left on device"), Reason.storage_error),
+        (OSError(errno.ENOSPC, "No space left on device"), Reason.store_unavailable),
+        (PermissionError(errno.EACCES, "Permission denied"), Reason.store_unavailable),
+        (OSError(errno.EROFS, "Read-only file system"), Reason.store_unavailable),
+        (OSError(errno.EIO, "Input/output error"), Reason.storage_error),
         (FileNotFoundError("artifact"), Reason.storage_error),
         (CorruptArtifactError("artifact"), Reason.storage_error),
         (CorruptChunkError("chunk"), Reason.storage_error),
@@ -31,11 +34,11 @@ def test_what_a_stage_raises(error: Exception, reason: Reason) -> None:
     ("error", "renders", "reason"),
     [
         (ray_errors.RayActorError(), True, Reason.renderer_crash),
-        (ray_errors.RayActorError(), False, Reason.worker_lost),
+        (ray_errors.RayActorError(), False, Reason.process_crash),
         (ray_errors.RayActorError(error_msg="The actor died because its node has died."), True, Reason.worker_lost),
         (ray_errors.OutOfMemoryError("low on memory"), True, Reason.oom_killed),
         (ray_errors.WorkerCrashedError(), False, Reason.worker_lost),
-        (ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")), True, Reason.storage_error),
+        (ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")), True, Reason.store_unavailable),
         (ray_errors.RayTaskError("render", "traceback", "not an exception"), True, Reason.internal_error),
     ],
 )

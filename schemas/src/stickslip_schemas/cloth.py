@@ -1,5 +1,6 @@
 """What the kinds of cloth have in common: materials, presets, clips, and the arrays of a trajectory."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, Self
 
@@ -14,6 +15,7 @@ from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.fabrics import MATERIAL_NAME, FabricNumbers, Material
 from stickslip_schemas.hints import did_you_mean
 from stickslip_schemas.jobs import JobSpec, Quality, Render, Simulation
+from stickslip_schemas.states import Stage
 from stickslip_schemas.textures import Texture
 
 Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
@@ -225,6 +227,12 @@ class ClothSpec(JobSpec):
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the viewpoints, by name."""
         return load_rig(self.rig)
+
+    def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
+        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
+        if stage is Stage.render:
+            return f"{self.quality}, {self.frames} frames"
+        return f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
 
     @property
     def shown_instants(self) -> tuple[int, ...]:

@@ -16,6 +16,7 @@ from stickslip_schemas.axes import MAX_SAMPLES, AnyAxis, Seed
 from stickslip_schemas.base import Document, Float, Int
 from stickslip_schemas.cameras import Camera
 from stickslip_schemas.keys import Sha256, content_key, derived_seed
+from stickslip_schemas.states import Stage
 
 D = TypeVar("D", bound=Document)
 
@@ -143,6 +144,10 @@ class JobSpec(Document):
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the pictures; none where nothing is rendered."""
         raise NotImplementedError
+
+    def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
+        """Return a text that is the same for samples whose `stage` costs about the same; of simulate or render."""
+        return str(self.quality) if stage is Stage.render else ""  # type: ignore[attr-defined]  # all kinds have one
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         """Return the fields of documents that a value of an axis sets: by default the one of the axis's name."""

@@ -21,6 +21,7 @@ class ProblemCode(StrEnum):
     malformed_body = "malformed_body"
     body_too_large = "body_too_large"
     unauthorized = "unauthorized"
+    scope_missing = "scope_missing"
     host_not_allowed = "host_not_allowed"
     origin_not_allowed = "origin_not_allowed"
     not_found = "not_found"
@@ -34,6 +35,7 @@ class ProblemCode(StrEnum):
     unknown_worker = "unknown_worker"
     storage_error = "storage_error"
     busy = "busy"
+    too_slow = "too_slow"
     internal_error = "internal_error"
 
 

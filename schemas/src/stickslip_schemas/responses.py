@@ -20,6 +20,9 @@ class StageProgress(Document):
     counts: dict[TaskState, int]
     cached: int
     cpu_seconds: float = Field(description="measured, of the tasks that this job had to run [s]")
+    frames: tuple[int, int] | None = Field(
+        default=None, description="of the simulations that run and tell: frames done, and frames"
+    )
 
 
 class Eta(Document):
@@ -56,6 +59,7 @@ class Job(Document):
     state: JobState
     reason: Reason | None
     message: str
+    priority: int = Field(description="tasks of the job with the highest number come first")
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -143,6 +147,22 @@ class SampleState(Document):
     message: str
 
 
+class JobPatch(Document):
+    """What can be changed of a job."""
+
+    priority: int = Field(ge=-100, le=100, description="tasks of the job with the highest number come first")
+
+
+class RunningTask(Document):
+    """A task that a worker holds."""
+
+    task_id: str
+    stage: Stage
+    job: str | None
+    since: datetime | None = Field(description="when it was started; null: it waits at the worker")
+    frames: tuple[int, int] | None = Field(description="of a simulation that tells: frames done, and frames")
+
+
 class WorkerEntry(Document):
     """A dispatcher that has registered."""
 
@@ -155,6 +175,7 @@ class WorkerEntry(Document):
     last_seen_at: datetime
     alive: bool = Field(description="it was heard of within the time that a lease lasts")
     leased: int = Field(description="tasks that it holds")
+    running: tuple[RunningTask, ...] = Field(description="of these, the ones that have been started, the oldest first")
 
 
 class Preview(Document):

@@ -47,6 +47,11 @@ class TaskState(StrEnum):
         """True where the task has a result that others may build on."""
         return self in (TaskState.succeeded, TaskState.rejected)
 
+    @property
+    def is_over(self) -> bool:
+        """True where nothing is left to do of it."""
+        return self.is_settled or self in (TaskState.failed, TaskState.cancelled)
+
 
 class Stage(StrEnum):
     """What a task does, in the order of the data's way."""
@@ -65,7 +70,9 @@ class Reason(StrEnum):
     worker_lost = "worker_lost"
     oom_killed = "oom_killed"
     renderer_crash = "renderer_crash"
+    process_crash = "process_crash"
     storage_error = "storage_error"
+    store_unavailable = "store_unavailable"
     internal_error = "internal_error"
     # The sample itself: deterministic, never retried.
     solver_diverged = "solver_diverged"
@@ -74,10 +81,19 @@ class Reason(StrEnum):
     # A job's own.
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"
+    quarantined = "quarantined"
     waiting_for_worker = "waiting_for_worker"
     preset_not_certified = "preset_not_certified"
+
+    @property
+    def ends_a_process(self) -> bool:
+        """True where a task took its process with it; one that does so again and again is set aside."""
+        return self in _ENDING
 
     @property
     def is_deterministic(self) -> bool:
         """True where a second try gives the same answer, so that the sample is rejected and not retried."""
         return self in (Reason.solver_diverged, Reason.out_of_frame, Reason.invalid_sample)
+
+
+_ENDING = {Reason.exec_timeout, Reason.worker_lost, Reason.oom_killed, Reason.renderer_crash, Reason.process_crash}

@@ -4,6 +4,7 @@ An artifact is a file named by its SHA-256. It is written beside its place, made
 reader sees all of it or nothing, and two writers of the same bytes cannot disturb each other.
 """
 
+import errno
 import hashlib
 import os
 import uuid
@@ -14,6 +15,14 @@ from stickslip_schemas.keys import is_sha256, sha256
 
 class CorruptArtifactError(OSError):
     """An artifact's bytes do not have the digest that names them."""
+
+
+_UNAVAILABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ESTALE)
+
+
+def is_unavailable(error: OSError) -> bool:
+    """Tell whether an error says that a store takes no files: it is full, read-only, not ours, or gone."""
+    return error.errno in _UNAVAILABLE
 
 
 class Store:

@@ -168,6 +168,9 @@ class TaskResult(Document):
     )
     cpu_seconds: Float = Field(default=0.0, ge=0)
     wall_seconds: Float = Field(default=0.0, ge=0)
+    call_seconds: Float | None = Field(
+        default=None, ge=0, description="of the whole call that made it, perhaps with others; null: do not go by it [s]"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

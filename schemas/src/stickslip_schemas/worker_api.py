@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from stickslip_schemas.base import Bool, Document, Int
+from stickslip_schemas.base import Bool, Document, Float, Int
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.kinds import KINDS, kind_named
 from stickslip_schemas.states import Stage
@@ -46,6 +46,9 @@ class LeaseRequest(Document):
 
     worker_id: str
     wanted: dict[Stage, Int]
+    at_most_seconds: Float | None = Field(
+        default=None, gt=0, description="leave out tasks of which it is known that they take longer [s]"
+    )
 
 
 class Lease(Document):
@@ -54,6 +57,9 @@ class Lease(Document):
     task_id: str
     token: Int
     attempt: Int = Field(ge=1)
+    limit_seconds: Float | None = Field(
+        default=None, gt=0, description="end the call after this time; null: nothing like it has been measured [s]"
+    )
     task: Task
 
 
@@ -70,6 +76,7 @@ class LeaseState(Document):
     task_id: str
     token: Int
     started: Bool
+    frames: tuple[Int, Int] | None = Field(default=None, description="of a simulation: frames done, and frames")
 
 
 class Heartbeat(Document):

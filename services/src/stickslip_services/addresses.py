@@ -17,9 +17,15 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def http_url(host: str, port: int) -> str:
+def reachable(host: str) -> str:
+    """Return an address at which this machine reaches a server that listens at `host`."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+
+
+def http_url(host: str, port: int, *, tls: bool = False) -> str:
     """Return the URL of a server at `host`, a name or an address of IPv4 or IPv6."""
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    scheme = "https" if tls else "http"
+    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
 
 
 def coordinator_url(url: str | None) -> str:

@@ -13,6 +13,7 @@ import json
 import logging
 import socket
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -23,20 +24,28 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
+from stickslip_schemas.store import Store
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
-from stickslip_services.api.doors import DoorMiddleware, worker_key
+from stickslip_services.api.connections import PatientProtocol, allow_many_files
+from stickslip_services.api.doors import DoorMiddleware, KeyMiddleware
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, workers
+from stickslip_services.api.sse import Feeds
 from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.database.opening import check as check_database
+from stickslip_services.database.opening import locked, opened
+from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.keys import KeyRing, local_worker_key
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.reindexing import reindex as find_versions
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -48,7 +57,9 @@ GRACE_SECONDS = 3
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
     coordinator = Coordinator(settings, clock or steady_clock())
-    metrics = Metrics(coordinator.database, coordinator.store.root, coordinator.alive_workers)
+    metrics = Metrics(
+        coordinator.database, coordinator.store.root, coordinator.alive_workers, coordinator.eta_watch.held
+    )
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -75,7 +86,8 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     )
     app.state.coordinator = coordinator
     app.state.metrics = metrics
-    app.state.worker_key = worker_key(settings.worker_key_path)
+    app.state.feeds = Feeds(coordinator.database, coordinator.bell, coordinator.show)
+    app.state.worker_key = local_worker_key(settings.worker_key_path)
     routers = [module.router for module in (jobs, datasets, certificates, tasks, workers, health, pages)]
     for router in routers:
         app.include_router(router)
@@ -84,7 +96,8 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
-    app.add_middleware(DoorMiddleware, allowed_hosts=settings.allowed_hosts)
+    app.add_middleware(KeyMiddleware, ring=KeyRing(coordinator.database), required=settings.keys_required)
+    app.add_middleware(DoorMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
     app.add_middleware(RequestIdMiddleware)
     app.add_middleware(TimingMiddleware, observe=metrics.observe)
     return app
@@ -120,6 +133,24 @@ class _Server(uvicorn.Server):
             sys.stdout.flush()
 
 
+def reindex(settings: Settings) -> int:
+    """Find the datasets in the store again; return the exit status."""
+    counts = Counter[str]()
+    with locked(settings.data), opened(settings.data, durable=settings.durable) as database:
+        for found in find_versions(database, Store(settings.store_root)):
+            name = f"{found.place.parent.name}:{found.place.name}"
+            if found.fault:
+                sys.stderr.write(f"left out: {found.place}: {found.fault}\n")
+            elif found.is_new:
+                sys.stdout.write(f"{name}  {found.samples} samples\n")
+            counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
+    sys.stderr.write(
+        f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out\n"
+        "certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`\n"
+    )
+    return 1 if counts["bad"] else 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run until a signal comes; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
@@ -127,13 +158,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")
+    parser.add_argument("--allow-host", action="append", dest="allowed_hosts", help="name to be asked by; repeatable")
+    parser.add_argument("--require-keys", action="store_true", default=None, help="no request without a key")
+    parser.add_argument("--behind-proxy", action="store_true", default=None, help="a proxy in front speaks TLS")
+    parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
+    parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
+    parser.add_argument("--reindex", action="store_true", default=None, help="find the datasets in the store, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
     if chosen.pop("openapi", False):
         sys.stdout.write(openapi_text())
         return 0
-    descriptor = chosen.pop("fd", None)
+    descriptor, is_reindexing = chosen.pop("fd", None), chosen.pop("reindex", False)
     try:
         settings = Settings(**chosen)
     except ValidationError as error:
@@ -141,14 +178,30 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     configure_logging()
     try:
+        if is_reindexing:
+            return reindex(settings)
+        check_database(settings.database_path, settings.store_root)
+    except DatabaseRefusedError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    try:
         listener = listen(settings.host, settings.port) if descriptor is None else socket.socket(fileno=descriptor)
     except OSError as error:
         sys.stderr.write(f"error: cannot listen on {settings.host}:{settings.port}: {error.strerror}\n")
         return 2
     settings = settings.model_copy(update={"port": listener.getsockname()[1]})
     config = uvicorn.Config(
-        make_app(settings), log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS, lifespan="on"
+        make_app(settings),
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=GRACE_SECONDS,
+        lifespan="on",
+        proxy_headers=False,
+        http=PatientProtocol,
+        ssl_certfile=settings.tls_certificate,
+        ssl_keyfile=settings.tls_key,
     )
+    allow_many_files()
     server = _Server(config, settings.url)
     server.run(sockets=[listener])
     return 0 if server.started else 1

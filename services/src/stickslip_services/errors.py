@@ -56,5 +56,13 @@ class MissingArtifactError(StickslipError):
     """The store does not have what the database says it has, or not all of it."""
 
 
+class DatabaseRefusedError(Exception):
+    """The database is damaged, lost, or of another version; the message says what to do."""
+
+
 class SupervisorError(Exception):
     """`stickslip up` cannot go on."""
+
+
+class ServerNotInstalledError(Exception):
+    """A server command was called where only the client is installed."""

@@ -6,7 +6,7 @@ from typing import Self
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback
+from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback, reachable
 
 
 class Settings(BaseSettings):
@@ -22,7 +22,15 @@ class Settings(BaseSettings):
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 
     allowed_hosts: tuple[str, ...] = ()
-    """Names, besides those of loopback, under which the coordinator may be asked: those of a proxy on this machine."""
+    """Names, besides those of loopback and `host`, under which the coordinator may be asked."""
+    require_keys: bool = False
+    """Whether every request needs a key. Always so where others than this machine can send some."""
+    behind_proxy: bool = False
+    """Whether a proxy in front of the coordinator speaks TLS to the world. Requests then need keys."""
+    tls_certificate: Path | None = None
+    """File with the certificate, and its chain, with which the coordinator speaks TLS itself."""
+    tls_key: Path | None = None
+    """File with the private key of `tls_certificate`."""
 
     durable: bool = True
     """Wait for the disk at each commit. Without it a power cut may lose what was accepted; for tests."""
@@ -30,25 +38,45 @@ class Settings(BaseSettings):
     """How long a lease lasts without a heartbeat [s]."""
     max_tries: int = Field(default=3, ge=1)
     """Failed tries after which a task fails."""
+    max_losses: int = Field(default=20, ge=1)
+    """Lost workers after which a task is set aside: such a loss is no failed try, but so many are no accident."""
+    max_quarantined: int = Field(default=10, ge=0)
+    """Tasks of a job that may be set aside; with one more the job fails at once."""
+    limit_floor_seconds: float = Field(default=60.0, gt=0)
+    """No call is ended for its cost before this time [s], however little it was expected to take."""
     retry_seconds: float = Field(default=1.0, ge=0)
     """Wait before the second try [s]; it doubles with every further one."""
     sweep_seconds: float = Field(default=1.0, gt=0)
     """Time between two looks at expired leases and due retries [s]."""
     lease_limit: int = Field(default=1000, ge=1)
     """The most tasks of one stage that one request is granted."""
+    min_free_bytes: int = Field(default=256 * 2**20, ge=0)
+    """Space that must stay free on the disks of store and database [bytes]; jobs are paused where less is left."""
     previews_per_job: int = Field(default=24, ge=0)
     """How many samples of a job, evenly spread over its slots, are rendered with a preview."""
     body_limit: int = Field(default=16 * 2**20, ge=1024)
     """The largest request body that is read [bytes]."""
 
     @model_validator(mode="after")
-    def _loopback_only(self) -> Self:
-        if not is_loopback(self.host):
+    def _closed_to_strangers(self) -> Self:
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key must be given together; one of them is missing")
+        for name in ("tls_certificate", "tls_key"):
+            path: Path | None = getattr(self, name)
+            if path is not None and not path.is_file():
+                raise ValueError(f"{name} must be a file, and {path} is none")
+        if not (is_loopback(self.host) or self.tls_certificate or self.behind_proxy):
             raise ValueError(
-                f"host must be a loopback address, because this version has no API keys and anyone who reaches the "
-                f"port may submit and cancel jobs; it is {self.host!r}. Use 127.0.0.1, and an SSH tunnel from afar."
+                f"host must be a loopback address unless the coordinator speaks TLS or a proxy does it, because keys "
+                f"would be readable on the way; it is {self.host!r}. Give --tls-certificate and --tls-key, or "
+                "--behind-proxy, or use 127.0.0.1 and an SSH tunnel."
             )
         return self
+
+    @property
+    def keys_required(self) -> bool:
+        """Whether a request without a key is refused, whatever it asks for."""
+        return self.require_keys or self.behind_proxy or self.tls_certificate is not None or not is_loopback(self.host)
 
     @property
     def database_path(self) -> Path:
@@ -67,5 +95,5 @@ class Settings(BaseSettings):
 
     @property
     def url(self) -> str:
-        """Where the coordinator can be reached."""
-        return http_url(self.host, self.port)
+        """Where the coordinator can be reached from this machine."""
+        return http_url(reachable(self.host), self.port, tls=self.tls_certificate is not None)

@@ -5,9 +5,10 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
@@ -53,6 +54,7 @@ from stickslip_schemas.worker_api import (
     WorkerSession,
 )
 
+from stickslip_services.api.connections import PatientProtocol
 from stickslip_services.catalog import datasets
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.local.sockets import listen
@@ -217,7 +219,7 @@ class PretendWorker:
             output = PackOutput(files=(entry, named))
         else:
             output = self._publish(task)
-        return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0)
+        return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0, call_seconds=1.0)
 
     def _publish(self, task: PublishTask) -> PublishOutput:
         zarr = {file.path: file for file in self._zarr(len(task.sample_keys))}
@@ -319,9 +321,11 @@ class RunningServer:
 class HttpApi:
     """The four verbs of the worker API over HTTP."""
 
-    def __init__(self, url: str, key: str) -> None:
+    def __init__(self, url: str, key: str, post: Callable[..., httpx.Response] | None = None) -> None:
         self._url = url
         self._key = key
+        self._send = post or partial(httpx.post, trust_env=False)
+        """Sends requests; by default each over a connection of its own."""
 
     def register(self, document: WorkerRegistration) -> WorkerSession:
         """Register a worker."""
@@ -342,7 +346,7 @@ class HttpApi:
     def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
         content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
         headers["Authorization"] = f"Bearer {self._key}"
-        response = httpx.post(self._url + path, content=content, headers=headers, trust_env=False)
+        response = self._send(self._url + path, content=content, headers=headers)
         response.raise_for_status()
         return answer.model_validate_json(response.content)
 
@@ -351,7 +355,7 @@ class HttpApi:
 def serving(app: FastAPI) -> Iterator[str]:
     """Serve an application from a thread of this process; yield its URL."""
     listener = listen("127.0.0.1", 0)
-    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1, http=PatientProtocol)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
@@ -364,9 +368,10 @@ def serving(app: FastAPI) -> Iterator[str]:
         listener.close()
 
 
-def start_server(data: Path, port: int = 0) -> RunningServer:
+def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> RunningServer:
     """Start a coordinator and wait until it answers."""
     command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", str(port)]
+    command += options
     log = (data.parent / f"{data.name}.log").open("ab")
     with log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)

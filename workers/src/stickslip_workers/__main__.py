@@ -26,6 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
     dispatch.add_argument("--store", type=Path, required=True, help="root of the store")
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
+    dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
     dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
     dispatch.add_argument("--ray-address", help="an existing Ray cluster (default: a cluster of its own)")
     dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
@@ -71,12 +72,13 @@ def _dispatch(options: argparse.Namespace) -> int:
         store=options.store,
         name=options.name,
         key=None if options.key_file is None else options.key_file.read_text(encoding="ascii").strip(),
+        tls_certificate=options.tls_certificate,
         slots=options.slots,
         ray_address=options.ray_address,
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
-    from stickslip_workers.cluster import ray_cluster
+    from stickslip_workers.cluster import ClusterLostError, ray_cluster
     from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.processes import StartError
 
@@ -91,12 +93,12 @@ def _dispatch(options: argparse.Namespace) -> int:
         dispatcher.stop()
 
     try:
-        with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cpus:
-            dispatcher = Dispatcher(settings, cluster_cpus=cpus)
+        with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cluster:
+            dispatcher = Dispatcher(settings, cluster)
             for number in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(number, stop)  # after Ray has set its own
             dispatcher.run()
-    except (StartError, CoordinatorError) as error:
+    except (ClusterLostError, StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
     return 0

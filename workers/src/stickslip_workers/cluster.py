@@ -1,7 +1,12 @@
 """The Ray cluster: one of our own on this machine, or one that is there already.
 
-A cluster of our own ends with the dispatcher, also after SIGKILL: Ray's own processes get a signal or see their parent
-gone. Two of its agents take up to a minute to see it; the next dispatcher of the same name ends them at once.
+A cluster of our own listens on loopback only. It ends with the dispatcher, also after SIGKILL: Ray's own processes get
+a signal or see their parent gone. Two of its agents take up to a minute to see it; the next dispatcher of the same name
+ends them at once.
+
+Ray itself takes minutes to notice that a part of it has died, and some of its calls then never return. So the processes
+of a cluster of our own are watched: where one is gone the dispatcher ends, and whoever has started it starts another
+one, with another cluster.
 """
 
 import contextlib
@@ -11,8 +16,11 @@ import secrets
 import shutil
 import signal
 import tempfile
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from stickslip_schemas.keys import sha256
@@ -26,16 +34,43 @@ OWNER = "STICKSLIP_RAY_OWNER"
 """Environment variable of all processes of a cluster of ours: its directory and the dispatcher's pid."""
 
 
+WATCH_SECONDS = 0.5
+"""Time between two looks at the processes of a cluster of our own [s]."""
+
+LAST_SECONDS = 5.0
+"""How long the dispatcher may still report what it has after its cluster was lost [s]."""
+
+_ESSENTIAL = ("gcs/gcs_server", "raylet/raylet", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
+"""Parts of the command lines of the processes without which a cluster does not work for long."""
+
+
+class ClusterLostError(RuntimeError):
+    """A process of Ray has died; nothing can be run any more."""
+
+
+@dataclass(slots=True)
+class Cluster:
+    """A Ray cluster."""
+
+    cpus: int
+    lost: str = ""
+    """Which process of it is gone; empty while all are there. Known only of a cluster of our own."""
+    closing: bool = False
+    """Whether its processes are being ended on purpose."""
+
+
 @contextmanager
-def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator[int]:
-    """Connect to the cluster at `address`, or start one with `cpus`; yield the number of its CPUs."""
+def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator[Cluster]:
+    """Connect to the cluster at `address`, or start one with `cpus`."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # a call after the end must not start another cluster
     if address is None:
         directory = _own_directory(name)
         _bury(directory)
-        # Ray listens on every interface: without a token, whoever reaches the machine could run code on it.
+        # Without a token, every user of the machine could run code as this one. The name of the variable is Ray's: with
+        # 0 it takes the loopback address for the node's, and all its processes listen there and nowhere else.
         os.environ |= {
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
             OWNER: f"{directory}:{os.getpid()}",
@@ -53,10 +88,73 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
     import ray  # after the environment is set
 
     ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
+    cluster = Cluster(int(ray.cluster_resources().get("CPU", 0)))
+    if address is None:
+        threading.Thread(target=_watch, args=(cluster, _essential_processes()), name="watch", daemon=True).start()
     try:
-        yield int(ray.cluster_resources().get("CPU", 0))
+        yield cluster
     finally:
+        cluster.closing = True
+        if cluster.lost:  # Ray might wait for what is gone; the next dispatcher buries the rest
+            _end()
         ray.shutdown()
+
+
+def _watch(cluster: Cluster, processes: dict[int, str]) -> None:
+    """Wait until a process of the cluster is gone, and see that this one ends soon after."""
+    while not (gone := [name for pid, name in processes.items() if _parent_of(pid) is None]):
+        time.sleep(WATCH_SECONDS)
+    if cluster.closing:
+        return
+    cluster.lost = gone[0]
+    log.error("%s is gone: this dispatcher ends, and a new one starts with a cluster of its own", gone[0])
+    time.sleep(LAST_SECONDS)
+    _end()
+
+
+def _end() -> None:
+    """End this process at once: what tidies up at its exit would wait for a cluster that is gone."""
+    logging.shutdown()
+    os._exit(1)
+
+
+def _essential_processes() -> dict[int, str]:
+    """Return the processes of the cluster of this process that must live, by pid."""
+    parents = {pid: parent for pid in _pids() if (parent := _parent_of(pid)) is not None}
+    found: dict[int, str] = {}
+    for pid in parents:
+        line = _command_line(pid)
+        name = next((part for part in _ESSENTIAL if part in line), None)
+        if name is not None and os.getpid() in _ancestors(pid, parents):
+            found[pid] = name.rpartition("/")[2].removeprefix("ray::")
+    return found
+
+
+def _ancestors(pid: int, parents: dict[int, int]) -> set[int]:
+    found = set()
+    while (pid := parents.get(pid, 0)) and pid not in found:
+        found.add(pid)
+    return found
+
+
+def _pids() -> list[int]:
+    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
+
+
+def _command_line(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def _parent_of(pid: int) -> int | None:
+    """Return the parent of a process that lives; None where there is none, or only its corpse."""
+    try:
+        state, parent = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:2]
+    except OSError:
+        return None
+    return None if state in "ZX" else int(parent)
 
 
 def _own_directory(name: str) -> Path:

@@ -4,6 +4,7 @@ One thread does everything but heartbeats. It sleeps in `ray.wait` and never blo
 one request, so running work goes on while the coordinator is away, and its results wait.
 """
 
+import contextlib
 import logging
 import time
 from collections import deque
@@ -19,6 +20,7 @@ from stickslip_schemas.tasks import RenderTask, SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
 from stickslip_workers.backoff import Backoff
+from stickslip_workers.cluster import Cluster, ClusterLostError
 from stickslip_workers.coordinator_client import (
     CoordinatorClient,
     CoordinatorError,
@@ -31,7 +33,7 @@ from stickslip_workers.kinds import kind, kind_names
 from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import Settings
-from stickslip_workers.stages.run import AnyTask, damaged_inputs
+from stickslip_workers.stages.run import AnyTask, with_damaged_inputs
 from stickslip_workers.together import apart, together, trace_of
 
 log = logging.getLogger(__name__)
@@ -40,6 +42,18 @@ LONGEST_WAIT = 1.0
 """The loop looks at time limits and dropped leases at least so often [s]."""
 
 REPORTS_A_REQUEST = 512
+
+EXPRESS_SLOTS = 1
+"""Calls beyond `slots` that may run while all of these have been taken for long: short tasks do not wait for hours."""
+
+EXPRESS_POLL_SECONDS = 1.0
+"""Time between two questions for short tasks [s]."""
+
+FRAMES_SECONDS = 2.0
+"""Time between two questions to a simulation how far it is [s]."""
+
+WARM_UP_SECONDS = 10.0
+"""The first call of a process is gone by only where it took longer [s]."""
 
 REPORT_SECONDS = 0.5
 """How long a result waits for others to be reported with, while there is other work to go on with."""
@@ -74,27 +88,38 @@ class Assignment:
     stage: Stage
     process: Process
     started_at: float
+    limit: float
+    """It is ended after this time [s]."""
+    asked: Any = None
+    """Ray's reference to the frames that are done, while the process has not answered."""
+    asked_at: float = 0.0
     unwanted_since: float | None = None
 
 
 class Dispatcher:
     """See the module. `run` returns when `stop` is called; Ray must be connected."""
 
-    def __init__(self, settings: Settings, *, cluster_cpus: int) -> None:
+    def __init__(self, settings: Settings, cluster: Cluster) -> None:
         self._settings = settings
-        self._slots = settings.slots or cluster_cpus
+        self._cluster = cluster
+        self._slots = settings.slots or cluster.cpus
+        most = self._slots + EXPRESS_SLOTS
         # Both pools full take all CPUs of the cluster, so that neither can keep the other from starting.
-        share = int(0.5 * max(cluster_cpus, 1) / self._slots * 1000) / 1000
+        share = int(0.5 * max(cluster.cpus, 1) / most * 1000) / 1000
         common: dict[str, Any] = {
             "store": str(settings.store.resolve()),
-            "size": self._slots,
+            "size": most,
             "num_cpus": share,
             "start_seconds": settings.start_seconds,
             "process_bytes": settings.process_bytes,
         }
         self._stage_pool = Pool(
             PoolSettings(
-                sort="stage", factory="stickslip_workers.stages.actor:StageActor", tasks_per_process=10_000, **common
+                sort="stage",
+                factory="stickslip_workers.stages.actor:StageActor",
+                tasks_per_process=10_000,
+                tells_frames=True,
+                **common,
             )
         )
         self._render_pool = Pool(
@@ -107,7 +132,7 @@ class Dispatcher:
             )
         )
         self._store = Store(settings.store)
-        self._coordinator = CoordinatorClient(settings.url, settings.key)
+        self._coordinator = CoordinatorClient(settings.url, settings.key, settings.tls_certificate)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None
         self._heartbeat: HeartbeatThread | None = None
@@ -121,6 +146,7 @@ class Dispatcher:
         self._renders_share = False
         """Whether the last renders that were leased share traces."""
         self._next_lease = 0.0
+        self._was_clogged = False
         self._stopping = False
 
     def stop(self) -> None:
@@ -143,9 +169,14 @@ class Dispatcher:
 
     def _turn(self) -> None:
         self._collect(self._wait_seconds())
+        if self._cluster.lost:
+            raise ClusterLostError(f"{self._cluster.lost} is gone")
         self._stage_pool.check_starts()
         self._render_pool.check_starts()
         self._enforce_limits()
+        self._ask_for_frames()
+        if self._is_clogged():
+            self._hand_back()
         self._start_work()
         if time.monotonic() < self._backoff.next_try:
             return
@@ -203,6 +234,9 @@ class Dispatcher:
         import ray
 
         pool = self._pool(assignment.stage)
+        seconds = time.monotonic() - assignment.started_at
+        # The first call of a process warms it up: how long it took says little of the others, unless it was long.
+        call_seconds = seconds if assignment.process.tasks or seconds > WARM_UP_SECONDS else None
         try:
             answer, resident = ray.get(ref)
         except ray.exceptions.RayError as error:
@@ -212,14 +246,11 @@ class Dispatcher:
                 log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
                 pool.note_death(assignment.process)
             result = process_failure(error, renders=assignment.stage is Stage.render)
-            results = [
-                result.model_copy(update={"damaged_inputs": damaged_inputs(lease.task, self._store)})
-                for lease in assignment.leases
-            ]
+            results = [with_damaged_inputs(result, lease.task, self._store) for lease in assignment.leases]
         else:
             pool.give_back(assignment.process, resident)
             results = _read_results(answer, assignment.leases)
-        seconds = time.monotonic() - assignment.started_at
+        results = [result.model_copy(update={"call_seconds": call_seconds}) for result in results]
         self._task_seconds[assignment.stage] = 0.8 * self._task_seconds.get(assignment.stage, seconds) + 0.2 * seconds
         if assignment.stage is Stage.simulate:
             each = seconds / len(assignment.leases)
@@ -239,18 +270,18 @@ class Dispatcher:
         """Kill what has run too long, and what nobody wants any more."""
         now = time.monotonic()
         for ref, assignment in list(self._running.items()):
-            limit = self._settings.exec_seconds[assignment.stage]
             if not any(self._book.holds(lease) for lease in assignment.leases):
                 # Most work ends by itself sooner than a new process would start.
                 assignment.unwanted_since = assignment.unwanted_since or now
                 if now < assignment.unwanted_since + self._settings.drop_seconds:
                     continue
-            elif now < assignment.started_at + limit:
+            elif now < assignment.started_at + assignment.limit:
                 continue
             del self._running[ref]
             self._pool(assignment.stage).end(assignment.process)
             result = failed(
-                Reason.exec_timeout, f"not done within {limit:g} s; process {assignment.process.pid} killed"
+                Reason.exec_timeout,
+                f"not done within {assignment.limit:.3g} s; process {assignment.process.pid} killed",
             )
             self._settle(assignment, [result] * len(assignment.leases))
 
@@ -270,10 +301,10 @@ class Dispatcher:
         for stage in reversed(Stage) if long else _PRECEDENCE:
             queue = self._queues[stage]
             pool = self._pool(stage)
-            while queue and len(self._running) < self._slots:
+            while queue and len(self._running) < self._open_slots():
                 process = pool.take()
                 if process is None:
-                    pool.grow(min(_batch_count(stage, queue), self._slots - len(self._running)))
+                    pool.grow(min(_batch_count(stage, queue), self._open_slots() - len(self._running)))
                     break
                 self._assign(_next_batch(queue), stage, process)
 
@@ -283,8 +314,44 @@ class Dispatcher:
         else:
             tasks = _tasks.dump_json([lease.task for lease in leases]).decode()
             ref = process.actor.call.remote("run", tasks)
-        self._running[ref] = Assignment(leases, stage, process, time.monotonic())
+        limits = [lease.limit_seconds for lease in leases if lease.limit_seconds is not None]
+        limit = self._settings.exec_seconds[stage]
+        if len(limits) == len(leases):  # they are put together because they are alike; the longest limit is that of all
+            limit = min(limit, max(limits))
+        self._running[ref] = Assignment(leases, stage, process, time.monotonic(), limit)
         self._book.start(leases)
+
+    def _open_slots(self) -> int:
+        """Return how many calls may run now."""
+        return self._slots + (EXPRESS_SLOTS if self._is_clogged() else 0)
+
+    def _is_clogged(self) -> bool:
+        """Tell whether all slots have been taken for long: then short tasks have a slot of their own."""
+        since = time.monotonic() - self._settings.clog_seconds
+        return sum(assignment.started_at < since for assignment in self._running.values()) >= self._slots
+
+    def _hand_back(self) -> None:
+        """Give back what was leased before all slots were taken for long: another dispatcher may have one free."""
+        if not self._was_clogged:
+            self._release_queued()
+        self._was_clogged = True
+
+    def _ask_for_frames(self) -> None:
+        """Ask simulations that take a while how far they are; heartbeats tell the coordinator."""
+        import ray
+
+        now = time.monotonic()
+        for assignment in self._running.values():
+            if assignment.stage is not Stage.simulate or len(assignment.leases) > 1:
+                continue
+            if assignment.asked is None:
+                if now > max(assignment.asked_at, assignment.started_at) + FRAMES_SECONDS:
+                    assignment.asked, assignment.asked_at = assignment.process.actor.frames.remote(), now
+            elif ray.wait([assignment.asked], timeout=0)[0]:
+                with contextlib.suppress(ray.exceptions.RayError):  # who has died is met in `_take_in`
+                    if (frames := ray.get(assignment.asked)) is not None:
+                        self._book.note_frames(assignment.leases[0], frames)
+                assignment.asked = None
 
     # --- the coordinator ------------------------------------------------------------------------------------
 
@@ -348,8 +415,11 @@ class Dispatcher:
         wanted = self._wanted()
         if not wanted or time.monotonic() < self._next_lease:
             return False
-        batch = self._coordinator.lease(LeaseRequest(worker_id=self._session.worker_id, wanted=wanted))
-        self._next_lease = time.monotonic() + batch.retry_after_seconds
+        clogged = self._is_clogged()
+        at_most = self._settings.clog_seconds if clogged else None
+        request = LeaseRequest(worker_id=self._session.worker_id, wanted=wanted, at_most_seconds=at_most)
+        batch = self._coordinator.lease(request)
+        self._next_lease = time.monotonic() + max(batch.retry_after_seconds, EXPRESS_POLL_SECONDS if clogged else 0.0)
         self._book.add(batch.leases)
         for lease in batch.leases:
             self._queues[Stage(lease.task.stage)].append(lease)
@@ -360,6 +430,10 @@ class Dispatcher:
     def _wanted(self) -> dict[Stage, int]:
         """Return how many tasks to ask for: little more than what can run, so that a kill gives little back."""
         queued = sum(_batch_count(stage, queue) for stage, queue in self._queues.items())
+        if self._is_clogged():
+            free = queued == 0 and len(self._running) < self._open_slots()
+            return {stage: LARGEST_BATCH if stage is Stage.simulate else 1 for stage in Stage} if free else {}
+        self._was_clogged = False
         idle = self._slots - len(self._running) - queued
         wanted = {}
         for stage in (Stage.publish, Stage.pack, Stage.render):
@@ -390,12 +464,17 @@ class Dispatcher:
 
     def _give_back(self) -> None:
         """End all processes and give all leases back, if the coordinator listens; it finds out by itself otherwise."""
-        self._stage_pool.close()
-        self._render_pool.close()
         self._release_queued()
-        for assignment in self._running.values():
-            for lease in assignment.leases:
-                self._release(lease)
+        if self._cluster.lost:
+            result = failed(Reason.worker_lost, f"{self._cluster.lost} of the Ray cluster died")
+            for assignment in self._running.values():
+                self._settle(assignment, [result] * len(assignment.leases))
+        else:
+            self._stage_pool.close()
+            self._render_pool.close()
+            for assignment in self._running.values():
+                for lease in assignment.leases:
+                    self._release(lease)
         self._running.clear()
         for _ in range(3):
             if self._try_to_report():

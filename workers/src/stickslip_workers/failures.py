@@ -2,6 +2,7 @@
 
 from stickslip_schemas.chunks import CorruptChunkError
 from stickslip_schemas.states import Reason
+from stickslip_schemas.store import is_unavailable
 from stickslip_schemas.tasks import TaskResult
 
 MESSAGE_LENGTH = 2000
@@ -16,6 +17,8 @@ def failed(reason: Reason, message: str) -> TaskResult:
 def failure(error: Exception) -> TaskResult:
     """Return the result of a stage that raised `error`."""
     message = f"{type(error).__name__}: {error}"
+    if isinstance(error, OSError) and is_unavailable(error):
+        return failed(Reason.store_unavailable, message)
     if isinstance(error, OSError | CorruptChunkError):
         return failed(Reason.storage_error, message)
     if isinstance(error, MemoryError):
@@ -32,7 +35,6 @@ def process_failure(error: Exception, *, renders: bool) -> TaskResult:
         return failure(error.cause) if isinstance(error.cause, Exception) else failed(Reason.internal_error, str(error))
     if isinstance(error, ray_errors.OutOfMemoryError):
         return failed(Reason.oom_killed, str(error))
-    node_died = "its node has died" in str(error)
-    if renders and isinstance(error, ray_errors.RayActorError) and not node_died:
-        return failed(Reason.renderer_crash, str(error))
+    if isinstance(error, ray_errors.RayActorError) and "its node has died" not in str(error):
+        return failed(Reason.renderer_crash if renders else Reason.process_crash, str(error))
     return failed(Reason.worker_lost, str(error))

@@ -18,8 +18,14 @@ class Host:
         self._inner = getattr(importlib.import_module(module), name)(store)
 
     def describe(self) -> dict[str, Any]:
-        """Return what the object says about itself, and the pid."""
-        return {**self._inner.describe(), "pid": os.getpid()}
+        """Return what the object says about itself, the pid, and the node that it is on."""
+        import ray
+
+        return {**self._inner.describe(), "pid": os.getpid(), "node": ray.get_runtime_context().get_node_id()}
+
+    def frames(self) -> Any:
+        """Return how far the object is, while `call` runs in another thread; None where it does not tell."""
+        return self._inner.frames()
 
     def call(self, method: str, argument: Any) -> tuple[Any, int]:
         """Call a method, and return its answer and the resident memory after it [bytes]."""

@@ -25,6 +25,13 @@ class LeaseBook:
             for lease in leases:
                 self._states[lease.task_id] = LeaseState(task_id=lease.task_id, token=lease.token, started=True)
 
+    def note_frames(self, lease: Lease, frames: tuple[int, int]) -> None:
+        """Note how far a started task is: frames done, and frames."""
+        with self._lock:
+            state = self._states.get(lease.task_id)
+            if state is not None and state.token == lease.token:
+                self._states[lease.task_id] = state.model_copy(update={"frames": frames})
+
     def remove(self, task_id: str, token: int) -> None:
         """Forget a lease; a newer one of the same task stays."""
         with self._lock:

@@ -4,7 +4,10 @@ Actors rather than Ray tasks for both: a process that has described itself is kn
 has started, its time limit is fair, and work that Ray cannot place anywhere shows as a process that does not start.
 """
 
+import contextlib
 import logging
+import os
+import signal
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -37,6 +40,8 @@ class PoolSettings:
     process_bytes: int
     python: str | None = None
     """Another interpreter than this one."""
+    tells_frames: bool = False
+    """Whether a process can be asked how far it is while it works: it then has a second thread."""
 
 
 @dataclass(eq=False)
@@ -48,6 +53,8 @@ class Process:
     """Ray's reference to its description, which is there when the process has started."""
     started_at: float = field(default_factory=time.monotonic)
     pid: int = 0
+    node: str = ""
+    """Id of the node that it runs on."""
     tasks: int = 0
 
 
@@ -102,6 +109,10 @@ class Pool:
 
         self._busy.discard(process)
         ray.kill(process.actor, no_restart=True)
+        if process.pid and process.node == ray.get_runtime_context().get_node_id():
+            # Ray asks a process to end, and one that was stopped does not listen.
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(process.pid, signal.SIGKILL)
 
     def note_death(self, process: Process) -> None:
         """Note that a busy process has died. A lost node may have taken others with it: ask the idle ones."""
@@ -149,6 +160,7 @@ class Pool:
             num_cpus=self._settings.num_cpus,
             max_restarts=0,
             max_task_retries=0,
+            max_concurrency=2 if self._settings.tells_frames else 1,
             scheduling_strategy="SPREAD",
             runtime_env=runtime_env,
         )(host.Host)
@@ -170,7 +182,7 @@ class Pool:
                     f"{_STARTS} {self._settings.sort} processes in a row did not start: {error}"
                 ) from error
             return
-        process.pid = description.pop("pid")
+        process.pid, process.node = description.pop("pid"), description.pop("node")
         if self.description is None:
             self.description = description
         elif description != self.description:

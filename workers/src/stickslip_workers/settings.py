@@ -21,6 +21,8 @@ class Settings:
     """Name of this dispatcher; a second one of the same name takes the first one's place."""
     key: str | None = None
     """What the coordinator wants to be shown by workers; None where it wants nothing."""
+    tls_certificate: Path | None = None
+    """The coordinator's own certificate, which is then trusted by itself; None: certificates are checked as usual."""
     slots: int | None = None
     """How many tasks run at once; by default the CPUs of the cluster."""
     ray_address: str | None = None
@@ -39,6 +41,8 @@ class Settings:
     )
     """Limit of one task, or batch of simulations, by stage; then its process is killed. Cloth takes minutes, and hours
     with the thesis's time steps."""
+    clog_seconds: float = 10
+    """With all slots taken for longer than this, tasks that take less go on beside them."""
     start_seconds: float = 120
     """Limit for a process to be scheduled by Ray and to start; then the dispatcher ends with an error."""
     drop_seconds: float = 5

@@ -1,24 +1,31 @@
-"""Who may come in: the name the coordinator is asked by, the page that asks, and the key of the workers.
+"""Who may come in: the name the coordinator is asked by, the page that asks, and the key that is shown.
 
 A page of another site that is open in a browser on this machine can send requests here too. It cannot forge `Host` and
 `Origin`, so both are checked: the one against DNS rebinding, the other against forged forms.
 """
 
-import hmac
-import secrets
-from pathlib import Path
+from base64 import b64decode
 from urllib.parse import urlsplit
 
-from fastapi import Request
+from sqlalchemy.exc import OperationalError
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Send
+from starlette.types import Scope as HttpScope
 from stickslip_schemas.problems import ProblemCode
-from stickslip_schemas.store import write_durably
 
 from stickslip_services.addresses import is_loopback
-from stickslip_services.api.problems import ProblemError, problem_response
+from stickslip_services.api.problems import problem_response
+from stickslip_services.keys import KeyRing
+from stickslip_services.scopes import Scope, allows
 
 _SAFE = ("GET", "HEAD", "OPTIONS")
+
+_CHALLENGE = 'Bearer realm="stickslip", Basic realm="stickslip: a key as password"'
+_HOW = (
+    ", as `Authorization: Bearer KEY` or as the password of Basic; `stickslip keys create` makes keys, and local "
+    "workers use the one in the file `worker-key` of the data directory"
+)
 
 
 class DoorMiddleware:
@@ -28,7 +35,7 @@ class DoorMiddleware:
         self._app = app
         self._allowed_hosts = allowed_hosts
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
         """Handle a request."""
         refusal = self._refusal(scope) if scope["type"] == "http" else None
         if refusal is None:
@@ -38,7 +45,7 @@ class DoorMiddleware:
         response = problem_response(403, *refusal, path=scope["path"], request_id=request_id)
         await response(scope, receive, send)
 
-    def _refusal(self, scope: Scope) -> tuple[ProblemCode, str] | None:
+    def _refusal(self, scope: HttpScope) -> tuple[ProblemCode, str] | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         name = _host_name(host)
@@ -61,22 +68,75 @@ def _host_name(host: str) -> str | None:
         return None
 
 
-def worker_key(path: Path) -> str:
-    """Return the key of the workers; make it where there is none. Only its owner can read the file."""
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, f"{secrets.token_urlsafe(32)}\n".encode(), mode=0o600)
-    return path.read_text(encoding="ascii").strip()
+class KeyMiddleware:
+    """Asks for a key where one is needed, and looks at what it is for.
+
+    What a request needs follows from its method and path alone, so that a new route is never open by mistake. Where
+    no key is required, everybody on this machine may do everything but be a worker.
+    """
+
+    def __init__(self, app: ASGIApp, ring: KeyRing, *, required: bool) -> None:
+        self._app = app
+        self._ring = ring
+        self._open = frozenset[Scope]() if required else frozenset(Scope) - {Scope.work}
+
+    async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
+        """Handle a request."""
+        needed = needed_scope(scope["method"], scope["path"]) if scope["type"] == "http" else None
+        if needed is None:
+            await self._app(scope, receive, send)
+            return
+        try:
+            refusal = await self._refusal(Headers(scope=scope), needed)
+        except OperationalError:
+            refusal = (503, ProblemCode.storage_error, "the coordinator cannot read its keys; its log says more")
+        if refusal is None:
+            await self._app(scope, receive, send)
+            return
+        status, code, detail = refusal
+        request_id = scope.get("state", {}).get("request_id")
+        headers = {"WWW-Authenticate": _CHALLENGE} if status == 401 else {"Retry-After": "10"} if status == 503 else {}
+        response = problem_response(status, code, detail, path=scope["path"], request_id=request_id, headers=headers)
+        await response(scope, receive, send)
+
+    async def _refusal(self, headers: Headers, needed: Scope) -> tuple[int, ProblemCode, str] | None:
+        authorization = headers.get("authorization")
+        if authorization is None:
+            if needed in self._open:
+                return None
+            return 401, ProblemCode.unauthorized, f"the request needs a key of the scope `{needed}`{_HOW}"
+        secret = _secret(authorization)
+        if secret is None or self._ring.is_fresh:
+            granted = None if secret is None else self._ring.scopes_of(secret)
+        else:
+            granted = await run_in_threadpool(self._ring.scopes_of, secret)
+        if granted is None:
+            return 401, ProblemCode.unauthorized, f"the key is not known, or it was revoked{_HOW}"
+        if needed in self._open or allows(granted, needed):
+            return None
+        has = ", ".join(scope for scope in Scope if scope in granted)
+        return 403, ProblemCode.scope_missing, f"the request needs the scope `{needed}`, and the key has: {has}"
 
 
-def require_worker_key(request: Request) -> None:
-    """Raise ProblemError where a request does not carry the key of the workers."""
-    scheme, _, key = request.headers.get("authorization", "").partition(" ")
-    expected: str = request.app.state.worker_key
-    if scheme.lower() != "bearer" or not hmac.compare_digest(key.strip().encode(), expected.encode()):
-        raise ProblemError(
-            401,
-            ProblemCode.unauthorized,
-            "the worker API needs the key in the file `worker-key` of the data directory, as `Authorization: Bearer`",
-            headers={"WWW-Authenticate": 'Bearer realm="stickslip workers"'},
-        )
+def needed_scope(method: str, path: str) -> Scope | None:
+    """Return what a key must be for to send a request; None where none is needed."""
+    if path in ("/livez", "/readyz") or path.startswith("/static/"):
+        return None
+    if path.startswith("/v1/worker") and method not in _SAFE:
+        return Scope.work
+    if method in _SAFE or path == "/v1/jobs:validate":
+        return Scope.read
+    return Scope.admin if path.startswith("/v1/certificates") else Scope.submit
+
+
+def _secret(authorization: str) -> str | None:
+    """Return the secret of an Authorization header; browsers send it as the password of a user of any name."""
+    scheme, _, value = authorization.partition(" ")
+    if scheme.lower() == "bearer":
+        return value.strip() or None
+    if scheme.lower() != "basic":
+        return None
+    try:
+        return b64decode(value.strip(), validate=True).decode().partition(":")[2] or None
+    except ValueError:
+        return None

@@ -1,11 +1,11 @@
 """Metrics for Prometheus: the queue and the store, read when somebody asks, and what went by since the start."""
 
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import Connection, func, select
 from stickslip_schemas.worker_api import ReportAnswer, ReportBatch
@@ -15,14 +15,16 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.queue.workers import RegisteredWorker, leased_counts
 
+EtaHeld = Mapping[tuple[str, bool], int]
 AliveWorkers = Callable[[Connection], list[RegisteredWorker]]
 
 
 class _QueueCollector(Collector):
-    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers) -> None:
+    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
         self._database = database
         self._store = store
         self._alive_workers = alive_workers
+        self._eta_held = eta_held
 
     def collect(self) -> Iterable[Metric]:
         tasks = GaugeMetricFamily("stickslip_tasks", "Tasks by stage and state", labels=["stage", "state"])
@@ -50,15 +52,22 @@ class _QueueCollector(Collector):
             leases.add_metric([worker.name], held.get(worker.id, 0))
         workers.add_metric([], len(alive))
         slots.add_metric([], sum(worker.slots for worker in alive))
-        return [tasks, by_state, leases, workers, slots, versions, bytes_, disk]
+        etas = CounterMetricFamily(
+            "stickslip_eta_predictions",
+            "Intervals of the time left that were noted every 5 s, by whether the job ended within; 80 % should hold",
+            labels=["kind", "held"],
+        )
+        for (kind, held_true), count in self._eta_held.items():
+            etas.add_metric([kind, str(held_true).lower()], count)
+        return [tasks, by_state, leases, workers, slots, versions, bytes_, disk, etas]
 
 
 class Metrics:
     """The metrics of one coordinator."""
 
-    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers) -> None:
+    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
         self._registry = CollectorRegistry()
-        self._registry.register(_QueueCollector(database, store, alive_workers))
+        self._registry.register(_QueueCollector(database, store, alive_workers, eta_held))
         Info("stickslip", "The coordinator", registry=self._registry).info({"version": __version__})
         self._task_seconds = Histogram(
             "stickslip_task_seconds",

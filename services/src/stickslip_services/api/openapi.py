@@ -9,6 +9,7 @@ from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.problems import Problem
+from stickslip_schemas.responses import JobPatch
 from stickslip_schemas.tasks import task_adapter
 from stickslip_schemas.worker_api import Heartbeat, LeaseRequest, ReportBatch, WorkerRegistration
 
@@ -22,6 +23,7 @@ _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
     "Heartbeat": Heartbeat,
     "ReportBatch": ReportBatch,
     "CertificateUpload": CertificateUpload,
+    "JobPatch": JobPatch,
     "Manifest": Manifest,
     "Problem": Problem,
 }
@@ -32,6 +34,13 @@ def describe(app: FastAPI) -> dict[str, Any]:
     if not app.openapi_schema:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = document.setdefault("components", {}).setdefault("schemas", {})
+        document["components"]["securitySchemes"] = {
+            "key": {
+                "type": "http",
+                "scheme": "bearer",
+                "description": "an API key, as `stickslip keys create` makes it",
+            }
+        }
         # What may be sent is more than what is answered (short forms of axes), so its schema holds for both.
         components.update(body_components(_DOCUMENTS))
         _drop_foreign_errors(document)

@@ -54,6 +54,28 @@ class ProblemError(Exception):
         self.headers = dict(headers or {})
 
 
+def problem_document(
+    status: int,
+    code: ProblemCode,
+    detail: str,
+    *,
+    path: str | None = None,
+    request_id: str | None = None,
+    fields: list[FieldError] | None = None,
+) -> Problem:
+    """Return a problem document, whose type and title follow from its code."""
+    return Problem(
+        type=f"urn:stickslip:problem:{code}",
+        title=code.replace("_", " ").capitalize(),
+        status=status,
+        detail=detail,
+        code=code,
+        instance=path,
+        request_id=request_id,
+        errors=fields or [],
+    )
+
+
 def problem_response(
     status: int,
     code: ProblemCode,
@@ -65,16 +87,7 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
 ) -> Response:
     """Return a problem document as a response."""
-    problem = Problem(
-        type=f"urn:stickslip:problem:{code}",
-        title=code.replace("_", " ").capitalize(),
-        status=status,
-        detail=detail,
-        code=code,
-        instance=path,
-        request_id=request_id,
-        errors=fields or [],
-    )
+    problem = problem_document(status, code, detail, path=path, request_id=request_id, fields=fields)
     # What came with the request may hold what has no UTF-8 form; the answer must be readable all the same.
     content = problem.model_dump_json(ensure_ascii=True)
     return Response(content, status, dict(headers or {}), MEDIA_TYPE)

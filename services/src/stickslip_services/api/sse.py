@@ -1,6 +1,7 @@
 """Event streams: what was written of a job since some event, then what happens, until the job ends.
 
-A stream holds no database connection while it waits, and it waits for the bell, not in a loop. Progress is a picture of
+All watchers of a job share one feed, which alone looks into the database: a thousand watchers cost it no more than one.
+A feed holds no database connection while it waits, and it waits for the bell, not in a loop. Progress is a picture of
 the present, so it is not stored and does not have an id of its own: it carries that of the event before it.
 """
 
@@ -24,6 +25,8 @@ KEEP_ALIVE_SECONDS = 15.0
 PROGRESS_SECONDS = 1.0
 LOOK_SECONDS = 0.2
 BATCH = 200
+KEPT_EVENTS = 1000
+"""So many of the last events a feed keeps in memory; who wants older ones reads them from the database."""
 
 
 OPENAPI = {
@@ -44,10 +47,34 @@ Show = Callable[[Connection, int], JobDetail]
 """Returns a job as a transaction sees it."""
 
 
-def stream(database: Database, bell: Bell, show: Show, job: int, *, after: int) -> StreamingResponse:
-    """Answer with the events of a job after the one with the id `after`."""
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # no proxy is to hold events back
-    return StreamingResponse(_events(database, bell, show, job, after), headers=headers, media_type="text/event-stream")
+class Feeds:
+    """The feeds of the jobs that are being watched. For one event loop."""
+
+    def __init__(self, database: Database, bell: Bell, show: Show) -> None:
+        self._database = database
+        self._bell = bell
+        self._show = show
+        self._feeds: dict[int, _Feed] = {}
+
+    def stream(self, job: int, *, after: int) -> StreamingResponse:
+        """Answer with the events of a job after the one with the id `after`."""
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # no proxy is to hold events back
+        return StreamingResponse(self._watch(job, after), headers=headers, media_type="text/event-stream")
+
+    async def _watch(self, job: int, cursor: int) -> AsyncIterator[bytes]:
+        feed = self._feeds.get(job)
+        if feed is None:
+            feed = self._feeds[job] = _Feed(self._database, self._bell, self._show, job, cursor)
+        feed.watchers += 1
+        try:
+            async for message in feed.messages(cursor):
+                yield message
+        finally:
+            feed.watchers -= 1
+            if feed.watchers == 0:
+                feed.task.cancel()
+                if self._feeds.get(job) is feed:
+                    del self._feeds[job]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,49 +84,117 @@ class _News:
     ended: bool
 
 
-def _read(database: Database, show: Show, job: int, after: int, *, with_progress: bool) -> _News:
-    with database.read() as connection:
-        events = read_events(connection, job, after=after, limit=BATCH)
-        shown = show(connection, job)
-    ended = shown.state.is_terminal and len(events) < BATCH
-    progress = JobProgressEvent(progress=shown.progress).model_dump_json() if with_progress or ended else None
-    return _News(events, progress, ended)
+class _Feed:
+    """What is known of a job, kept up to date while somebody watches."""
 
+    def __init__(self, database: Database, bell: Bell, show: Show, job: int, after: int) -> None:
+        self._database = database
+        self._bell = bell
+        self._show = show
+        self._job = job
+        self._after = after
+        """The events after this one, up to the last that there is, are in `_events`."""
+        self._events: list[StoredEvent] = []
+        self._progress = ""
+        self._is_complete = False
+        """Whether there is nothing more to come: the job has ended, and all of its events are known."""
+        self._version = 0
+        self._changed = asyncio.Event()
+        self.watchers = 0
+        self.task = asyncio.create_task(self._follow())
 
-async def _events(database: Database, bell: Bell, show: Show, job: int, cursor: int) -> AsyncIterator[bytes]:
-    opening = f"retry: {RECONNECT_MILLISECONDS}\n".encode()  # goes with the first event
-    told = ""
-    told_at = -PROGRESS_SECONDS
-    spoken_at = time.monotonic()
-    while True:
-        rung = bell.rung
-        now = time.monotonic()
-        is_progress_due = now - told_at >= PROGRESS_SECONDS
-        news = await run_in_threadpool(_read, database, show, job, cursor, with_progress=is_progress_due)
-        messages: list[bytes] = []
-        last: list[bytes] = []  # the end of the job is the last event, also after the progress that goes with it
-        for event in news.events:
-            cursor = event.id
-            (last if event.is_last else messages).append(_message(event.name, event.data, cursor))
-        if news.progress is not None and news.progress != told and (last or not news.ended):
-            told, told_at = news.progress, now
-            messages.append(_message(EventName.job_progress, news.progress, cursor - 1 if last else cursor))
-        if messages or last:
-            messages.insert(0, opening)
-            opening = b""
-        elif now - spoken_at >= KEEP_ALIVE_SECONDS:
-            messages.append(b": still here\n\n")
-        if messages:
-            spoken_at = now
-            yield b"".join([*messages, *last])
-        if news.ended:
-            return
-        if len(news.events) == BATCH:
-            continue
-        # A busy queue rings all the time; a few looks a second are enough for people.
-        await asyncio.sleep(LOOK_SECONDS)
-        due_in = KEEP_ALIVE_SECONDS if is_progress_due else told_at + PROGRESS_SECONDS - time.monotonic()
-        await bell.wait(rung, max(0.0, min(due_in, spoken_at + KEEP_ALIVE_SECONDS - time.monotonic())))
+    async def messages(self, cursor: int) -> AsyncIterator[bytes]:
+        """Yield what a watcher who has seen the events up to `cursor` is told."""
+        opening = f"retry: {RECONNECT_MILLISECONDS}\n".encode()  # goes with the first event
+        told = ""
+        while True:
+            version, changed = self._version, self._changed
+            events = await self._events_after(cursor)
+            messages: list[bytes] = []
+            last: list[bytes] = []  # the end of the job is the last event, also after the progress that goes with it
+            for event in events:
+                cursor = event.id
+                (last if event.is_last else messages).append(_message(event.name, event.data, cursor))
+            is_up_to_date = cursor >= self._newest
+            ended = self._is_complete and is_up_to_date
+            if self._progress not in ("", told) and is_up_to_date and (last or not ended):
+                told = self._progress
+                messages.append(_message(EventName.job_progress, told, cursor - 1 if last else cursor))
+            if messages or last:
+                messages.insert(0, opening)
+                opening = b""
+                yield b"".join([*messages, *last])
+            if ended:
+                return
+            if self.task.done():
+                self.task.result()  # raises what has gone wrong; the client comes back
+                return
+            if version == self._version and is_up_to_date:
+                try:
+                    await asyncio.wait_for(changed.wait(), KEEP_ALIVE_SECONDS)
+                except TimeoutError:
+                    yield b": still here\n\n"
+
+    @property
+    def _newest(self) -> int:
+        return self._events[-1].id if self._events else self._after
+
+    async def _events_after(self, cursor: int) -> list[StoredEvent]:
+        if cursor >= self._after:
+            return [event for event in self._events if event.id > cursor]
+        older = await run_in_threadpool(self._read, cursor)
+        return [event for event in older if event.id <= self._newest]  # what is newer comes with its progress
+
+    def _read(self, after: int) -> list[StoredEvent]:
+        with self._database.read() as connection:
+            return read_events(connection, self._job, after=after, limit=BATCH)
+
+    def _look(self, *, with_progress: bool) -> _News:
+        with self._database.read() as connection:
+            events = read_events(connection, self._job, after=self._newest, limit=BATCH)
+            shown = (
+                self._show(connection, self._job) if with_progress or any(event.is_last for event in events) else None
+            )
+        ended = shown is not None and shown.state.is_terminal and len(events) < BATCH
+        progress = None if shown is None else JobProgressEvent(progress=shown.progress).model_dump_json()
+        return _News(events, progress, ended)
+
+    async def _follow(self) -> None:
+        """Look for news until the job ends or nobody watches any more."""
+        looked_at = -PROGRESS_SECONDS
+        try:
+            while not self._is_complete:
+                rung = self._bell.rung
+                now = time.monotonic()
+                is_progress_due = now - looked_at >= PROGRESS_SECONDS
+                news = await run_in_threadpool(self._look, with_progress=is_progress_due)
+                if news.progress is not None:
+                    looked_at = now
+                self._take(news)
+                if len(news.events) == BATCH or self._is_complete:
+                    continue
+                # A busy queue rings all the time; a few looks a second are enough for people.
+                await asyncio.sleep(LOOK_SECONDS)
+                due_in = KEEP_ALIVE_SECONDS if is_progress_due else looked_at + PROGRESS_SECONDS - time.monotonic()
+                await self._bell.wait(rung, max(0.0, due_in))
+        finally:
+            self._tell()
+
+    def _take(self, news: _News) -> None:
+        is_new = bool(news.events) or news.ended or news.progress not in (None, self._progress)
+        self._events += news.events
+        if len(self._events) > 2 * KEPT_EVENTS:
+            self._after = self._events[-KEPT_EVENTS - 1].id
+            del self._events[:-KEPT_EVENTS]
+        self._progress = news.progress or self._progress
+        self._is_complete = news.ended
+        if is_new:
+            self._tell()
+
+    def _tell(self) -> None:
+        self._version += 1
+        self._changed.set()
+        self._changed = asyncio.Event()
 
 
 def _message(name: EventName, data: str, identifier: int) -> bytes:

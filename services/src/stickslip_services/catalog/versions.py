@@ -86,6 +86,18 @@ def find_reserved(connection: Connection, publish_task: int) -> tuple[str, int] 
     return None if row is None else (row.dataset, row.version)
 
 
+def version_exists(connection: Connection, dataset: str, version: int) -> bool:
+    """Tell whether a number of a dataset is taken."""
+    columns = dataset_versions.c
+    query = select(columns.version).where(columns.dataset == dataset, columns.version == version)
+    return connection.scalar(query) is not None
+
+
+def reserve_number(connection: Connection, dataset: str, version: int, publish_task: int) -> None:
+    """Give a publish task this number of a version."""
+    connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task))
+
+
 def commit_version(
     connection: Connection, publish_task: int, summary: ManifestSummary, *, name: str | None, now: float
 ) -> None:

@@ -10,8 +10,18 @@ from rich.markup import escape
 
 from stickslip_services.cli.specs import SpecFileError
 from stickslip_services.client.calls import ClientError, ProblemError, UnreachableError
-from stickslip_services.errors import SupervisorError
+from stickslip_services.errors import DatabaseRefusedError, NotFoundError, ServerNotInstalledError, SupervisorError
 from stickslip_services.local.certifying import CertifyError
+
+_SHOWN = (
+    CertifyError,
+    ClientError,
+    DatabaseRefusedError,
+    NotFoundError,
+    ServerNotInstalledError,
+    SpecFileError,
+    SupervisorError,
+)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,7 +47,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
                 f"{error}. Is a coordinator running there? `stickslip up` starts one on this machine; "
                 "--url or STICKSLIP_URL names another."
             )
-        except (CertifyError, ClientError, SpecFileError, SupervisorError) as error:
+        except _SHOWN as error:
             _print(str(error))
         except OSError as error:
             _print(f"{error.filename or 'the file system'}: {error.strerror or error}")

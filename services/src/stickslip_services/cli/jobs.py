@@ -30,6 +30,9 @@ from stickslip_services.client.http import Client, UnreachableError
 
 SHOWN_REJECTS = 50
 
+PRIORITY = "tasks of the job with the highest number come first; jobs of one number share evenly"
+PriorityOption = Annotated[int, typer.Option(min=-100, max=100, help=PRIORITY)]
+
 
 @shows_errors
 def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
@@ -85,11 +88,12 @@ def submit(
     idempotency_key: Annotated[
         str | None, typer.Option(help="a key that you choose; two submissions with the same key make one job")
     ] = None,
+    priority: PriorityOption = 0,
 ) -> None:
     """Submit a job and print its id."""
     document = read_spec(file)
     with Client(url) as client:
-        job = client.submit(document, idempotency_key=idempotency_key)
+        job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
         typer.echo(job.id)
         if not then_watch:
             say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
@@ -157,6 +161,8 @@ def _job_table(job: JobDetail) -> Table:
     shown.add_row("state", wording.state(job.state))
     if job.message:
         shown.add_row("", escape(job.message))
+    if job.priority:
+        shown.add_row("priority", str(job.priority))
     shown.add_row("tasks", escape(wording.stages(job.progress)))
     if not job.state.is_terminal:
         shown.add_row("time left", wording.eta(job.progress.eta))
@@ -205,3 +211,15 @@ def resume(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
     with Client(url) as client:
         job = client.resume(job_id)
     console().print(f"{job.id} is {wording.state(job.state)}. To watch it: stickslip watch {job.id}")
+
+
+@shows_errors
+def prioritise(
+    job_id: JobArgument,
+    priority: Annotated[int, typer.Argument(min=-100, max=100, help=PRIORITY)],
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Give a job another priority, from its next task on. What runs goes on."""
+    with Client(url) as client:
+        job = client.prioritise(job_id, priority)
+    console().print(f"{job.id} has priority {job.priority}")

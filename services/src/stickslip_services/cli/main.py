@@ -8,7 +8,9 @@ import typer
 from stickslip_services import __version__
 from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import datasets, pull_dataset, verify
-from stickslip_services.cli.jobs import cancel, jobs, pause, resume, show, submit, validate, watch_job
+from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
+from stickslip_services.cli.keys import app as keys
+from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.up import up
 from stickslip_services.cli.workers import workers
 
@@ -38,10 +40,12 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "watch": watch_job,
     "pause": pause,
     "resume": resume,
+    "priority": prioritise,
     "cancel": cancel,
     "datasets": datasets,
     "pull": pull_dataset,
     "verify": verify,
+    "reindex": reindex,
     "certify": certify,
     "register": register,
     "certificates": certificates,
@@ -49,3 +53,5 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 
 for _name, _command in _COMMANDS.items():
     app.command(name=_name)(_command)
+
+app.add_typer(keys, name="keys")

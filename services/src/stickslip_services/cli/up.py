@@ -1,6 +1,5 @@
 """Running a coordinator and a dispatcher on this machine."""
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -10,23 +9,7 @@ from rich.markup import escape
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
 from stickslip_services.cli.common import console
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client.http import ClientError
-
-_SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
-
-
-class ServerNotInstalledError(ClientError):
-    """A server command was called where only the client is installed."""
-
-
-def require_server(command: str) -> None:
-    """Raise ServerNotInstalledError where the packages of the server are missing."""
-    missing = [name for name in _SERVER_MODULES if find_spec(name) is None]
-    if missing:
-        raise ServerNotInstalledError(
-            f"`stickslip {command}` needs the server, and {', '.join(missing)} is not installed: "
-            "pip install 'stickslip-services[server]'"
-        )
+from stickslip_services.installed import require_server
 
 
 def _url_option(url: str) -> str:
@@ -37,8 +20,19 @@ def _url_option(url: str) -> str:
 def up(
     data: Annotated[Path, typer.Option(help="directory of everything: database, store, logs")] = Path("stickslip-data"),
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
-    host: Annotated[str, typer.Option(help="address to listen on; this version knows loopback only")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
+    ] = "127.0.0.1",
     slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
+    allow_host: Annotated[
+        list[str] | None, typer.Option(help="name that the coordinator may be asked by; repeatable")
+    ] = None,
+    require_keys: Annotated[bool, typer.Option("--require-keys", help="refuse every request without a key")] = False,
+    behind_proxy: Annotated[
+        bool, typer.Option("--behind-proxy", help="a proxy in front speaks TLS to the world; requests need keys")
+    ] = False,
+    tls_certificate: Annotated[Path | None, typer.Option(help="file with the certificate and its chain")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="file with the private key of the certificate")] = None,
     dispatcher: Annotated[str | None, typer.Option(hidden=True, help="another dispatcher, for tests")] = None,
 ) -> None:
     """Run a coordinator and a dispatcher with their workers on this machine, until Ctrl-C."""
@@ -46,8 +40,16 @@ def up(
     from stickslip_services.local import supervisor  # it starts a server, and its settings need the server's packages
 
     screen = console()
+    doors = {
+        "allowed_hosts": tuple(allow_host or ()),
+        "require_keys": require_keys,
+        "behind_proxy": behind_proxy,
+        "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
+        "tls_key": None if tls_key is None else tls_key.absolute(),
+    }
+    given = {name: value for name, value in doors.items() if value}
     status = supervisor.run(
-        supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher),
+        supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher, doors=given),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"

@@ -79,9 +79,11 @@ class AsyncClient:
         """Ask what a job would be."""
         return await self._ask(calls.validate(spec))
 
-    async def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None) -> JobDetail:
+    async def submit(
+        self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0
+    ) -> JobDetail:
         """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
-        return await self._ask(calls.submit(spec, idempotency_key))
+        return await self._ask(calls.submit(spec, idempotency_key, priority))
 
     async def job(self, job_id: str) -> JobDetail:
         """Return a job."""
@@ -98,6 +100,10 @@ class AsyncClient:
     async def previews(self, job_id: str) -> list[Preview]:
         """Return the previews of a job."""
         return await self._ask(calls.previews(job_id))
+
+    async def prioritise(self, job_id: str, priority: int) -> JobDetail:
+        """Give a job another priority: tasks of the job with the highest number come first."""
+        return await self._ask(calls.prioritise(job_id, priority))
 
     async def cancel(self, job_id: str) -> JobDetail:
         """Cancel a job."""

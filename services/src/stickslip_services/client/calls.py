@@ -120,10 +120,16 @@ def validate(spec: Mapping[str, Any]) -> Call[Validation]:
     return Call("POST", "/v1/jobs:validate", TypeAdapter(Validation), {"json": spec})
 
 
-def submit(spec: Mapping[str, Any], idempotency_key: str | None) -> Call[JobDetail]:
+def submit(spec: Mapping[str, Any], idempotency_key: str | None, priority: int) -> Call[JobDetail]:
     """Submit a job; without a key, one is made."""
     headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
-    return Call("POST", "/v1/jobs", _JOB, {"json": spec, "headers": headers})
+    query = {"priority": str(priority)} if priority else {}
+    return Call("POST", "/v1/jobs", _JOB, {"json": spec, "headers": headers, "params": query})
+
+
+def prioritise(job_id: str, priority: int) -> Call[JobDetail]:
+    """Give a job another priority."""
+    return Call("PATCH", f"/v1/jobs/{job_id}", _JOB, {"json": {"priority": priority}})
 
 
 def job(job_id: str) -> Call[JobDetail]:

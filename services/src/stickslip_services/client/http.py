@@ -83,9 +83,9 @@ class Client:
         """Ask what a job would be."""
         return self._ask(calls.validate(spec))
 
-    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None) -> JobDetail:
+    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0) -> JobDetail:
         """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
-        return self._ask(calls.submit(spec, idempotency_key))
+        return self._ask(calls.submit(spec, idempotency_key, priority))
 
     def job(self, job_id: str) -> JobDetail:
         """Return a job."""
@@ -102,6 +102,10 @@ class Client:
     def previews(self, job_id: str) -> list[Preview]:
         """Return the previews of a job."""
         return self._ask(calls.previews(job_id))
+
+    def prioritise(self, job_id: str, priority: int) -> JobDetail:
+        """Give a job another priority: tasks of the job with the highest number come first."""
+        return self._ask(calls.prioritise(job_id, priority))
 
     def cancel(self, job_id: str) -> JobDetail:
         """Cancel a job."""

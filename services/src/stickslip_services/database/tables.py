@@ -58,6 +58,7 @@ jobs = Table(
     Column("reason", String),
     Column("message", Text, nullable=False),
     Column("rejected_count", Integer, nullable=False),
+    Column("priority", Integer, nullable=False, server_default="0"),
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
@@ -93,6 +94,7 @@ tasks = Table(
     Column("build", String, nullable=False),  # of its stage: what a worker must have to run it
     Column("payload", Text, nullable=False),  # JSON; what the task is besides the results it waits for
     Column("preview", Boolean, nullable=False),
+    Column("cost_group", String, nullable=False, server_default=""),  # tasks of one group cost about the same
     Column("job", Integer, nullable=False),  # the oldest live job that needs it, while it is pending
     Column("state", String, nullable=False),
     Column("reason", String),
@@ -103,6 +105,7 @@ tasks = Table(
     Column("expires_at", Float),
     Column("attempts", Integer, nullable=False, server_default="0"),  # times that it was started
     Column("tries", Integer, nullable=False, server_default="0"),  # of these, the failed ones
+    Column("losses", Integer, nullable=False, server_default="0"),  # of these, the ones that a lost worker ended
     Column("retry_at", Float),
     Column("reported_token", Integer),
     Column("reported_by", String),
@@ -118,6 +121,7 @@ tasks = Table(
         "kind",
         "job",
         "seq",
+        "cost_group",
         sqlite_where=text("state = 'pending' AND waiting_on = 0"),
         postgresql_where=text("state = 'pending' AND waiting_on = 0"),
     ),
@@ -206,14 +210,26 @@ task_counts = Table(
     Column("count", Integer, nullable=False),
 )
 
-stage_timings = Table(
-    "stage_timings",
+job_groups = Table(
+    "job_groups",
+    metadata,
+    Column("job", Integer, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
+    Column("stage", String, primary_key=True),
+    Column("cost_group", String, primary_key=True),
+    Column("left", Integer, nullable=False),  # tasks of the group that are not over
+)
+
+cost_groups = Table(
+    "cost_groups",
     metadata,
     Column("stage", String, primary_key=True),
     Column("kind", String, primary_key=True),
-    Column("wall_count", Integer, nullable=False),
-    Column("wall_sum", Float, nullable=False),
+    Column("cost_group", String, primary_key=True),
+    Column("count", Integer, nullable=False),  # of finished tasks; halved with the sums now and then (ledger.py)
+    Column("wall_sum", Float, nullable=False),  # of a task's share of the call that made it
     Column("wall_squares", Float, nullable=False),
+    Column("call_sum", Float, nullable=False),  # of the whole call
+    Column("call_squares", Float, nullable=False),
 )
 
 datasets = Table(
@@ -254,6 +270,19 @@ certificates = Table(
     Column("passed", Boolean, nullable=False),
     Column("created_at", Float, nullable=False),
     Index("ix_certificates_preset_sim_core", "preset", "sim_core"),
+    sqlite_autoincrement=True,
+)
+
+api_keys = Table(
+    "api_keys",
+    metadata,
+    Column("seq", Integer, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("name", String, nullable=False),
+    Column("digest", String, nullable=False, unique=True),  # SHA-256 of the secret, which is nowhere
+    Column("scopes", String, nullable=False),  # words, with spaces between
+    Column("created_at", Float, nullable=False),
+    Column("revoked_at", Float),
     sqlite_autoincrement=True,
 )
 

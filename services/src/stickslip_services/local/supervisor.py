@@ -6,7 +6,6 @@ it starts ends the whole with its last words.
 """
 
 import ctypes
-import fcntl
 import os
 import shlex
 import signal
@@ -14,17 +13,18 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import IO, Any
 
 import httpx
+from pydantic import ValidationError
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.addresses import is_loopback
+from stickslip_services.database.opening import check, locked
 from stickslip_services.errors import SupervisorError
 from stickslip_services.local.sockets import listen
 from stickslip_services.settings import Settings
@@ -50,6 +50,8 @@ class LocalService:
     slots: int | None = None
     dispatcher: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
+    doors: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the coordinator that say who may come in, by name."""
 
 
 @dataclass(slots=True)
@@ -134,20 +136,17 @@ class _Child:
 def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable[[str], None] | None = None) -> int:
     """Run until a signal to stop; return the exit status. Raise SupervisorError."""
     say = say or (lambda message: print_line(sys.stderr, message))
-    if not is_loopback(service.host):
-        raise SupervisorError(
-            f"host must be a loopback address such as 127.0.0.1, and it is {service.host!r}: this version has no API "
-            "keys, so anyone who reached the port could submit and cancel jobs. From afar, use an SSH tunnel."
-        )
     data = service.data.absolute()
+    settings = _settings(service, data)
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        lock = stack.enter_context(_locked(data / "lock"))
+        lock = stack.enter_context(locked(data))
+        check(settings.database_path, settings.store_root)
         signals = stack.enter_context(_stop_signals())
         # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
         listener = _listen(service.host, service.port)
         stack.callback(listener.close)
-        settings = Settings(data=data, host=service.host, port=listener.getsockname()[1])
+        settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         coordinator = _Child(
             "coordinator",
             _coordinator_command(settings, listener.fileno()),
@@ -158,7 +157,7 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
         children = [coordinator, dispatcher]
         try:
             coordinator.start()
-            if not _wait_until_ready(settings.url, coordinator, signals):
+            if not _wait_until_ready(settings, coordinator, signals):
                 return 0
             write_durably(data / "url", f"{settings.url}\n".encode())
             dispatcher.start()
@@ -180,10 +179,24 @@ def print_line(stream: IO[str], message: str) -> None:
     stream.flush()
 
 
+def _settings(service: LocalService, data: Path) -> Settings:
+    try:
+        return Settings(data=data, host=service.host, port=service.port, **service.doors)
+    except ValidationError as error:
+        raise SupervisorError(
+            "; ".join(item["msg"].removeprefix("Value error, ") for item in error.errors())
+        ) from error
+
+
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     module = "stickslip_services.coordinator"
     place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
-    return [sys.executable, "-m", module, *place]
+    doors = [f"--allow-host={host}" for host in settings.allowed_hosts]
+    doors += ["--require-keys"] if settings.require_keys else []
+    doors += ["--behind-proxy"] if settings.behind_proxy else []
+    if settings.tls_certificate is not None:
+        doors += ["--tls-certificate", str(settings.tls_certificate), "--tls-key", str(settings.tls_key)]
+    return [sys.executable, "-m", module, *place, *doors]
 
 
 def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
@@ -191,6 +204,7 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
     if service.dispatcher is not None:
         program = shlex.split(service.dispatcher)
     slots = [] if service.slots is None else ["--slots", str(service.slots)]
+    pinned = [] if settings.tls_certificate is None else ["--tls-certificate", str(settings.tls_certificate)]
     return [
         *program,
         "dispatch",
@@ -202,14 +216,16 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
         "local",
         "--key-file",
         str(settings.worker_key_path),
+        *pinned,
         *slots,
     ]
 
 
-def _wait_until_ready(url: str, coordinator: _Child, signals: list[int]) -> bool:
+def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int]) -> bool:
     """Return True when the coordinator answers, False if it is to stop before; raise SupervisorError."""
     deadline = time.monotonic() + START_SECONDS
-    with httpx.Client(base_url=url, timeout=2.0, trust_env=False) as client:
+    # Whose certificate it is does not matter here: the listening socket is ours.
+    with httpx.Client(base_url=settings.url, timeout=2.0, trust_env=False, verify=False) as client:
         while not signals:
             assert coordinator.process is not None
             if coordinator.process.poll() is not None:
@@ -225,40 +241,6 @@ def _wait_until_ready(url: str, coordinator: _Child, signals: list[int]) -> bool
                 )
             time.sleep(_TICK / 2)
     return False
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[int]:
-    """Hold the lock of a data directory; the coordinator inherits it, so that it is held while one of them lives."""
-    with path.open("a+") as file:
-        deadline = time.monotonic() + 10
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                holder = path.read_text(encoding="utf-8").strip()
-                # If the holder was killed, its coordinator is about to follow it.
-                if _is_alive(holder) or time.monotonic() > deadline:
-                    raise SupervisorError(f"{path.parent} is in use by another `stickslip up` (pid {holder})") from None
-                time.sleep(_TICK)
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
-        os.set_inheritable(file.fileno(), True)
-        yield file.fileno()
-
-
-def _is_alive(pid: str) -> bool:
-    if not pid.isdecimal():
-        return False
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from stickslip_schemas.states import JobState, Stage, TaskState
 from stickslip_services.database.tables import (
     dataset_versions,
     job_counts,
+    job_groups,
     job_tasks,
     jobs,
     samples,
@@ -15,7 +16,7 @@ from stickslip_services.database.tables import (
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.ledger import LIVE, OPEN, RUNNABLE
+from stickslip_services.queue.ledger import LIVE, OPEN, OVER, RUNNABLE
 
 
 def audit(connection: Connection) -> list[str]:
@@ -101,6 +102,17 @@ def _counter_faults(connection: Connection) -> list[str]:
     for job, stage, state, count in connection.execute(select(*columns).where(job_counts.c.job.in_(open_jobs))):
         if by_job[job][stage, state] != count:
             faults.append(f"job {job} counts {count} {stage} {state}, and there are {by_job[job][stage, state]}")
+    grouped = connection.execute(
+        select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, func.count())
+        .join(tasks, tasks.c.seq == job_tasks.c.task)
+        .where(job_tasks.c.job.in_(open_jobs), tasks.c.state.not_in(OVER))
+        .group_by(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group)
+    )
+    there_left = {(job, stage, group): count for job, stage, group, count in grouped}
+    said = connection.execute(select(job_groups).where(job_groups.c.job.in_(open_jobs)))
+    said_left = {(job, stage, group): count for job, stage, group, count in said if count}
+    if said_left != there_left:
+        faults.append(f"job_groups says {said_left} are left, and there are {there_left}")
     return faults
 
 

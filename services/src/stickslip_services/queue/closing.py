@@ -1,21 +1,58 @@
 """Closing a ledger: counters follow the tasks, and jobs follow the counters.
 
 queued -> running at the first lease; cancelling -> cancelled, and pausing -> paused, when nothing of theirs runs any
-more; the endings that were noted come true.
+more; a job for which only tasks that were set aside are left -> failed; the endings that were noted come true.
 """
 
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
-from sqlalchemy import Connection, bindparam, select, text, update
+from sqlalchemy import Connection, func, select, text, update
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
-from stickslip_services.database.tables import job_counts, job_stages, job_tasks, jobs, task_counts, tasks
+from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks
+from stickslip_services.queue.costs import add_costs
+from stickslip_services.queue.eta import Run
 from stickslip_services.queue.events import append_published, append_task_state, set_job_state
-from stickslip_services.queue.ledger import Ending, Holder, Ledger, Move, Run, give_up_tasks, live_jobs, runnable_tasks
+from stickslip_services.queue.ids import task_id
+from stickslip_services.queue.ledger import (
+    OVER,
+    RUNNABLE,
+    Ending,
+    Holder,
+    Ledger,
+    Move,
+    give_up_tasks,
+    live_jobs,
+    runnable_tasks,
+)
 
 _OPEN = text("jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')")  # the partial index's words
+_OPEN_JOBS = text(
+    "SELECT seq, state, (SELECT SUM(count) FROM job_counts WHERE job = jobs.seq AND state = 'failed') FROM jobs "
+    "WHERE jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"
+)
+_QUEUED_JOBS = text(f"SELECT seq FROM jobs WHERE {_OPEN.text} AND jobs.state = 'queued'")
+_READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # likewise
+
+
+# Made once: composing a statement costs more than running it.
+_ADD_TO_TASK_COUNTS = text(
+    "INSERT INTO task_counts (stage, state, count) VALUES (:stage, :state, :change) "
+    "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
+)
+_ADD_TO_JOB_COUNTS = text(
+    "UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state"
+)
+_ADD_TO_JOB_GROUPS = text(
+    'UPDATE job_groups SET "left" = "left" + :b_change '
+    "WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
+)
+_ADD_TO_JOB_STAGES = text(
+    "UPDATE job_stages SET cpu_seconds = cpu_seconds + :b_cpu, wall_count = wall_count + :b_count, "
+    "wall_sum = wall_sum + :b_wall, wall_squares = wall_squares + :b_squares WHERE job = :b_job AND stage = :b_stage"
+)
 
 
 @contextmanager
@@ -28,22 +65,69 @@ def ledger(connection: Connection, now: float) -> Iterator[Ledger]:
 
 def close(book: Ledger) -> None:
     """Bring counters and jobs up to date with what the ledger has noted."""
-    for job in book.endings:
+    given_up = _settle(book, frozenset())
+    open_jobs = book.connection.execute(_OPEN_JOBS).all()
+    for job in _blocked_jobs(
+        book.connection, [seq for seq, state, failed in open_jobs if state in RUNNABLE and failed]
+    ):
+        book.end_job(job, _set_aside(book.connection, job))
+    _settle(book, given_up)
+    _tell(book)
+    for job, ending in book.endings.items():
+        _end_job(book, job, ending)
+    if not {JobState.cancelling, JobState.pausing}.isdisjoint(state for _, state, _ in open_jobs):
+        _finish_cancelling(book.connection, book.now)
+        _finish_pausing(book.connection, book.now)
+
+
+def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
+    """Give up the tasks of jobs that end, and let the counters follow; return the jobs whose tasks are given up."""
+    for job in book.endings.keys() - given_up:
         give_up_tasks(book, job, ending=book.endings.keys())
     moves, book.moves = book.moves, []
     runs, book.runs = book.runs, []
-    _add_to_task_counts(book.connection, book.inserted)
+    inserted, book.inserted = book.inserted, Counter()
+    _add_to_task_counts(book.connection, inserted)
     if moves or runs:
         holders = book.holders([*(move.task for move in moves), *(run.task for run in runs)])
         _count(book.connection, moves, holders)
         _add_costs(book.connection, runs, holders)
         leased = (move.task for move in moves if move.new in (TaskState.leased, TaskState.running))
         _start_jobs(book, {holder.job for task in leased for holder in holders.get(task, ())})
-    _tell(book)
-    for job, ending in book.endings.items():
-        _end_job(book, job, ending)
-    _finish_cancelling(book.connection, book.now)
-    _finish_pausing(book.connection, book.now)
+    return frozenset(book.endings)
+
+
+def _blocked_jobs(connection: Connection, set_aside: list[int]) -> list[int]:
+    """Return those of the runnable jobs with tasks set aside for which nothing runs, and nothing can."""
+    if not set_aside:
+        return []
+    counts = job_counts.c
+    busy = (TaskState.leased, TaskState.running, TaskState.soft_failed)
+    idle = connection.scalars(
+        select(counts.job)
+        .where(counts.job.in_(set_aside))
+        .group_by(counts.job)
+        .having(func.sum(counts.count).filter(counts.state.in_(busy)) == 0)
+    ).all()
+    ready = select(tasks.c.seq).join(job_tasks, job_tasks.c.task == tasks.c.seq).where(_READY)
+    return [job for job in idle if connection.scalar(ready.where(job_tasks.c.job == job).limit(1)) is None]
+
+
+def _set_aside(connection: Connection, job: int) -> Ending:
+    """Return how a job ends that has nothing left but tasks that were set aside, and what needs them."""
+    failed = (
+        select(tasks.c.key, tasks.c.stage, tasks.c.message)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.state == TaskState.failed)
+        .order_by(tasks.c.seq)
+    )
+    rows = connection.execute(failed).all()
+    first = rows[0]
+    message = (
+        f"everything else is done, but {len(rows)} of its tasks were set aside; the first is "
+        f"{task_id(first.stage, first.key)}: {first.message}. What is done is kept; submit the job again to try again"
+    )
+    return Ending(JobState.failed, Reason.quarantined, message)
 
 
 def _tell(book: Ledger) -> None:
@@ -74,68 +158,58 @@ def _count(connection: Connection, moves: list[Move], holders: dict[int, list[Ho
             by_job[holder.job, move.stage, move.old] -= 1
             by_job[holder.job, move.stage, move.new] += 1
     _add_to_task_counts(connection, overall)
+    _count_left(connection, moves, holders)
     changes = [
         {"b_job": job, "b_stage": stage, "b_state": state, "b_change": change}
         for (job, stage, state), change in by_job.items()
         if change
     ]
     if changes:
-        connection.execute(
-            update(job_counts)
-            .where(
-                job_counts.c.job == bindparam("b_job"),
-                job_counts.c.stage == bindparam("b_stage"),
-                job_counts.c.state == bindparam("b_state"),
-            )
-            .values(count=job_counts.c.count + bindparam("b_change")),
-            changes,
-        )
+        connection.execute(_ADD_TO_JOB_COUNTS, changes)
+
+
+def _count_left(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
+    left: Counter[tuple[int, Stage, str]] = Counter()
+    for move in moves:
+        change = (move.new not in OVER) - (move.old not in OVER)
+        if change:
+            for holder in holders.get(move.task, ()):
+                left[holder.job, move.stage, holder.cost_group] += change
+    rows = [
+        {"b_job": job, "b_stage": stage, "b_group": group, "b_change": change}
+        for (job, stage, group), change in left.items()
+        if change
+    ]
+    if rows:
+        connection.execute(_ADD_TO_JOB_GROUPS, rows)
 
 
 def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[Holder]]) -> None:
     by_job: dict[tuple[int, Stage], list[Run]] = {}
-    by_kind: dict[tuple[Stage, str], list[Run]] = {}
     for run in runs:
-        by_kind.setdefault((run.stage, run.kind), []).append(run)
         for holder in holders.get(run.task, ()):
             if not holder.cached:
                 by_job.setdefault((holder.job, run.stage), []).append(run)
-    for (job, stage), group in by_job.items():
-        connection.execute(
-            update(job_stages)
-            .where(job_stages.c.job == job, job_stages.c.stage == stage)
-            .values(
-                cpu_seconds=job_stages.c.cpu_seconds + sum(run.cpu_seconds for run in group),
-                wall_count=job_stages.c.wall_count + len(group),
-                wall_sum=job_stages.c.wall_sum + sum(run.wall_seconds for run in group),
-                wall_squares=job_stages.c.wall_squares + sum(run.wall_seconds**2 for run in group),
-            )
-        )
-    for (stage, kind), group in by_kind.items():
-        connection.execute(
-            text(
-                "INSERT INTO stage_timings (stage, kind, wall_count, wall_sum, wall_squares) "
-                "VALUES (:stage, :kind, :n, :total, :squares) ON CONFLICT (stage, kind) DO UPDATE SET "
-                "wall_count = stage_timings.wall_count + excluded.wall_count, "
-                "wall_sum = stage_timings.wall_sum + excluded.wall_sum, "
-                "wall_squares = stage_timings.wall_squares + excluded.wall_squares"
-            ),
-            {
-                "stage": stage,
-                "kind": kind,
-                "n": len(group),
-                "total": sum(run.wall_seconds for run in group),
-                "squares": sum(run.wall_seconds**2 for run in group),
-            },
-        )
+    rows = [
+        {
+            "b_job": job,
+            "b_stage": stage,
+            "b_cpu": sum(run.cpu_seconds for run in group),
+            "b_count": len(group),
+            "b_wall": sum(run.wall_seconds for run in group),
+            "b_squares": sum(run.wall_seconds**2 for run in group),
+        }
+        for (job, stage), group in by_job.items()
+    ]
+    if rows:
+        connection.execute(_ADD_TO_JOB_STAGES, rows)
+    add_costs(connection, runs)
 
 
 def _start_jobs(book: Ledger, job_seqs: Collection[int]) -> None:
     if not job_seqs:
         return
-    queued = book.connection.scalars(
-        select(jobs.c.seq).where(jobs.c.seq.in_(job_seqs), jobs.c.state == JobState.queued)
-    ).all()
+    queued = [seq for seq in book.connection.scalars(_QUEUED_JOBS) if seq in job_seqs]
     for job in queued:
         set_job_state(book.connection, job, JobState.running, book.now)
 
@@ -144,13 +218,7 @@ def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, Ta
     """Change the number of tasks by stage and state."""
     rows = [{"stage": stage, "state": state, "change": change} for (stage, state), change in changes.items() if change]
     if rows:
-        connection.execute(
-            text(
-                f"INSERT INTO {task_counts.name} (stage, state, count) VALUES (:stage, :state, :change) "
-                "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
-            ),
-            rows,
-        )
+        connection.execute(_ADD_TO_TASK_COUNTS, rows)
 
 
 def _finish_cancelling(connection: Connection, now: float) -> None:
@@ -167,7 +235,10 @@ def _finish_pausing(connection: Connection, now: float) -> None:
     for job in _jobs_in(connection, JobState.pausing):
         held = _held_tasks(connection, job)
         if not set(held) - runnable_tasks(connection, held):
-            set_job_state(connection, job, JobState.paused, now, message="paused; resume it to go on")
+            reason, message = connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job)).one()
+            if reason is None:
+                message = "paused; resume it to go on"
+            set_job_state(connection, job, JobState.paused, now, reason=reason, message=message)
 
 
 def _jobs_in(connection: Connection, state: JobState) -> list[int]:

@@ -3,6 +3,7 @@
 What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 """
 
+import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import JobState, Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, is_unavailable
 from stickslip_schemas.tasks import PublishOutput
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -33,8 +34,10 @@ from stickslip_services.clock import Clock, steady_clock
 from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.keys import admit_local_worker
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.eta_watch import EtaWatch
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import (
     Replay,
@@ -44,18 +47,24 @@ from stickslip_services.queue.jobs import (
     find_replay,
     fingerprint,
     has_runnable_job,
+    held_jobs,
+    hold_jobs,
     keep_replay,
     pause_job,
+    prioritise_job,
+    release_jobs,
     resume_job,
+    runnable_jobs,
     show_job,
     unplanned_jobs,
 )
 from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
-from stickslip_services.queue.ledger import Ledger
+from stickslip_services.queue.ledger import RUNNABLE, Ledger
 from stickslip_services.queue.planning import Plan, collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
+from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.queue.stranded import find_stranded, note_stranded
 from stickslip_services.queue.submitting import insert_job, plan_job
 from stickslip_services.queue.terms import Terms, terms_for
@@ -72,6 +81,8 @@ from stickslip_services.settings import Settings
 CHECKED_AT_ONCE = 64 * 2**20
 """The largest dataset that is checked while the request that asks for it again waits [bytes]."""
 
+logger = logging.getLogger(__name__)
+
 BUSY_POLL_SECONDS = 0.2
 IDLE_POLL_SECONDS = 1.0
 
@@ -85,15 +96,26 @@ class Coordinator:
     bell: Bell = field(default_factory=Bell)
     database: Database = field(init=False)
     store: Store = field(init=False)
+    store_watch: StoreWatch = field(init=False)
+    eta_watch: EtaWatch = field(init=False, default_factory=EtaWatch)
+    _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
+    """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
 
     def __post_init__(self) -> None:
         self.database = Database(self.settings.database_path, durable=self.settings.durable)
         self.store = Store(self.settings.store_root)
+        self.store_watch = StoreWatch(
+            self.settings.store_root,
+            self.settings.data,
+            min_free_bytes=self.settings.min_free_bytes,
+            clock=lambda: self.clock(),
+        )
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
         with self.database.write() as connection:
             migrate.upgrade(connection)
+            admit_local_worker(connection, self.settings.worker_key_path, self.clock())
             renew_all_leases(connection, self.clock(), self.settings)
         self.plan_waiting_jobs()
 
@@ -109,12 +131,12 @@ class Coordinator:
 
     # --- users ----------------------------------------------------------------------------------------------------
 
-    def submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
+    def submit(self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
         with collector_at_rest():
-            return self._submit(spec, idempotency_key)
+            return self._submit(spec, idempotency_key, priority)
 
-    def _submit(self, spec: JobSpec, idempotency_key: str | None) -> JobDetail | Replay:
+    def _submit(self, spec: JobSpec, idempotency_key: str | None, priority: int) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
         while True:
@@ -131,7 +153,7 @@ class Coordinator:
                     continue  # a worker with other builds has registered in between, or a certificate
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, plan)
+                    job = insert_job(book, spec, plan, priority=priority)
                 shown = self.show(connection, job)
                 if idempotency_key:
                     keep_replay(connection, idempotency_key, print_, job, shown.model_dump_json(), now)
@@ -146,6 +168,13 @@ class Coordinator:
             job = cancel_job(book, job_id)
         return self._shown(job)
 
+    def prioritise(self, job_id: str, priority: int, *, if_match: Collection[str] | None = None) -> JobDetail:
+        """Give a job another priority; with `if_match` as in `cancel`."""
+        with self._book() as book:
+            self._check_unchanged(book.connection, job_id, if_match)
+            job = prioritise_job(book, job_id, priority)
+        return self._shown(job)
+
     def pause(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
         """Pause a job; with `if_match` as in `cancel`."""
         with self._book() as book:
@@ -154,7 +183,12 @@ class Coordinator:
         return self._shown(job)
 
     def resume(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
-        """Let a paused job go on, with the builds it was planned for; with `if_match` as in `cancel`."""
+        """Let a paused job go on, with the builds it was planned for; with `if_match` as in `cancel`.
+
+        Raises ConflictError while the store takes no results.
+        """
+        if trouble := self.store_watch.trouble:
+            raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = resume_job(book, job_id)
@@ -172,7 +206,11 @@ class Coordinator:
 
     def show(self, connection: Connection, job: int) -> JobDetail:
         """Return a job as a transaction sees it."""
-        return show_job(connection, job, self.alive_workers(connection))
+        shown = show_job(connection, job, self.alive_workers(connection), self.frames)
+        if self.store_watch.trouble and shown.state in RUNNABLE:  # perhaps not even the database could be told
+            update = {"reason": Reason.store_unavailable, "message": self.store_watch.trouble}
+            return shown.model_copy(update=update)
+        return shown
 
     def add_certificate(self, upload: CertificateUpload) -> CertificateEntry:
         """Register a certificate."""
@@ -200,18 +238,24 @@ class Coordinator:
         if worker.superseded:
             raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
         wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+        if self.store_watch.trouble:
+            return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
         with self.database.read() as connection:
-            ready = has_ready_task(connection, worker, wanted.keys())
+            ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
             waiting = has_runnable_job(connection)
         if not ready:
             return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
         with self._book() as book:
-            leases = grant_leases(book, find_worker(book.connection, worker.id), wanted, self.settings)
+            worker = find_worker(book.connection, worker.id)
+            leases = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         """Renew a worker's leases and tell it what to drop."""
         worker = self._meet(heartbeat.worker_id)
+        self._frames[worker.id] = {
+            lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None
+        }
         if not heartbeat.leases:
             return HeartbeatAnswer(drop=())
         with self._book() as book:
@@ -226,9 +270,18 @@ class Coordinator:
         with self._book() as book:
             taken = take_reports(book, worker.id, reports, versions)
             give_back(book, taken.released)
-            fail_tries(book, taken.failures, self.settings)
-            for task, digests in taken.damaged:
-                make_again(book, task, digests)
+            for _, reason, message in taken.failures:
+                if reason is Reason.store_unavailable:
+                    self.store_watch.note(f"worker {worker.name} cannot use the store: {message}")
+            give_back(book, [task for task, reason, _ in taken.failures if reason is Reason.store_unavailable])
+            for task, reason, message in taken.failures:
+                if reason is Reason.worker_lost:
+                    lose(book, [task], self.settings, message=message)
+            innocent = (Reason.store_unavailable, Reason.worker_lost)
+            charged = [failure for failure in taken.failures if failure[1] not in innocent]
+            fail_tries(book, charged, self.settings)
+            for consumer, digests in taken.damaged:
+                make_again(book, consumer, digests)
         return ReportAnswer(verdicts=taken.verdicts)
 
     def _checked(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:
@@ -243,7 +296,9 @@ class Coordinator:
                 check_output(self.store, output)
         except (OSError, ValueError) as error:
             message = f"the result does not hold: {error}"[:2000]
-            update = {"outcome": "failed", "reason": Reason.storage_error, "message": message, "output": None}
+            unavailable = isinstance(error, OSError) and is_unavailable(error)
+            reason = Reason.store_unavailable if unavailable else Reason.storage_error
+            update = {"outcome": "failed", "reason": reason, "message": message, "output": None}
             return report.model_copy(update={"result": report.result.model_copy(update=update)})
         return report
 
@@ -261,9 +316,33 @@ class Coordinator:
 
     def sweep(self) -> None:
         """Take back expired leases, let due retries go on, and let jobs that nobody serves say so."""
+        self._watch_store()
         self._take_back()
         self._note_stranded()
+        self._watch_etas()
         self.check_made_datasets(at_most=CHECKED_AT_ONCE)
+
+    def _watch_etas(self) -> None:
+        if not self.eta_watch.is_due(self.clock()):
+            return
+        with self.database.read() as connection:
+            ids = self.eta_watch.watched | set(runnable_jobs(connection))
+            jobs = {job_id: self.show(connection, find_job(connection, job_id).seq) for job_id in ids}
+        self.eta_watch.look(jobs, self.clock())
+
+    def _watch_store(self) -> None:
+        """Pause jobs while the store takes no results, and let them go on afterwards."""
+        trouble = self.store_watch.look()
+        with self.database.read() as connection:
+            due = has_runnable_job(connection) if trouble else bool(held_jobs(connection))
+        if not due:
+            return
+        with self._book() as book:
+            if trouble:
+                hold_jobs(book, trouble)
+            else:
+                release_jobs(book)
+        logger.warning("jobs are paused: %s", trouble) if trouble else logger.info("the store takes results again")
 
     def check_made_datasets(self, *, at_most: int | None = None) -> None:
         """Check the datasets that jobs found made before; where a file is damaged or lost, it is made again.
@@ -324,6 +403,11 @@ class Coordinator:
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""
         return present_workers(connection, seen_since=self.alive_since)
+
+    @property
+    def frames(self) -> dict[str, tuple[int, int]]:
+        """Of the simulations that run and tell, by task: frames done, and frames."""
+        return {task: frames for told in list(self._frames.values()) for task, frames in told.items()}
 
     @property
     def alive_since(self) -> float:

@@ -3,9 +3,10 @@
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
-from sqlalchemy import Connection, Row, func, insert, select
+from sqlalchemy import Connection, Row, func, insert, select, update
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
@@ -21,10 +22,11 @@ from stickslip_services.errors import (
     NotFoundError,
     PreconditionFailedError,
 )
+from stickslip_services.queue.costs import read_costs
 from stickslip_services.queue.eta import StageTimings
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
-from stickslip_services.queue.progress import read_progress, rejected_samples
+from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.workers import NO_WORKER, RegisteredWorker, count_slots
 
 
@@ -62,9 +64,17 @@ def fingerprint(spec: JobSpec) -> str:
     return sha256(spec.model_dump_json().encode())
 
 
+_RUNNABLE_JOB = select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1)
+
+
 def has_runnable_job(connection: Connection) -> bool:
     """Tell whether there is any job to work for."""
-    return connection.scalar(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1)) is not None
+    return connection.scalar(_RUNNABLE_JOB) is not None
+
+
+def runnable_jobs(connection: Connection) -> list[str]:
+    """Return the jobs that there is something to do for, oldest first."""
+    return list(connection.scalars(select(jobs.c.id).where(jobs.c.state.in_(RUNNABLE)).order_by(jobs.c.seq)))
 
 
 def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any, Any]]:
@@ -89,9 +99,9 @@ def cancel_job(book: Ledger, job_id: str) -> int:
 def pause_job(book: Ledger, job_id: str) -> int:
     """Pause a job: nothing more is started for it, what runs finishes. Raise ConflictError if it has ended."""
     row = find_job(book.connection, job_id)
-    if row.state in (JobState.pausing, JobState.paused):
+    if row.state in (JobState.pausing, JobState.paused) and row.reason is None:
         return int(row.seq)
-    if row.state not in RUNNABLE:
+    if row.state not in (*RUNNABLE, JobState.pausing, JobState.paused):
         raise ConflictError(f"job {job_id} is {row.state}, and only a job that is queued or running can be paused")
     message = "nothing more is started; tasks that are running finish"
     set_job_state(book.connection, row.seq, JobState.pausing, book.now, message=message)
@@ -126,6 +136,37 @@ def check_unchanged(job: JobDetail, etags: Collection[str]) -> None:
         )
 
 
+def prioritise_job(book: Ledger, job_id: str, priority: int) -> int:
+    """Give a job another priority. Raise ConflictError if it has ended."""
+    row = find_job(book.connection, job_id)
+    if JobState(row.state).is_terminal:
+        raise ConflictError(f"job {job_id} has ended ({row.state}); its priority cannot be changed")
+    book.connection.execute(update(jobs).where(jobs.c.seq == row.seq).values(priority=priority))
+    charge_waiting_tasks(book.connection, row.seq)
+    return int(row.seq)
+
+
+def hold_jobs(book: Ledger, trouble: str) -> None:
+    """Pause the jobs that could run because the store takes no results, and let them say so."""
+    message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
+    for seq in book.connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))).all():
+        reason = Reason.store_unavailable
+        set_job_state(book.connection, seq, JobState.pausing, book.now, reason=reason, message=message)
+        charge_waiting_tasks(book.connection, seq)
+
+
+def release_jobs(book: Ledger) -> None:
+    """Let the jobs go on that waited for the store."""
+    for job_id in held_jobs(book.connection):
+        resume_job(book, job_id)
+
+
+def held_jobs(connection: Connection) -> list[str]:
+    """Return the jobs that wait for the store."""
+    waiting = jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable
+    return list(connection.scalars(select(jobs.c.id).where(*waiting).order_by(jobs.c.seq)))
+
+
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     """Return the row of a job; raise NotFoundError."""
     row = connection.execute(select(jobs).where(jobs.c.id == job_id)).one_or_none()
@@ -134,10 +175,14 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     return row
 
 
-def show_job(connection: Connection, job: int, workers: Collection[RegisteredWorker]) -> JobDetail:
+def show_job(
+    connection: Connection, job: int, workers: Collection[RegisteredWorker], frames: Frames = MappingProxyType({})
+) -> JobDetail:
     """Return a job with its spec."""
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
-    return JobDetail(**dict(_shown(connection, [row], workers)[0]), spec=job_spec_adapter.validate_json(row.spec))
+    return JobDetail(
+        **dict(_shown(connection, [row], workers, frames)[0]), spec=job_spec_adapter.validate_json(row.spec)
+    )
 
 
 def list_jobs(connection: Connection, page: PageRequest, workers: Collection[RegisteredWorker]) -> Page[Job]:
@@ -146,7 +191,7 @@ def list_jobs(connection: Connection, page: PageRequest, workers: Collection[Reg
     if page.after is not None:
         query = query.where(jobs.c.seq < page.after)
     rows = connection.execute(query).all()
-    shown = dict(zip((row.seq for row in rows), _shown(connection, rows, workers), strict=True))
+    shown = dict(zip((row.seq for row in rows), _shown(connection, rows, workers, {}), strict=True))
     return make_page(rows, page, position=lambda row: int(row.seq), item=lambda row: shown[row.seq])
 
 
@@ -225,10 +270,13 @@ def is_preview(connection: Connection, digest: str) -> bool:
 
 
 def _shown(
-    connection: Connection, rows: Sequence[Row[tuple[object, ...]]], workers: Collection[RegisteredWorker]
+    connection: Connection,
+    rows: Sequence[Row[tuple[object, ...]]],
+    workers: Collection[RegisteredWorker],
+    frames: Frames,
 ) -> list[Job]:
     slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows}
-    progress = read_progress(connection, rows, slots)
+    progress = read_progress(connection, rows, slots, costs=read_costs(connection), frames=frames)
     return [
         Job(
             id=row.id,
@@ -237,6 +285,7 @@ def _shown(
             state=row.state,
             reason=row.reason,
             message=row.message,
+            priority=row.priority,
             created_at=as_datetime(row.created_at),
             started_at=None if row.started_at is None else as_datetime(row.started_at),
             finished_at=None if row.finished_at is None else as_datetime(row.finished_at),

@@ -1,13 +1,14 @@
 """Leases: who may run which task, and until when.
 
 A lease is (worker, token); the token of a task increments at each lease, so that a worker that lost its lease is told
-from the one that has it. Between jobs the next task goes to the job that has the fewest tasks on lease: a small job
-does not wait behind a big one, and jobs of one size share evenly. Within a job and stage the order is that of the
-slots, so that shards fill up one after the other. How many tasks of each stage run is the dispatcher's choice.
+from the one that has it. Between jobs the next task goes to the job of the highest priority, and of those to the one
+that has the fewest tasks on lease: a small job does not wait behind a big one, and jobs of one size share evenly.
+Within a job and stage the order is that of the slots, so that shards fill up one after the other. How many tasks of
+each stage run is the dispatcher's choice.
 """
 
 import heapq
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
@@ -17,6 +18,8 @@ from stickslip_schemas.worker_api import Lease, LeaseState
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import job_counts, jobs, tasks
 from stickslip_services.queue.compose import StoredTask, compose_tasks, reserve_version
+from stickslip_services.queue.costs import limit_seconds, long_groups, read_costs
+from stickslip_services.queue.eta import Cost, Group
 from stickslip_services.queue.ids import task_id, task_key
 from stickslip_services.queue.ledger import (
     RUNNABLE,
@@ -39,25 +42,76 @@ class _Ready:
     seq: int
     key: bytes
     stage: Stage
+    kind: str
+    cost_group: str
+    tries: int
     payload: str
     preview: bool
     token: int
     attempts: int
 
 
-def has_ready_task(connection: Connection, worker: RegisteredWorker, stages: Iterable[Stage]) -> bool:
-    """Tell whether a lease request of these stages would be granted anything."""
+# Made once: composing a statement costs more than running it.
+_OF_GROUP = (
+    _READY,
+    tasks.c.stage == bindparam("b_stage"),
+    tasks.c.build == bindparam("b_build"),
+    tasks.c.kind == bindparam("b_kind"),
+    tasks.c.cost_group.not_in(bindparam("b_left_out", expanding=True)),
+)
+_READY_TASK = (
+    select(tasks.c.seq)
+    .where(*_OF_GROUP, tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))))
+    .limit(1)
+)
+_READY_TASKS = (
+    select(
+        *(tasks.c[name] for name in ("seq", "key", "payload", "preview", "token", "attempts", "cost_group", "tries"))
+    )
+    .where(*_OF_GROUP, tasks.c.job == bindparam("b_job"))
+    .order_by(tasks.c.seq)
+    .limit(bindparam("b_count"))
+    .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
+)
+_JOBS_WITH_PENDING = (
+    select(
+        job_counts.c.job,
+        jobs.c.priority,
+        func.coalesce(
+            func.sum(job_counts.c.count).filter(job_counts.c.state.in_((TaskState.leased, TaskState.running))), 0
+        ),
+    )
+    .join(jobs, jobs.c.seq == job_counts.c.job)
+    .where(jobs.c.state.in_(RUNNABLE), job_counts.c.stage == bindparam("b_stage"))
+    .group_by(job_counts.c.job, jobs.c.priority)
+    .having(func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.pending) > 0)
+)
+_LEASE = (
+    update(tasks)
+    .where(tasks.c.seq == bindparam("b_seq"))
+    .values(
+        state=TaskState.leased,
+        token=bindparam("b_token"),
+        owner=bindparam("b_owner"),
+        expires_at=bindparam("b_expires_at"),
+    )
+)
+
+
+def has_ready_task(
+    connection: Connection, worker: RegisteredWorker, stages: Iterable[Stage], *, at_most: float | None
+) -> bool:
+    """Tell whether a lease request of these stages would be granted anything; `at_most` seconds a call."""
+    costs = {} if at_most is None else read_costs(connection)
     return any(
         connection.scalar(
-            select(tasks.c.seq)
-            .where(
-                _READY,
-                tasks.c.stage == stage,
-                tasks.c.build == build,
-                tasks.c.kind == kind,
-                tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))),
-            )
-            .limit(1)
+            _READY_TASK,
+            {
+                "b_stage": stage,
+                "b_build": build,
+                "b_kind": kind,
+                "b_left_out": long_groups(costs, stage, kind, at_most),
+            },
         )
         for kind in worker.kinds
         for stage, build in worker.stage_builds(kind).items()
@@ -66,29 +120,21 @@ def has_ready_task(connection: Connection, worker: RegisteredWorker, stages: Ite
 
 
 def grant_leases(
-    book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings
+    book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings, *, at_most: float | None
 ) -> tuple[Lease, ...]:
-    """Lease up to the wanted number of tasks of each stage to `worker`."""
+    """Lease up to the wanted number of tasks of each stage to `worker`; none known to take over `at_most` seconds."""
     granted: list[_Ready] = []
+    costs = read_costs(book.connection)
     for stage in reversed(Stage):  # what is nearest to a dataset first
         count = min(wanted.get(stage, 0), settings.lease_limit)
         if count > 0:
-            granted.extend(_pick(book.connection, worker, stage, count))
+            granted.extend(_pick(book.connection, worker, stage, count, costs, at_most))
     if not granted:
         return ()
     for task in granted:
         book.moved(task.seq, task.stage, TaskState.pending, TaskState.leased)
-    book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(
-            state=TaskState.leased,
-            token=bindparam("b_token"),
-            owner=worker.id,
-            expires_at=book.now + settings.lease_seconds,
-        ),
-        [{"b_seq": task.seq, "b_token": task.token + 1} for task in granted],
-    )
+    lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
+    book.connection.execute(_LEASE, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
     stored = [StoredTask(task.seq, task.stage, task.payload, task.preview) for task in granted]
     for publish in (task for task in stored if task.stage is Stage.publish):
         reserve_version(book.connection, publish)
@@ -98,63 +144,87 @@ def grant_leases(
             task_id=task_id(task.stage, task.key),
             token=task.token + 1,
             attempt=task.attempts + 1,
+            limit_seconds=limit_seconds(
+                costs.get((task.stage, task.kind, task.cost_group)), task.tries, floor=settings.limit_floor_seconds
+            ),
             task=composed[task.seq],
         )
         for task in granted
     )
 
 
-def _pick(connection: Connection, worker: RegisteredWorker, stage: Stage, count: int) -> list[_Ready]:
-    """Choose ready tasks of a stage, one at a time from the job that has the fewest on lease."""
-    queue: list[tuple[int, int, list[_Ready]]] = []  # tasks on lease, job, its ready tasks in reverse order
-    for job, on_lease in _jobs_with_pending(connection, stage):
-        if ready := _ready_tasks(connection, worker, stage, job, count):
-            queue.append((on_lease, job, ready[::-1]))
+def _pick(
+    connection: Connection,
+    worker: RegisteredWorker,
+    stage: Stage,
+    count: int,
+    costs: Mapping[Group, Cost],
+    at_most: float | None,
+) -> list[_Ready]:
+    """Choose ready tasks of a stage, one at a time: of the highest priority, from the job with the fewest on lease."""
+    queue: list[tuple[int, int, int, list[_Ready]]] = []  # -priority, tasks on lease, job, its tasks in reverse order
+    for job, priority, on_lease in _jobs_with_pending(connection, stage):
+        ready = [
+            task
+            for kind in worker.kinds
+            for task in _ready_tasks(
+                connection, worker, stage, kind, job, count, long_groups(costs, stage, kind, at_most)
+            )
+        ]
+        if ready:
+            queue.append((-priority, on_lease, job, ready[::-1]))
     heapq.heapify(queue)
     picked: list[_Ready] = []
     while queue and len(picked) < count:
-        on_lease, job, ready = queue[0]
+        order, on_lease, job, ready = queue[0]
         picked.append(ready.pop())
         if ready:
-            heapq.heapreplace(queue, (on_lease + 1, job, ready))
+            heapq.heapreplace(queue, (order, on_lease + 1, job, ready))
         else:
             heapq.heappop(queue)
     return picked
 
 
-def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int]]:
-    """Return (job, number of tasks of the stage on lease) of the runnable jobs that wait for tasks of the stage."""
-    counts = job_counts.c
-    on_lease = func.sum(counts.count).filter(counts.state.in_((TaskState.leased, TaskState.running)))
-    pending = func.sum(counts.count).filter(counts.state == TaskState.pending)
+def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int, int]]:
+    """Return (job, priority, number of tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
+    return [(job, priority, held) for job, priority, held in connection.execute(_JOBS_WITH_PENDING, {"b_stage": stage})]
+
+
+def _ready_tasks(
+    connection: Connection,
+    worker: RegisteredWorker,
+    stage: Stage,
+    kind: str,
+    job: int,
+    count: int,
+    left_out: Sequence[str],
+) -> list[_Ready]:
     rows = connection.execute(
-        select(counts.job, func.coalesce(on_lease, 0))
-        .join(jobs, jobs.c.seq == counts.job)
-        .where(jobs.c.state.in_(RUNNABLE), counts.stage == stage)
-        .group_by(counts.job)
-        .having(pending > 0)
+        _READY_TASKS,
+        {
+            "b_stage": stage,
+            "b_build": worker.stage_builds(kind)[stage],
+            "b_kind": kind,
+            "b_left_out": left_out,
+            "b_job": job,
+            "b_count": count,
+        },
     )
-    return [(job, held) for job, held in rows]
-
-
-def _ready_tasks(connection: Connection, worker: RegisteredWorker, stage: Stage, job: int, count: int) -> list[_Ready]:
-    found: list[_Ready] = []
-    for kind in worker.kinds:
-        rows = connection.execute(
-            select(tasks.c.seq, tasks.c.key, tasks.c.payload, tasks.c.preview, tasks.c.token, tasks.c.attempts)
-            .where(
-                _READY,
-                tasks.c.stage == stage,
-                tasks.c.build == worker.stage_builds(kind)[stage],
-                tasks.c.kind == kind,
-                tasks.c.job == job,
-            )
-            .order_by(tasks.c.seq)
-            .limit(count)
-            .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
+    return [
+        _Ready(
+            seq=row.seq,
+            key=row.key,
+            stage=stage,
+            kind=kind,
+            cost_group=row.cost_group,
+            tries=row.tries,
+            payload=row.payload,
+            preview=row.preview,
+            token=row.token,
+            attempts=row.attempts,
         )
-        found.extend(_Ready(row.seq, row.key, stage, row.payload, row.preview, row.token, row.attempts) for row in rows)
-    return found
+        for row in rows
+    ]
 
 
 def renew_leases(
@@ -164,7 +234,8 @@ def renew_leases(
     drop: list[str] = []
     mine: list[tuple[LeaseState, HeldTask]] = []
     keys = {state.task_id: task_key(state.task_id) for state in held}
-    columns = (tasks.c.key, tasks.c.seq, tasks.c.stage, tasks.c.state, tasks.c.tries, tasks.c.token, tasks.c.owner)
+    names = ("key", "seq", "stage", "state", "tries", "losses", "token", "owner")
+    columns = [tasks.c[name] for name in names]
     rows = {
         row.key: row
         for batch in batches(key for key in keys.values() if key is not None)
@@ -175,7 +246,9 @@ def renew_leases(
         if row is None or row.owner != worker.id or row.token != lease.token or worker.superseded:
             drop.append(lease.task_id)
         else:
-            mine.append((lease, HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries)))
+            mine.append(
+                (lease, HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses))
+            )
     unneeded = _unneeded(book, mine)
     cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
     halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])

@@ -15,6 +15,7 @@ from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.queue.eta import Run
 
 RUNNABLE = (JobState.queued, JobState.running)
 """States of a job whose tasks may be leased."""
@@ -26,12 +27,18 @@ OPEN = (*LIVE, JobState.cancelling)
 """States of a job whose counters follow its tasks; those of an ended job stay as they were at its end."""
 
 
+OVER = tuple(state for state in TaskState if state.is_over)
+"""States of a task that nothing is left to do of."""
+
+
 @dataclass(frozen=True, slots=True)
 class Holder:
     """A job that has a task, and whether the task was settled before the job came."""
 
     job: int
     cached: bool
+    cost_group: str
+    """Of the task."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,17 +61,6 @@ class Ending:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """A task that was really run: what it cost."""
-
-    task: int
-    stage: Stage
-    kind: str
-    cpu_seconds: float
-    wall_seconds: float
-
-
-@dataclass(frozen=True, slots=True)
 class Move:
     """A task that has gone from one state to another."""
 
@@ -83,6 +79,15 @@ class HeldTask:
     stage: Stage
     state: TaskState
     tries: int
+    losses: int
+
+
+_HOLDERS = (
+    select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
+    .join(jobs, jobs.c.seq == job_tasks.c.job)
+    .join(tasks, tasks.c.seq == job_tasks.c.task)
+    .where(job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)), jobs.c.state.in_(OPEN))
+)
 
 
 class Ledger:
@@ -118,13 +123,8 @@ class Ledger:
         """Return the open jobs of each task."""
         found: dict[int, list[Holder]] = {}
         for batch in batches(set(task_seqs)):
-            rows = self.connection.execute(
-                select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached)
-                .join(jobs, jobs.c.seq == job_tasks.c.job)
-                .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(OPEN))
-            )
-            for task, job, cached in rows:
-                found.setdefault(task, []).append(Holder(job, cached))
+            for task, job, cached, cost_group in self.connection.execute(_HOLDERS, {"b_tasks": batch}):
+                found.setdefault(task, []).append(Holder(job, cached, cost_group))
         return found
 
 
@@ -142,8 +142,8 @@ def give_up_tasks(book: Ledger, job: int, *, ending: Collection[int] = ()) -> No
 def charge_waiting_tasks(connection: Connection, job: int) -> None:
     """Charge each waiting task of a live job to the job that it is to run for: a runnable one where there is one.
 
-    Called whenever a job starts or stops being runnable, for a task is leased only on behalf of the job it is
-    charged to.
+    Called whenever a job starts or stops being runnable, or changes its priority, for a task is leased only on behalf
+    of the job it is charged to.
     """
     for batch in batches(seq for seq, _, _ in _waiting_tasks(connection, job)):
         _charge(connection, live_jobs(connection, batch))
@@ -196,35 +196,39 @@ def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) ->
     book.moved(task.seq, task.stage, task.state, state)
 
 
+_START = (
+    update(tasks)
+    .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
+    .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=bindparam("b_now"))
+)
+
+
 def start_tasks(book: Ledger, leased: Collection[tuple[int, str]]) -> None:
     """Note that leased tasks (seq, stage) have been started: from here on they may fail."""
     for batch in batches(leased):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([seq for seq, _ in batch]))
-            .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=book.now)
-        )
+        book.connection.execute(_START, {"b_tasks": [seq for seq, _ in batch], "b_now": book.now})
     for seq, stage in leased:
         book.moved(seq, stage, TaskState.leased, TaskState.running)
 
 
 def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collection[int] = ()) -> dict[int, int]:
-    """Return, for each of the tasks that have any, its oldest runnable job, or else its oldest live one.
+    """Return, for each of the tasks that have any, its first runnable job, or else its first live one.
 
-    Jobs in `but` are left out.
+    First is the one of the highest priority, and of these the oldest. Jobs in `but` are left out.
     """
-    found: dict[int, tuple[int, int]] = {}
+    found: dict[int, tuple[int, int, int]] = {}
     is_halted = case((jobs.c.state.in_(RUNNABLE), 0), else_=1)
     for batch in batches(task_seqs):
         rows = connection.execute(
-            select(job_tasks.c.task, is_halted, job_tasks.c.job)
+            select(job_tasks.c.task, is_halted, jobs.c.priority, job_tasks.c.job)
             .join(jobs, jobs.c.seq == job_tasks.c.job)
             .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(LIVE))
         )
-        for task, halted, job in rows:
+        for task, halted, priority, job in rows:
             if job not in but:
-                found[task] = min((halted, job), found.get(task, (halted, job)))
-    return {task: job for task, (_, job) in found.items()}
+                mine = (halted, -priority, job)
+                found[task] = min(mine, found.get(task, mine))
+    return {task: job for task, (_, _, job) in found.items()}
 
 
 def runnable_tasks(connection: Connection, task_seqs: Iterable[int]) -> set[int]:

@@ -29,6 +29,7 @@ class PlannedTask(NamedTuple):
     payload: str
     depends_on: tuple[bytes, ...] = ()
     preview: bool = False
+    cost_group: str = ""
 
 
 class PlannedSample(NamedTuple):
@@ -98,14 +99,16 @@ def expand(spec: JobSpec, builds: Builds, *, certificate: Sha256 | None = None, 
             key = simulate = bytes.fromhex(point.simulation_key)
             render: bytes | None = None
             if simulate not in tasks_by_key:
-                tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.simulate, point.simulation_text)
+                cost = spec.cost_group(Stage.simulate, point.labels)
+                tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.simulate, point.simulation_text, cost_group=cost)
             if point.render_key is not None and point.render_text is not None:
                 key = render = bytes.fromhex(point.render_key)
                 shared = (value for axis, value in point.labels.items() if axis != spec.variant_axis)
                 group = renders.setdefault((simulate, *shared), {})
                 if render not in group:
                     preview = point.slot in previewed
-                    group[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview)
+                    cost = spec.cost_group(Stage.render, point.labels)
+                    group[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview, cost)
             last[key] = None
             plan.samples.append(PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text))
         name = pack_key(spec, shard, members, builds)

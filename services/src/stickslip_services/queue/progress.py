@@ -1,19 +1,27 @@
-"""How far jobs are, from the counters that the ledger keeps; no row of `tasks` is read."""
+"""How far jobs are, from the counters that the ledger keeps; of `tasks` only the rows that tell of frames are read."""
 
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 from sqlalchemy import Connection, Row, select
 from stickslip_schemas.responses import Progress, StageProgress
 from stickslip_schemas.states import JobState, Stage, TaskState
 
-from stickslip_services.database.tables import job_counts, job_stages, stage_timings
-from stickslip_services.queue.eta import StageTimings, StageWork, estimate
+from stickslip_services.database.tables import job_counts, job_groups, job_stages, job_tasks, tasks
+from stickslip_services.queue.eta import Cost, Group, StageWork, estimate, pooled
+from stickslip_services.queue.ids import task_key
 
-_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed, TaskState.cancelled)
+Frames = Mapping[str, tuple[int, int]]
+"""Of the simulations that run and tell, by task: frames done, and frames."""
 
 
 def read_progress(
-    connection: Connection, rows: Collection[Row[tuple[object, ...]]], slots: Mapping[int, int]
+    connection: Connection,
+    rows: Collection[Row[tuple[object, ...]]],
+    slots: Mapping[int, int],
+    *,
+    costs: Mapping[Group, Cost],
+    frames: Frames,
 ) -> dict[int, Progress]:
     """Return the progress of jobs (rows of `jobs`) by `seq`; `slots` says how many tasks of each can run at once."""
     seqs = [row.seq for row in rows]
@@ -23,11 +31,46 @@ def read_progress(
     stages = {
         (row.job, row.stage): row for row in connection.execute(select(job_stages).where(job_stages.c.job.in_(seqs)))
     }
-    earlier = {
-        (row.stage, row.kind): StageTimings(row.wall_count, row.wall_sum, row.wall_squares)
-        for row in connection.execute(select(stage_timings))
-    }
-    return {row.seq: _progress(row, counts, stages, earlier, slots[row.seq]) for row in rows}
+    running = [row.seq for row in rows if row.state in (JobState.queued, JobState.running)]
+    groups: dict[tuple[int, str], list[tuple[str, int]]] = {}
+    if running:
+        for job, stage, group, left in connection.execute(select(job_groups).where(job_groups.c.job.in_(running))):
+            groups.setdefault((job, stage), []).append((group, left))
+    known = _Known(counts, stages, groups, costs, _frames(connection, seqs, frames))
+    return {row.seq: _progress(row, known, slots[row.seq]) for row in rows}
+
+
+def _frames(connection: Connection, seqs: list[int], frames: Frames) -> dict[tuple[int, str, str], "_Sum"]:
+    """Return the frames of the tasks that tell, by job, stage and cost group."""
+    found: dict[tuple[int, str, str], _Sum] = {}
+    by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
+    if not by_key:
+        return found
+    rows = connection.execute(
+        select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, tasks.c.key)
+        .join(tasks, tasks.c.seq == job_tasks.c.task)
+        .where(tasks.c.key.in_(by_key), tasks.c.state == TaskState.running, job_tasks.c.job.in_(seqs))
+    )
+    for job, stage, group, key in rows:
+        done, total = by_key[key]
+        before = found.get((job, stage, group), _Sum(0, 0, 0.0))
+        found[job, stage, group] = _Sum(before.done + done, before.total + total, before.share + done / max(total, 1))
+    return found
+
+
+class _Sum(NamedTuple):
+    done: int
+    total: int
+    share: float
+    """Of tasks that are done of running ones."""
+
+
+class _Known(NamedTuple):
+    counts: dict[tuple[int, str], dict[TaskState, int]]
+    stages: dict[tuple[int, str], Row[tuple[object, ...]]]
+    groups: dict[tuple[int, str], list[tuple[str, int]]]
+    costs: Mapping[Group, Cost]
+    frames: dict[tuple[int, str, str], _Sum]
 
 
 def rejected_samples(progress: Progress) -> int:
@@ -37,33 +80,33 @@ def rejected_samples(progress: Progress) -> int:
     return 0 if last is None else last.counts.get(TaskState.rejected, 0)
 
 
-def _progress(
-    row: Row[tuple[object, ...]],
-    counts: dict[tuple[int, str], dict[TaskState, int]],
-    stages: dict[tuple[int, str], Row[tuple[object, ...]]],
-    earlier: dict[tuple[str, str], StageTimings],
-    slots: int,
-) -> Progress:
+def _progress(row: Row[tuple[object, ...]], known: _Known, slots: int) -> Progress:
     shown: dict[Stage, StageProgress] = {}
-    work: dict[Stage, StageWork] = {}
+    work: dict[Stage, list[StageWork]] = {}
     for stage in Stage:
-        kept = stages.get((row.seq, stage))
+        kept = known.stages.get((row.seq, stage))
         if kept is None:  # not planned yet
             continue
-        mine = counts[row.seq, stage]
+        mine = known.counts[row.seq, stage]
+        told = [frames for (job, of, _), frames in known.frames.items() if (job, of) == (row.seq, stage)]
         shown[stage] = StageProgress(
             counts={state: count for state, count in mine.items() if count},
             cached=kept.cached,
             cpu_seconds=kept.cpu_seconds,
+            frames=(sum(item.done for item in told), sum(item.total for item in told)) if told else None,
         )
-        left = sum(count for state, count in mine.items() if state not in _OVER)
-        timings = StageTimings(kept.wall_count, kept.wall_sum, kept.wall_squares)
-        work[stage] = StageWork(left, timings if timings.count else earlier.get((stage, row.kind)))
+        work[stage] = []
+        for group, left in known.groups.get((row.seq, stage), ()):
+            cost = known.costs.get((stage, row.kind, group))
+            enough = cost is not None and (cost.is_known or stage in (Stage.pack, Stage.publish))
+            timings = cost.share if cost is not None and enough else pooled(known.costs, stage, row.kind)
+            told_of = known.frames.get((row.seq, stage, group))
+            work[stage].append(StageWork(left - (0.0 if told_of is None else told_of.share), timings))
     eta = None
     if row.state in (JobState.queued, JobState.running) and row.builds is not None:
         eta = estimate(work, slots=slots)
     return Progress(
-        done=sum(stage.counts.get(state, 0) for stage in shown.values() for state in _OVER),
+        done=sum(count for stage in shown.values() for state, count in stage.counts.items() if state.is_over),
         total=sum(count for stage in shown.values() for count in stage.counts.values()),
         stages=shown,
         eta=eta,

@@ -123,6 +123,7 @@ def reopen(book: Ledger, makers: Iterable[_Maker]) -> None:
                 message="",
                 job=job_of[maker.seq],
                 tries=0,
+                losses=0,
                 retry_at=None,
                 finished_at=None,
             )

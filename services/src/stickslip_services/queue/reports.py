@@ -18,8 +18,9 @@ from stickslip_schemas.worker_api import Report, ReportVerdict
 from stickslip_services.catalog.versions import ManifestSummary, commit_version, find_committed, find_reserved
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
+from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import task_id, task_key
-from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, Run, start_tasks
+from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, start_tasks
 
 Verdict = Literal["accepted", "duplicate", "stale"]
 
@@ -29,8 +30,10 @@ class _Row(NamedTuple):
     key: bytes
     stage: Stage
     kind: str
+    cost_group: str
     state: TaskState
     tries: int
+    losses: int
     owner: str | None
     token: int
     reported_by: str | None
@@ -41,6 +44,7 @@ class _Row(NamedTuple):
 class _Ended:
     task: HeldTask
     kind: str
+    cost_group: str
     result: TaskResult
 
 
@@ -53,6 +57,40 @@ class Taken:
     failures: tuple[tuple[HeldTask, Reason, str], ...]
     damaged: tuple[tuple[int, tuple[Sha256, ...]], ...]
     """Of failed tasks, the inputs that were damaged or missing."""
+
+
+# Made once: composing a statement costs more than running it.
+_NOTE_REPORT = (
+    update(tasks)
+    .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
+    .values(reported_by=bindparam("b_worker"), reported_token=tasks.c.token)
+)
+_FIND = select(*(tasks.c[name] for name in _Row._fields)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
+_SETTLE = (
+    update(tasks)
+    .where(tasks.c.seq == bindparam("b_seq"))
+    .values(
+        state=bindparam("b_state"),
+        reason=bindparam("b_reason"),
+        message=bindparam("b_message"),
+        output=bindparam("b_output"),
+        cpu_seconds=bindparam("b_cpu"),
+        wall_seconds=bindparam("b_wall"),
+        owner=None,
+        expires_at=None,
+        finished_at=bindparam("b_now"),
+    )
+)
+_DEPENDENTS = (
+    select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
+    .join(tasks, tasks.c.seq == task_dependencies.c.task)
+    .where(task_dependencies.c.depends_on.in_(bindparam("b_tasks", expanding=True)))
+)
+_COUNT_DOWN = (
+    update(tasks)
+    .where(tasks.c.seq == bindparam("b_seq"))
+    .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled"))
+)
 
 
 def take_reports(
@@ -74,19 +112,15 @@ def take_reports(
         elif row is not None and (row.owner, row.token) == (worker_id, report.token):
             verdict = "accepted"
             rows[report.task_id] = row._replace(owner=None, reported_by=worker_id, reported_token=report.token)
-            task = HeldTask(row.seq, row.key, row.stage, row.state, row.tries)
+            task = HeldTask(row.seq, row.key, row.stage, row.state, row.tries, row.losses)
             if report.result is None:
                 released.append(task)
             else:
-                ended.append(_Ended(task, row.kind, _checked(book, task, report.result, versions)))
+                ended.append(_Ended(task, row.kind, row.cost_group, _checked(book, task, report.result, versions)))
         verdicts.append(ReportVerdict(task_id=report.task_id, verdict=verdict))
     accepted = [*released, *(end.task for end in ended)]
     for batch in batches(accepted):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([task.seq for task in batch]))
-            .values(reported_by=worker_id, reported_token=tasks.c.token)
-        )
+        book.connection.execute(_NOTE_REPORT, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
     failures = _take_results(book, ended, versions)
     damaged = tuple((end.task.seq, end.result.damaged_inputs) for end in ended if end.result.damaged_inputs)
     return Taken(tuple(verdicts), tuple(released), failures, damaged)
@@ -94,35 +128,23 @@ def take_reports(
 
 def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
     keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
-    columns = tasks.c
     return {
         task_id(row.stage, row.key): _Row(
             row.seq,
             row.key,
             Stage(row.stage),
             row.kind,
+            row.cost_group,
             TaskState(row.state),
             row.tries,
+            row.losses,
             row.owner,
             row.token,
             row.reported_by,
             row.reported_token,
         )
         for batch in batches(keys)
-        for row in book.connection.execute(
-            select(
-                columns.seq,
-                columns.key,
-                columns.stage,
-                columns.kind,
-                columns.state,
-                columns.tries,
-                columns.owner,
-                columns.token,
-                columns.reported_by,
-                columns.reported_token,
-            ).where(columns.key.in_(batch))
-        )
+        for row in book.connection.execute(_FIND, {"b_keys": batch})
     }
 
 
@@ -191,19 +213,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
     if not settled:
         return
     book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(
-            state=bindparam("b_state"),
-            reason=bindparam("b_reason"),
-            message=bindparam("b_message"),
-            output=bindparam("b_output"),
-            cpu_seconds=bindparam("b_cpu"),
-            wall_seconds=bindparam("b_wall"),
-            owner=None,
-            expires_at=None,
-            finished_at=book.now,
-        ),
+        _SETTLE,
         [
             {
                 "b_seq": end.task.seq,
@@ -213,6 +223,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
                 "b_output": None if end.result.output is None else end.result.output.model_dump_json(),
                 "b_cpu": end.result.cpu_seconds,
                 "b_wall": end.result.wall_seconds,
+                "b_now": book.now,
             }
             for end in settled
         ],
@@ -222,7 +233,10 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
         task, result = end.task, end.result
         state = TaskState(result.outcome)
         book.moved(task.seq, task.stage, TaskState.running, state)
-        book.ran(Run(task.seq, task.stage, end.kind, result.cpu_seconds, result.wall_seconds))
+        # What is rejected is often found at once: it says little of what the others take.
+        call_seconds = None if state is TaskState.rejected else result.call_seconds
+        cost = (result.cpu_seconds, result.wall_seconds, call_seconds)
+        book.ran(Run(task.seq, task.stage, end.kind, end.cost_group, *cost))
         if result.reason is not None:
             rejected[task.seq] = (result.reason, result.message)
             name = task_id(task.stage, task.key)
@@ -238,19 +252,13 @@ def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int
     edges = [
         (row.depends_on, row.task, row.stage, row.state)
         for batch in batches(settled)
-        for row in book.connection.execute(
-            select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
-            .join(tasks, tasks.c.seq == task_dependencies.c.task)
-            .where(task_dependencies.c.depends_on.in_(batch))
-        )
+        for row in book.connection.execute(_DEPENDENTS, {"b_tasks": batch})
     ]
     if not edges:
         return
     waits = Counter(task for _, task, _, _ in edges)
     book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled")),
+        _COUNT_DOWN,
         [{"b_seq": task, "b_settled": count} for task, count in waits.items()],
     )
     doomed = [

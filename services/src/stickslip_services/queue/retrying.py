@@ -1,28 +1,30 @@
 """What becomes of a task that was not finished: another try, or the end. And when its lease expires.
 
-A try counts only where the task had been started. A failed try waits a little (1 s, 2 s, ...) before the next; after
-`max_tries` of them the task fails, and with it every job that needs it. Such a job starts no further tasks; what is
-running finishes and is kept.
+A try counts only where the task had been started, and where it was not the worker that was lost. A failed try waits a
+little (1 s, 2 s, ...) before the next; after `max_tries` of them the task fails. One that took its process with it each
+time is set aside: the jobs that need it go on with everything else. Any other failure ends every job that needs the
+task: it starts no further tasks; what is running finishes and is kept.
 """
 
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, select, text, update
+from sqlalchemy import Connection, func, select, text, update
 from stickslip_schemas.events import TaskStateEvent
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, cancel_tasks, live_jobs, release
+from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ending, HeldTask, Ledger, cancel_tasks, live_jobs, release
 from stickslip_services.settings import Settings
 
 
 def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: bool = False) -> list[HeldTask]:
     """Return the tasks that `owners` hold, or whose lease has expired."""
-    query = select(tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.tries).where(
+    query = select(tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.tries, tasks.c.losses).where(
         text("tasks.owner IS NOT NULL")  # in the words of the partial index
     )
     if owners is not None:
@@ -30,7 +32,7 @@ def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: boo
     if expired:
         query = query.where(tasks.c.expires_at <= book.now)
     return [
-        HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries)
+        HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses)
         for row in book.connection.execute(query)
     ]
 
@@ -42,10 +44,14 @@ def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:
 
 
 def lose(book: Ledger, held: Sequence[HeldTask], settings: Settings, *, message: str) -> None:
-    """Take leases from a worker that is lost: tasks that it had started have failed once more."""
+    """Take leases from a lost worker. Tasks that it had started are not to blame, unless it happens too often."""
     give_back(book, [task for task in held if task.state is TaskState.leased])
-    started = [task for task in held if task.state is not TaskState.leased]
-    fail_tries(book, [(task, Reason.worker_lost, message) for task in started], settings)
+    for task, job in _still_needed(book, [task for task in held if task.state is not TaskState.leased]):
+        losses = task.losses + 1
+        if losses < settings.max_losses:
+            release(book, task, TaskState.pending, job=job, losses=losses)
+        else:
+            _fail(book, task, job, Reason.worker_lost, message, losses, settings)
 
 
 def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], settings: Settings) -> None:
@@ -54,31 +60,60 @@ def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], s
     for task, job in _still_needed(book, [task for task, _, _ in failures]):
         reason, message = why[task.seq]
         tries = task.tries + 1
-        state = TaskState.soft_failed if tries < settings.max_tries else TaskState.failed
+        if tries >= settings.max_tries:
+            _fail(book, task, job, reason, message, tries, settings)
+            continue
         retry_at = book.now + settings.retry_seconds * 2 ** (tries - 1)
-        release(
-            book,
-            task,
-            state,
-            job=job,
-            tries=tries,
-            reason=reason,
-            message=message,
-            retry_at=retry_at if state is TaskState.soft_failed else None,
-            finished_at=book.now if state is TaskState.failed else None,
-        )
-        name = task_id(task.stage, task.key)
-        event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
-        book.tell(task.seq, event)
-        if state is TaskState.failed:
-            _fail_jobs(book, task, f"task {name} failed {tries} times, at last with {reason}: {message}", settings)
+        values = {"tries": tries, "reason": reason, "message": message, "retry_at": retry_at}
+        release(book, task, TaskState.soft_failed, job=job, **values)
+        _tell(book, task, TaskState.soft_failed, reason, message)
+
+
+def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, times: int, settings: Settings) -> None:
+    """Let a task fail for good; `times` it failed."""
+    tries = task.tries + (reason is not Reason.worker_lost)
+    values = {"job": job, "tries": tries, "finished_at": book.now}
+    name = task_id(task.stage, task.key)
+    if not reason.ends_a_process:
+        release(book, task, TaskState.failed, reason=reason, message=message, **values)
+        _tell(book, task, TaskState.failed, reason, message)
+        _fail_jobs(book, task, f"task {name} failed {times} times, at last with {reason}: {message}", settings)
+        return
+    message = f"set aside after {times} tries, at last {reason}: {message}. To reproduce: {reproducer(name, settings)}"
+    release(book, task, TaskState.failed, reason=Reason.quarantined, message=message, **values)
+    _tell(book, task, TaskState.failed, Reason.quarantined, message)
+    for job_seq in _live_holders(book, task):
+        count = _count_failed(book.connection, job_seq)
+        if count > settings.max_quarantined:
+            _fail_jobs(book, task, f"{count} of its tasks were set aside, at last {name}: {message}", settings)
+            return
+        state = JobState(book.connection.execute(select(jobs.c.state).where(jobs.c.seq == job_seq)).scalar_one())
+        if state in RUNNABLE:
+            news = f"task {name} was {message}. The job goes on with the others"
+            set_job_state(book.connection, job_seq, state, book.now, reason=Reason.quarantined, message=news)
+
+
+def _tell(book: Ledger, task: HeldTask, state: TaskState, reason: Reason, message: str) -> None:
+    name = task_id(task.stage, task.key)
+    event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
+    book.tell(task.seq, event)
+
+
+def _count_failed(connection: Connection, job: int) -> int:
+    """Count rows: the counters follow only when the ledger is closed."""
+    query = select(func.count()).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+    return int(connection.scalar(query.where(job_tasks.c.job == job, tasks.c.state == TaskState.failed)) or 0)
+
+
+_IS_DUE = text(
+    "SELECT EXISTS (SELECT 1 FROM tasks WHERE tasks.owner IS NOT NULL AND tasks.expires_at <= :b_now) "
+    "OR EXISTS (SELECT 1 FROM tasks WHERE tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now)"
+)
 
 
 def is_sweep_due(connection: Connection, now: float) -> bool:
     """Tell whether a lease has expired or a retry is due, without taking the write lock."""
-    expired = select(tasks.c.seq).where(text("tasks.owner IS NOT NULL"), tasks.c.expires_at <= now).limit(1)
-    due = select(tasks.c.seq).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= now).limit(1)
-    return connection.scalar(expired) is not None or connection.scalar(due) is not None
+    return bool(connection.scalar(_IS_DUE, {"b_now": now}))
 
 
 def sweep(book: Ledger, settings: Settings) -> None:
@@ -158,7 +193,11 @@ def _fail_jobs(book: Ledger, task: HeldTask, message: str, settings: Settings) -
         f"{message}. No further tasks are started; what is done is kept, and submitting the job again tries again. "
         f"To reproduce: {command}",
     )
-    holders = [holder.job for holder in book.holders([task.seq]).get(task.seq, ())]
-    live = book.connection.scalars(select(jobs.c.seq).where(jobs.c.seq.in_(holders), jobs.c.state.in_(LIVE)))
-    for job in live.all():
+    for job in _live_holders(book, task):
         book.end_job(job, ending)
+
+
+def _live_holders(book: Ledger, task: HeldTask) -> list[int]:
+    holders = [holder.job for holder in book.holders([task.seq]).get(task.seq, ())]
+    live = select(jobs.c.seq).where(jobs.c.seq.in_(holders), jobs.c.state.in_(LIVE))
+    return list(book.connection.scalars(live))

@@ -16,15 +16,16 @@ def find_stranded(connection: Connection, now: float, settings: Settings) -> dic
     seen_since = now - settings.lease_seconds
     alive = present_workers(connection, seen_since=seen_since)
     rows = connection.execute(
-        select(jobs.c.seq, jobs.c.kind, jobs.c.builds, jobs.c.message).where(
+        select(jobs.c.seq, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
             jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None)
         )
     )
-    return {
-        row.seq: message
-        for row in rows
-        if (message := _stranded_message(row.kind, Builds.model_validate_json(row.builds), alive)) != row.message
-    }
+    found = {}
+    for row in rows:
+        message = _stranded_message(row.kind, Builds.model_validate_json(row.builds), alive)
+        if message != row.message and (message or row.reason == Reason.waiting_for_worker):
+            found[row.seq] = message
+    return found
 
 
 def note_stranded(connection: Connection, now: float, settings: Settings) -> None:

@@ -16,6 +16,7 @@ from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_services.database.database import batches, insert_rows
 from stickslip_services.database.tables import (
     job_counts,
+    job_groups,
     job_stages,
     job_tasks,
     jobs,
@@ -25,14 +26,14 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import Ledger, charge_waiting_tasks
+from stickslip_services.queue.ledger import OVER, Ledger, charge_waiting_tasks
 from stickslip_services.queue.planning import Plan
 from stickslip_services.queue.workers import NO_WORKER
 
 _LOST = (TaskState.failed, TaskState.cancelled)
 
 
-def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None) -> int:
+def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None, *, priority: int = 0) -> int:
     """Write a job down, and its tasks if it can be planned already; return its `seq`."""
     reason, message = (None, "") if plan else (Reason.waiting_for_worker, NO_WORKER)
     result = book.connection.execute(
@@ -45,6 +46,7 @@ def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None) -> int:
             state=JobState.queued,
             message=message,
             rejected_count=0,
+            priority=priority,
             created_at=book.now,
         )
     )
@@ -87,6 +89,7 @@ class _Known(NamedTuple):
     state: TaskState
     reason: str | None
     message: str
+    cost_group: str
 
 
 def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
@@ -113,6 +116,13 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     book.inserted.update(counts)
     counts.update((task.stage, task.state) for task in known.values())
     _insert_counts(connection, job, counts)
+    left = Counter((task.stage, task.cost_group) for task in known.values() if task.state not in OVER)
+    for key, task in plan.tasks.items():
+        if key not in known:
+            left[Stage(task.stage), task.cost_group] += seqs[key] not in rejected
+    groups = {*left, *((task.stage, task.cost_group) for task in known.values())}
+    rows = ((job, stage, group, left[stage, group]) for stage, group in groups)
+    insert_rows(connection, job_groups, ("job", "stage", "cost_group", '"left"'), rows)
     _retry(book, job, [task for task in known.values() if task.state in _LOST])  # its moves change the counts
     return known[plan.publish_key].state if plan.publish_key in known else TaskState.pending
 
@@ -121,12 +131,18 @@ def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
     found: dict[bytes, _Known] = {}
     if not connection.scalar(select(tasks.c.seq).limit(1)):
         return found
-    columns = (tasks.c.key, tasks.c.seq, tasks.c.stage, tasks.c.state, tasks.c.reason, tasks.c.message)
+    columns = (
+        tasks.c.key,
+        tasks.c.seq,
+        tasks.c.stage,
+        tasks.c.state,
+        tasks.c.reason,
+        tasks.c.message,
+        tasks.c.cost_group,
+    )
     for batch in batches(keys):
-        for key, seq, stage, state, reason, message in connection.execute(
-            select(*columns).where(tasks.c.key.in_(batch))
-        ):
-            found[key] = _Known(seq, Stage(stage), TaskState(state), reason, message)
+        for key, seq, stage, state, *rest in connection.execute(select(*columns).where(tasks.c.key.in_(batch))):
+            found[key] = _Known(seq, Stage(stage), TaskState(state), *rest)
     return found
 
 
@@ -144,6 +160,7 @@ def _retry(book: Ledger, job: int, lost: Sequence[_Known]) -> None:
                 message="",
                 job=job,
                 tries=0,
+                losses=0,
                 retry_at=None,
                 finished_at=None,
             )
@@ -164,7 +181,7 @@ def _insert_tasks(
     dependencies: list[tuple[int, int]] = []
     kind = plan.spec.kind
     seq = connection.scalar(select(func.coalesce(func.max(tasks.c.seq), 0))) or 0
-    for key, (stage, build, payload, depends_on, preview) in plan.tasks.items():
+    for key, (stage, build, payload, depends_on, preview, cost_group) in plan.tasks.items():
         if key in seqs:
             continue
         seq += 1
@@ -183,8 +200,8 @@ def _insert_tasks(
                 rejected.add(seq)
         if stage in (Stage.pack, Stage.publish):  # their slots are those of the job that came first
             payload = json.dumps(json.loads(payload) | {"job": job})
-        rows.append((seq, key, stage, kind, build, payload, preview, job, *fate, waiting_on))
-    columns = ("seq", "key", "stage", "kind", "build", "payload", "preview", "job")
+        rows.append((seq, key, stage, kind, build, payload, preview, cost_group, job, *fate, waiting_on))
+    columns = ("seq", "key", "stage", "kind", "build", "payload", "preview", "cost_group", "job")
     insert_rows(connection, tasks, (*columns, "state", "reason", "message", "waiting_on"), rows)
     insert_rows(connection, task_dependencies, ("task", "depends_on"), dependencies)
     return seqs, rejected

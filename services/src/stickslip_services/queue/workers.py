@@ -1,10 +1,10 @@
 """Workers: dispatchers that have registered, and what they can run."""
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, Row, func, insert, select, text, update
+from sqlalchemy import Connection, Row, bindparam, func, insert, select, text, update
 from stickslip_schemas import responses
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Stage
@@ -71,9 +71,12 @@ def insert_worker(connection: Connection, registration: WorkerRegistration, now:
     return find_worker(connection, worker_id)
 
 
+_WORKER = select(workers).where(workers.c.id == bindparam("b_id"))
+
+
 def find_worker(connection: Connection, worker_id: str) -> RegisteredWorker:
     """Return a worker, superseded or not; raise UnknownWorkerError."""
-    row = connection.execute(select(workers).where(workers.c.id == worker_id)).one_or_none()
+    row = connection.execute(_WORKER, {"b_id": worker_id}).one_or_none()
     if row is None:
         raise UnknownWorkerError(f"no worker has the id {worker_id!r}: register again")
     return _worker(row)
@@ -126,35 +129,32 @@ def leased_counts(connection: Connection) -> dict[str, int]:
     return dict(connection.execute(query).all())
 
 
-@dataclass(frozen=True, slots=True)
-class RunningTask:
-    """What a worker is at."""
-
-    task_id: str
-    stage: Stage
-    job: str | None
-    since: float | None
-    """When it was started [s since 1970]; None: it waits at the worker."""
-
-
-def running_tasks(connection: Connection) -> dict[str, list[RunningTask]]:
-    """Return the tasks on lease by worker, those that run longest first."""
+def running_tasks(
+    connection: Connection, frames: Mapping[str, tuple[int, int]]
+) -> dict[str, list[responses.RunningTask]]:
+    """Return the tasks on lease by worker, those that run longest first; `frames` are what simulations tell."""
     rows = connection.execute(
         select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
         .where(text("tasks.owner IS NOT NULL"))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
-    found: dict[str, list[RunningTask]] = {}
+    found: dict[str, list[responses.RunningTask]] = {}
     for owner, key, stage, state, started_at, job in rows:
-        since = started_at if state == "running" else None
-        found.setdefault(owner, []).append(RunningTask(task_id(stage, key), Stage(stage), job, since))
+        since = as_datetime(started_at) if state == "running" else None
+        name = task_id(stage, key)
+        running = responses.RunningTask(
+            task_id=name, stage=Stage(stage), job=job, since=since, frames=frames.get(name) if since else None
+        )
+        found.setdefault(owner, []).append(running)
     return found
 
 
-def show_workers(connection: Connection, *, alive_since: float) -> list[responses.WorkerEntry]:
+def show_workers(
+    connection: Connection, *, alive_since: float, frames: Mapping[str, tuple[int, int]]
+) -> list[responses.WorkerEntry]:
     """Return the newest session of every worker as the API shows it."""
-    held = leased_counts(connection)
+    held = running_tasks(connection, frames)
     return [
         responses.WorkerEntry(
             id=worker.id,
@@ -165,7 +165,8 @@ def show_workers(connection: Connection, *, alive_since: float) -> list[response
             registered_at=as_datetime(worker.registered_at),
             last_seen_at=as_datetime(worker.last_seen_at),
             alive=worker.last_seen_at >= alive_since,
-            leased=held.get(worker.id, 0),
+            leased=len(held.get(worker.id, ())),
+            running=tuple(task for task in held.get(worker.id, ()) if task.since is not None),
         )
         for worker in present_workers(connection)
     ]

@@ -9,6 +9,7 @@ from stickslip_schemas.tasks import TaskResult
 
 from stickslip_workers.cloth import fabric_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind
+from stickslip_workers.progress import tell
 
 if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
@@ -30,6 +31,7 @@ def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult
         vertices=simulation.mesh,
         frames=simulation.frames,
         seed=simulation.seed,
+        on_frame=tell,
     )
     forces = {
         "contact_force": np.asarray(run.contact_force, dtype=np.float32),

@@ -9,6 +9,7 @@ from stickslip_schemas.tasks import TaskResult
 
 from stickslip_workers.cloth import fabric_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind
+from stickslip_workers.progress import tell
 
 if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth_sphere import ClothSphereSimulation
@@ -31,6 +32,7 @@ def _simulate_one(simulation: "ClothSphereSimulation", store: Store) -> TaskResu
         vertices=simulation.mesh,
         frames=simulation.frames,
         seed=simulation.seed,
+        on_frame=tell,
     )
     record = {
         "angle": np.asarray(run.angle, dtype=np.float32),

@@ -6,7 +6,7 @@ from pydantic import TypeAdapter
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import Task, TaskResult
 
-from stickslip_workers import builds
+from stickslip_workers import builds, progress
 from stickslip_workers.kinds import kind_names
 from stickslip_workers.stages.run import AnyTask, run_tasks
 
@@ -29,4 +29,12 @@ class StageActor:
 
     def run(self, tasks: str) -> str:
         """Run tasks, see `run_tasks`."""
-        return _results.dump_json(run_tasks(_tasks.validate_json(tasks), self._store)).decode()
+        progress.forget()
+        try:
+            return _results.dump_json(run_tasks(_tasks.validate_json(tasks), self._store)).decode()
+        finally:
+            progress.forget()
+
+    def frames(self) -> tuple[int, int] | None:
+        """Return how far the simulation is that runs, from another thread: frames done, and frames."""
+        return progress.told()

@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from importlib import import_module
 
+from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
 
@@ -34,10 +35,19 @@ def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
     return tuple(digest for digest in input_digests(task) if not store.holds(digest))
 
 
+def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:
+    """Return the result of a failed task with all damaged inputs named, so that they are made again at once.
+
+    Nothing is known of inputs while the store itself cannot be used.
+    """
+    if result.reason is Reason.store_unavailable:
+        return result
+    return result.model_copy(update={"damaged_inputs": damaged_inputs(task, store)})
+
+
 def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
-    """Return the result of a task that raised; it names all damaged inputs, so that they are made again at once."""
-    damaged = damaged_inputs(task, store)
-    return failure(error).model_copy(update={"damaged_inputs": damaged})
+    """Return the result of a task that raised."""
+    return with_damaged_inputs(failure(error), task, store)
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:

@@ -26,8 +26,8 @@ PageDep = Annotated[PageRequest, Depends(_page)]
 
 _TITLES = {
     400: "The body is not JSON",
-    401: "The key is missing or wrong",
-    403: "The request names a foreign host, or comes from a page of another site",
+    401: "The key is missing or not known",
+    403: "The key lacks the scope, or the request names a foreign host or comes from a page of another site",
     404: "Not found",
     409: "The state does not allow it; `detail` names the state",
     412: "The job has changed since the `ETag` in `If-Match`",
@@ -41,11 +41,14 @@ _TITLES = {
 
 BODY_PROBLEMS = (400, 413, 415, 422)
 
+KEYED: dict[str, Any] = {"security": [{"key": []}]}
+"""What OpenAPI says of a route that needs a key, also on loopback."""
+
 
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return what OpenAPI says of the problems that a route may answer with."""
     schema = {"$ref": "#/components/schemas/Problem"}
     return {
         status: {"description": _TITLES[status], "content": {MEDIA_TYPE: {"schema": schema}}}
-        for status in sorted({*statuses, 403, 500, 503})
+        for status in sorted({*statuses, 401, 403, 500, 503})
     }

@@ -5,13 +5,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import AnyJobSpec
-from stickslip_schemas.responses import Job, JobDetail, Page, Preview, SampleState, Validation
+from stickslip_schemas.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
 from stickslip_schemas.states import TaskState
 
-from stickslip_services.api import sse
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.files import matches
 from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
+from stickslip_services.api.sse import OPENAPI as STREAM
+from stickslip_services.api.sse import Feeds
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.jobs import Replay, etag, find_job, list_jobs, list_previews, list_samples
 from stickslip_services.queue.validating import validate
@@ -61,9 +62,12 @@ def post_job(
             description="a word that is yours alone; a request that comes twice with it makes one job. Kept for ever.",
         ),
     ] = None,
+    priority: Annotated[
+        int, Query(ge=-100, le=100, description="tasks of the job with the highest number come first")
+    ] = 0,
 ) -> Response:
     """Submit a job. What of it is there already is not done again; what had failed is tried again."""
-    job = coordinator.submit(spec, idempotency_key)
+    job = coordinator.submit(spec, idempotency_key, priority=priority)
     if isinstance(job, Replay):
         return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
     return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})
@@ -101,6 +105,22 @@ def get_job(
     if matches(if_none_match, tag):
         return Response(status_code=304, headers={"ETag": tag})
     return _json(content, headers={"ETag": tag})
+
+
+@router.patch(
+    "/v1/jobs/{job_id}",
+    responses=_CHANGED | problem_responses(*BODY_PROBLEMS),
+    openapi_extra=body_schema("JobPatch"),
+)
+def patch_job(
+    job_id: str,
+    patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))],
+    coordinator: CoordinatorDep,
+    response: Response,
+    if_match: IfMatch = None,
+) -> JobDetail:
+    """Give a job another priority, from its next task on. 409: it has ended."""
+    return _tagged(response, coordinator.prioritise(job_id, patch.priority, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=_CHANGED)
@@ -152,7 +172,7 @@ def get_previews(job_id: str, coordinator: CoordinatorDep) -> list[Preview]:
                 "`job.progress` (about once a second, with the id of the event before it). After the `job.state` that "
                 "ends the job the stream ends."
             ),
-            "content": {"text/event-stream": sse.OPENAPI},
+            "content": {"text/event-stream": STREAM},
         },
         **problem_responses(404, 422),
     },
@@ -168,7 +188,8 @@ def get_events(
     """Follow a job."""
     with coordinator.database.read() as connection:
         job = int(find_job(connection, job_id).seq)
-    return sse.stream(coordinator.database, coordinator.bell, coordinator.show, job, after=int(last_event_id or 0))
+    feeds: Feeds = request.app.state.feeds
+    return feeds.stream(job, after=int(last_event_id or 0))
 
 
 def _etags(if_match: str | None) -> list[str] | None:

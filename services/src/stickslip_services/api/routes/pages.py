@@ -26,6 +26,7 @@ from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import coordinator_of
 from stickslip_services.catalog.certificates import find_certificate, list_certificates
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets
+from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
@@ -41,7 +42,7 @@ from stickslip_services.queue.jobs import (
     stage_durations,
 )
 from stickslip_services.queue.retrying import failed_tasks
-from stickslip_services.queue.workers import running_tasks, show_workers
+from stickslip_services.queue.workers import show_workers
 
 router = APIRouter(include_in_schema=False)
 
@@ -484,8 +485,7 @@ def get_workers_part(coordinator: CoordinatorDep) -> Response:
 
 def _workers(coordinator: Coordinator) -> dict[str, Any]:
     with coordinator.database.read() as connection:
-        workers = show_workers(connection, alive_since=coordinator.alive_since)
-        running = running_tasks(connection)
+        workers = show_workers(connection, alive_since=coordinator.alive_since, frames=coordinator.frames)
         certified = {
             entry.sim_core: entry
             for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
@@ -493,7 +493,8 @@ def _workers(coordinator: Coordinator) -> dict[str, Any]:
         }
     root = coordinator.store.root
     disk = shutil.disk_usage(root if root.exists() else coordinator.settings.data)
-    return {"workers": workers, "running": running, "certified": certified, "disk": disk, "now": coordinator.clock()}
+    now = as_datetime(coordinator.clock())
+    return {"workers": workers, "certified": certified, "disk": disk, "now": now}
 
 
 @router.get("/docs")

@@ -1,6 +1,6 @@
 """The worker API: a dispatcher registers, leases tasks, says that it lives, and reports."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
 from stickslip_schemas.responses import WorkerEntry
@@ -16,15 +16,12 @@ from stickslip_schemas.worker_api import (
 )
 
 from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.doors import require_worker_key
 from stickslip_services.api.metrics import Metrics
-from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses
+from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, coordinator_of, problem_responses
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.workers import show_workers
 
 router = APIRouter(tags=["workers"])
-
-_KEY: dict[str, Any] = {"dependencies": [Depends(require_worker_key)]}
 
 CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
@@ -33,15 +30,14 @@ CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
     """List the workers that have registered, the newest session of each name, newest first."""
     with coordinator.database.read() as connection:
-        return show_workers(connection, alive_since=coordinator.alive_since)
+        return show_workers(connection, alive_since=coordinator.alive_since, frames=coordinator.frames)
 
 
 @router.post(
     "/v1/workers",
-    **_KEY,
     status_code=201,
-    responses=problem_responses(401, *BODY_PROBLEMS),
-    openapi_extra=body_schema("WorkerRegistration"),
+    responses=problem_responses(*BODY_PROBLEMS),
+    openapi_extra=body_schema("WorkerRegistration") | KEYED,
 )
 def post_worker(
     registration: Annotated[WorkerRegistration, Depends(JsonBody(WorkerRegistration))], coordinator: CoordinatorDep
@@ -52,10 +48,9 @@ def post_worker(
 
 @router.post(
     "/v1/worker/lease",
-    **_KEY,
     response_model=LeaseBatch,
-    responses=problem_responses(401, 404, 409, *BODY_PROBLEMS),
-    openapi_extra=body_schema("LeaseRequest"),
+    responses=problem_responses(404, 409, *BODY_PROBLEMS),
+    openapi_extra=body_schema("LeaseRequest") | KEYED,
 )
 def post_lease(
     request: Annotated[LeaseRequest, Depends(JsonBody(LeaseRequest))], coordinator: CoordinatorDep
@@ -67,9 +62,8 @@ def post_lease(
 
 @router.post(
     "/v1/worker/heartbeat",
-    **_KEY,
-    responses=problem_responses(401, 404, *BODY_PROBLEMS),
-    openapi_extra=body_schema("Heartbeat"),
+    responses=problem_responses(404, *BODY_PROBLEMS),
+    openapi_extra=body_schema("Heartbeat") | KEYED,
 )
 def post_heartbeat(
     heartbeat: Annotated[Heartbeat, Depends(JsonBody(Heartbeat))], coordinator: CoordinatorDep
@@ -80,9 +74,8 @@ def post_heartbeat(
 
 @router.post(
     "/v1/worker/report",
-    **_KEY,
-    responses=problem_responses(401, 404, *BODY_PROBLEMS),
-    openapi_extra=body_schema("ReportBatch"),
+    responses=problem_responses(404, *BODY_PROBLEMS),
+    openapi_extra=body_schema("ReportBatch") | KEYED,
 )
 def post_report(
     batch: Annotated[ReportBatch, Depends(JsonBody(ReportBatch))], coordinator: CoordinatorDep, request: Request

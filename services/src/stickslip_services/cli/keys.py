@@ -1,0 +1,86 @@
+"""API keys: making, listing and revoking them, in the database of a data directory.
+
+Whoever may write the data directory may make keys: no key is needed for that, and no coordinator has to run.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from stickslip_services.cli.common import console, say, table
+from stickslip_services.cli.errors import shows_errors
+from stickslip_services.installed import require_server
+from stickslip_services.scopes import Scope
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
+app = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
+
+DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
+DEFAULT_DATA = Path("stickslip-data")
+
+
+@contextmanager
+def _writing(data: Path) -> Iterator["Connection"]:
+    require_server("keys")
+    from stickslip_services.database.opening import opened  # the server's packages may be missing
+
+    with opened(data) as database, database.write() as connection:
+        yield connection
+
+
+@app.command()
+@shows_errors
+def create(
+    name: Annotated[str, typer.Argument(help="whose key it is, or what for")],
+    scope: Annotated[list[Scope], typer.Option(help="what it is for; repeatable. submit includes read, admin all")],
+    data: DataOption = DEFAULT_DATA,
+) -> None:
+    """Make a key and print it. It is shown this once: only its digest is kept."""
+    with _writing(data) as connection:
+        from stickslip_services.keys import create_key
+
+        key, secret = create_key(connection, name, scope, time.time())
+    typer.echo(secret)
+    say(f"{key.id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
+    say("Authorization: Bearer KEY; a browser takes it as the password of any user")
+
+
+@app.command("list")
+@shows_errors
+def list_(data: DataOption = DEFAULT_DATA) -> None:
+    """List keys, also the revoked ones, newest first."""
+    with _writing(data) as connection:
+        from stickslip_services.keys import list_keys
+
+        found = list_keys(connection)
+    shown = table("key", "name", "scopes", "made", "revoked", no_wrap=("key",))
+    for key in found:
+        shown.add_row(
+            key.id,
+            escape(key.name),
+            ", ".join(scope for scope in Scope if scope in key.scopes),
+            f"{key.created_at:%Y-%m-%d %H:%M}",
+            "" if key.revoked_at is None else f"{key.revoked_at:%Y-%m-%d %H:%M}",
+        )
+    console().print(shown)
+
+
+@app.command()
+@shows_errors
+def revoke(
+    key_id: Annotated[str, typer.Argument(metavar="KEY", help="id of a key, as `stickslip keys list` shows it")],
+    data: DataOption = DEFAULT_DATA,
+) -> None:
+    """Let a key open nothing any more; a running coordinator knows it within a second."""
+    with _writing(data) as connection:
+        from stickslip_services.keys import revoke_key
+
+        revoke_key(connection, key_id, time.time())
+    typer.echo(f"{key_id} is revoked")

@@ -1,0 +1,125 @@
+"""API keys: secrets that programs and people show. The database has their digests only.
+
+A secret has 256 random bits, so a plain SHA-256 cannot be reversed by guessing, and no salt is needed.
+"""
+
+import secrets
+import threading
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sqlalchemy import Connection, insert, select, update
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.store import write_durably
+
+from stickslip_services.clock import as_datetime
+from stickslip_services.database.database import Database
+from stickslip_services.database.tables import api_keys
+from stickslip_services.errors import NotFoundError
+from stickslip_services.scopes import Scope
+
+LOCAL_WORKER = "local-worker"
+"""Name of the key in the file `worker-key` of the data directory."""
+
+FRESH_SECONDS = 1.0
+"""A key that was made or revoked counts so long after that, at the latest [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ApiKey:
+    """A key without its secret."""
+
+    id: str
+    name: str
+    scopes: frozenset[Scope]
+    created_at: datetime
+    revoked_at: datetime | None
+
+
+def create_key(connection: Connection, name: str, scopes: Collection[Scope], now: float) -> tuple[ApiKey, str]:
+    """Make a key; return it and its secret, which nobody can be told again."""
+    secret = f"sk_{secrets.token_urlsafe(32)}"
+    return _insert(connection, name, scopes, secret, now), secret
+
+
+def list_keys(connection: Connection) -> list[ApiKey]:
+    """Return all keys, also the revoked ones, newest first."""
+    rows = connection.execute(select(api_keys).order_by(api_keys.c.seq.desc()))
+    return [
+        ApiKey(
+            id=row.id,
+            name=row.name,
+            scopes=frozenset(map(Scope, row.scopes.split())),
+            created_at=as_datetime(row.created_at),
+            revoked_at=None if row.revoked_at is None else as_datetime(row.revoked_at),
+        )
+        for row in rows
+    ]
+
+
+def revoke_key(connection: Connection, key_id: str, now: float) -> None:
+    """Let a key open nothing any more; one that is revoked stays so. Raise NotFoundError."""
+    known = api_keys.c.id == key_id
+    if connection.scalar(select(api_keys.c.seq).where(known)) is None:
+        raise NotFoundError(f"there is no key {key_id[:100]!r}")
+    connection.execute(update(api_keys).where(known, api_keys.c.revoked_at.is_(None)).values(revoked_at=now))
+
+
+def local_worker_key(path: Path) -> str:
+    """Return the secret in the file of the local workers; make it where there is none. Only its owner can read it."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, f"{secrets.token_urlsafe(32)}\n".encode(), mode=0o600)
+    return path.read_text(encoding="ascii").strip()
+
+
+def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
+    """Let the secret in the file of the local workers be a key of the scope `work`; replace one that was revoked."""
+    digest = sha256(local_worker_key(path).encode())
+    row = connection.execute(select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)).one_or_none()
+    if row is not None and row.revoked_at is not None:
+        path.unlink()
+        row = None
+    if row is None:
+        _insert(connection, LOCAL_WORKER, (Scope.work,), local_worker_key(path), now)
+
+
+class KeyRing:
+    """The keys that open something, as they were a moment ago. Thread-safe."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._lock = threading.Lock()
+        self._scopes: dict[str, frozenset[Scope]] = {}
+        self._read_at = float("-inf")
+
+    @property
+    def is_fresh(self) -> bool:
+        """True where `scopes_of` answers without a look at the database."""
+        return time.monotonic() < self._read_at + FRESH_SECONDS
+
+    def scopes_of(self, secret: str) -> frozenset[Scope] | None:
+        """Return what a secret is for; None where it is no key, or one that was revoked."""
+        with self._lock:
+            if not self.is_fresh:
+                with self._database.read() as connection:
+                    rows = connection.execute(
+                        select(api_keys.c.digest, api_keys.c.scopes).where(api_keys.c.revoked_at.is_(None))
+                    )
+                    self._scopes = {row.digest: frozenset(map(Scope, row.scopes.split())) for row in rows}
+                self._read_at = time.monotonic()
+            return self._scopes.get(sha256(secret.encode()))
+
+
+def _insert(connection: Connection, name: str, scopes: Collection[Scope], secret: str, now: float) -> ApiKey:
+    ordered = [scope for scope in Scope if scope in scopes]
+    key_id = f"key-{secrets.token_hex(8)}"
+    connection.execute(
+        insert(api_keys).values(
+            id=key_id, name=name, digest=sha256(secret.encode()), scopes=" ".join(ordered), created_at=now
+        )
+    )
+    return ApiKey(key_id, name, frozenset(ordered), as_datetime(now), None)

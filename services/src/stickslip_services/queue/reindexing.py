@@ -1,0 +1,101 @@
+"""Finding the datasets of a store again after the database was lost.
+
+A version is known by its manifest, its root's metadata and the seal that vouches for both. Of each version that is
+whole a job is written down that has made it, so that the dataset is listed and can be pulled, and a spec that is
+submitted again finds it. Results of single simulations and renders are not found again, and neither are certificates.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import select, update
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal
+from stickslip_schemas.samples import dataset_id
+from stickslip_schemas.states import TaskState
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import PublishOutput
+
+from stickslip_services.catalog.versions import (
+    commit_version,
+    find_committed,
+    read_version,
+    reserve_number,
+    version_exists,
+)
+from stickslip_services.database.database import Database
+from stickslip_services.database.tables import tasks
+from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.ledger import Ending
+from stickslip_services.queue.planning import expand
+from stickslip_services.queue.submitting import insert_job
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A version in the store."""
+
+    place: Path
+    samples: int
+    fault: str
+    """Why it was not taken in; empty where it was."""
+    is_new: bool = True
+
+
+def reindex(database: Database, store: Store) -> Iterator[Found]:
+    """Take in the versions that are in the store and not in the database, one transaction each; yield all of them."""
+    for path in sorted(store.root.glob(f"datasets/*/v*/{MANIFEST_NAME}")):
+        try:
+            manifest, output = _read(store, path)
+        except (OSError, ValueError) as error:
+            yield Found(path.parent, 0, str(error).splitlines()[0])
+            continue
+        is_new = _take_in(database, store, manifest, output, path.stat().st_mtime)
+        yield Found(path.parent, manifest.sample_count, "", is_new)
+
+
+def _read(store: Store, path: Path) -> tuple[Manifest, PublishOutput]:
+    """Read a version; put artifacts back that are gone from the store and are still in the version's directory."""
+    place = path.parent
+    content, group, seal = (place / MANIFEST_NAME, place / GROUP_NAME, place / SEAL_NAME)
+    check_seal(content.read_bytes(), group.read_bytes(), seal.read_bytes())
+    manifest = Manifest.model_validate_json(content.read_bytes())
+    if (dataset_id(manifest.spec), f"v{manifest.version}") != (place.parent.name, place.name):
+        raise ValueError(f"the manifest is that of {dataset_id(manifest.spec)}, v{manifest.version}")
+    own = {name: sha256((place / name).read_bytes()) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)}
+    for name, digest in (own | {file.path: file.sha256 for file in manifest.files}).items():
+        if not store.has(digest, size=1):
+            store.publish((place / name).read_bytes())
+    size = manifest.size + sum((place / name).stat().st_size for name in own)
+    output = PublishOutput(manifest=own[MANIFEST_NAME], group=own[GROUP_NAME], bytes=size)
+    read_version(store, output)  # every file is there
+    return manifest, output
+
+
+def _take_in(database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float) -> bool:
+    """Write a version down as the work of a job that has ended; return False where it is known."""
+    plan = expand(manifest.spec, manifest.builds, certificate=manifest.certificate)
+    with database.write() as connection:
+        if version_exists(connection, manifest.dataset, manifest.version):
+            return False
+        with ledger(connection, made_at) as book:
+            insert_job(book, manifest.spec, plan)
+            task = connection.scalar(select(tasks.c.seq).where(tasks.c.key == plan.publish_key))
+            assert task is not None
+            connection.execute(
+                update(tasks)
+                .where(tasks.c.seq == task)
+                .values(state=TaskState.succeeded, output=output.model_dump_json(), finished_at=made_at)
+            )
+            book.moved(task, "publish", TaskState.pending, TaskState.succeeded)
+            reserve_number(connection, manifest.dataset, manifest.version, task)
+            commit_version(connection, task, read_version(store, output), name=manifest.spec.name, now=made_at)
+            version = find_committed(connection, task)
+            ending = Ending.published(
+                version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
+            )
+            message = ". ".join(filter(None, ["found again in the store", ending.message]))
+            for holder in book.holders([task])[task]:
+                book.end_job(holder.job, Ending(ending.state, None, message, ending.dataset, ending.rejected_count))
+    return True

@@ -1,0 +1,30 @@
+"""Scopes: what a key lets its holder do."""
+
+from collections.abc import Collection
+from enum import StrEnum
+
+
+class Scope(StrEnum):
+    """What a key is for. `submit` includes `read`; `admin` includes everything."""
+
+    read = "read"
+    """Look at everything: jobs, datasets, certificates, pages, metrics."""
+    submit = "submit"
+    """Submit jobs, and pause, resume, cancel and prioritise them."""
+    work = "work"
+    """Be a worker: register, lease tasks and report results."""
+    admin = "admin"
+    """Everything, and register certificates."""
+
+
+_IMPLIED = {
+    Scope.read: {Scope.read},
+    Scope.submit: {Scope.submit, Scope.read},
+    Scope.work: {Scope.work},
+    Scope.admin: set(Scope),
+}
+
+
+def allows(granted: Collection[Scope], needed: Scope) -> bool:
+    """Tell whether scopes that were granted include the one that is needed."""
+    return any(needed in _IMPLIED[scope] for scope in granted)

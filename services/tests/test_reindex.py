@@ -1,0 +1,208 @@
+"""A lost database is built again from the datasets; one that is damaged or newer is refused in one sentence."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+from stickslip_schemas.keys import sha256
+from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.states import JobState
+from stickslip_schemas.store import Store
+from stickslip_services.cli import app
+from stickslip_services.database.database import Database
+from stickslip_services.database.opening import check, locked, opened
+from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.reindexing import reindex
+from stickslip_services.settings import Settings
+from stickslip_services.testing import (
+    PretendWorker,
+    list_datasets,
+    list_jobs,
+    parsed,
+    rejection,
+    rods,
+    show_job,
+    start_server,
+)
+from typer.testing import CliRunner, Result
+
+
+@pytest.fixture
+def made(settings: Settings) -> dict[str, object]:
+    """Two datasets, one with a rejected sample; then the database is lost. Return what was known of them."""
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
+    for spec in (rods(name="first"), rods(gamma=(9.0, 1.0))):
+        coordinator.submit(parsed(spec), None)
+        worker.work()
+    known = {dataset.id: dataset for dataset in list_datasets(coordinator)}
+    coordinator.close()
+    for path in settings.data.glob("coordinator.sqlite3*"):
+        path.unlink()
+    return dict(known)
+
+
+def run(settings: Settings) -> Result:
+    return CliRunner().invoke(app, ["reindex", "--data", str(settings.data)])
+
+
+def test_a_lost_database_is_not_taken_for_a_new_one(settings: Settings, made: dict[str, object]) -> None:
+    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(settings.data), "--port", "0"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    (sentence,) = ended.stderr.splitlines()
+    assert "is gone: run `stickslip reindex --data" in sentence
+    up = CliRunner().invoke(app, ["up", "--data", str(settings.data), "--port", "0"])
+    assert (up.exit_code, "stickslip reindex" in up.stderr) == (1, True)
+
+
+def test_datasets_are_found_again(settings: Settings, made: dict[str, object], tmp_path: Path) -> None:
+    result = run(settings)
+    assert result.exit_code == 0, result.output
+    assert "2 versions found again, 0 known before, 0 left out" in result.stderr
+    again = run(settings)
+    assert "0 versions found again, 2 known before, 0 left out" in again.stderr
+    server = start_server(settings.data)
+    try:
+        for dataset in made:
+            pulled = CliRunner().invoke(app, ["pull", dataset, str(tmp_path / dataset), "--url", server.url])
+            assert pulled.exit_code == 0, pulled.output
+            assert CliRunner().invoke(app, ["verify", str(tmp_path / dataset)]).exit_code == 0
+    finally:
+        server.stop()
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    found = {dataset.id: dataset for dataset in list_datasets(coordinator)}
+    assert found.keys() == made.keys()
+    for dataset, before in made.items():
+        (old,), (new,) = before.versions, found[dataset].versions  # type: ignore[attr-defined]
+        same = ("version", "manifest", "group", "sample_count", "valid_count", "bytes")
+        assert [getattr(new, name) for name in same[:-1]] == [getattr(old, name) for name in same[:-1]]
+        assert found[dataset].name == before.name  # type: ignore[attr-defined]
+    assert {job.state for job in list_jobs(coordinator)} == {JobState.succeeded, JobState.succeeded_with_rejects}
+    assert all(job.message.startswith("found again in the store") for job in list_jobs(coordinator))
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+    coordinator.close()
+
+
+def test_a_spec_that_is_submitted_again_finds_its_dataset(settings: Settings, made: dict[str, object]) -> None:
+    run(settings)
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = coordinator.submit(parsed(rods(name="first")), None)
+    shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
+    assert shown.state is JobState.succeeded
+    assert worker.work() == 0
+    bigger = coordinator.submit(parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
+    worker.work()
+    assert show_job(coordinator, bigger.id).state is JobState.succeeded  # type: ignore[union-attr]
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+    coordinator.close()
+
+
+def test_a_dataset_that_rots_afterwards_is_made_again(settings: Settings, made: dict[str, object]) -> None:
+    run(settings)
+    store = Store(settings.store_root)
+    (path,) = store.dataset_path(next(iter(made)), 1).glob("views/c/0/0")
+    store.path(sha256(path.read_bytes())).unlink()
+    path.write_bytes(b"rotten")
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
+    spec = rods(gamma=(9.0, 1.0)) if path.parts[-6] == next(iter(made)) else rods(name="first")
+    job = coordinator.submit(parsed(spec), None)
+    assert worker.work() > 0
+    assert show_job(coordinator, job.id).state.is_terminal  # type: ignore[union-attr]
+    assert show_job(coordinator, job.id).dataset is not None  # type: ignore[union-attr]
+    coordinator.close()
+
+
+@pytest.mark.parametrize("damage", ["manifest", "file", "moved"])
+def test_a_version_that_is_not_whole_is_left_out(settings: Settings, made: dict[str, object], damage: str) -> None:
+    store = Store(settings.store_root)
+    place = store.dataset_path(next(iter(made)), 1)
+    if damage == "manifest":
+        (place / MANIFEST_NAME).unlink()  # it is a link: the artifact must not be written through it
+        (place / MANIFEST_NAME).write_text("{}")
+    elif damage == "file":
+        store.path(sha256((place / "views/c/0/0").read_bytes())).unlink()
+        (place / "views/c/0/0").unlink()
+    else:
+        place.rename(place.parent / "v7")
+    result = run(settings)
+    assert result.exit_code == 1
+    assert "1 versions found again, 0 known before, 1 left out" in result.stderr
+    assert f"left out: {place.parent}" in result.stderr.replace("\n", "")
+
+
+def test_an_artifact_that_is_gone_is_put_back_from_the_version(settings: Settings, made: dict[str, object]) -> None:
+    store = Store(settings.store_root)
+    path = store.dataset_path(next(iter(made)), 1) / "views/c/0/0"
+    digest = sha256(path.read_bytes())
+    store.path(digest).unlink()
+    assert run(settings).exit_code == 0
+    assert store.holds(digest)
+
+
+def test_it_does_not_write_beside_a_running_coordinator(settings: Settings, made: dict[str, object]) -> None:
+    with locked(settings.data):
+        result = run(settings)
+    assert result.exit_code == 2
+    assert "is in use by another `stickslip up`" in result.stderr
+    with opened(settings.data) as database:
+        assert [found.is_new for found in reindex(database, Store(settings.store_root))] == [True, True]
+
+
+def one_sentence(settings: Settings) -> str:
+    with pytest.raises(DatabaseRefusedError) as raised:
+        check(settings.database_path, settings.store_root)
+    assert "\n" not in str(raised.value)
+    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(settings.data), "--port", "0"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stderr) == (2, f"error: {raised.value}\n")
+    return str(raised.value)
+
+
+def test_a_newer_database_is_refused(settings: Settings) -> None:
+    with opened(settings.data) as database, database.write() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9042'"))
+    sentence = one_sentence(settings)
+    assert "was made by a newer stickslip (schema 9042" in sentence
+    assert "install that version again" in sentence
+
+
+@pytest.mark.parametrize("how", ["overwritten", "truncated", "not one", "another's"])
+def test_a_damaged_database_is_refused(settings: Settings, how: str) -> None:
+    path = settings.database_path
+    with opened(settings.data):
+        pass
+    if how == "another's":
+        path.unlink()
+        other = Database(path)
+        with other.write() as connection:
+            connection.execute(text("CREATE TABLE birds (name)"))
+        other.close()
+        assert "is not a database of stickslip" in one_sentence(settings)
+        return
+    content = path.read_bytes()
+    for beside in settings.data.glob("coordinator.sqlite3-*"):
+        beside.unlink()
+    if how == "overwritten":
+        path.write_bytes(content[:4096] + b"\xff" * 8192 + content[12288:])
+    elif how == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        path.write_text("no database at all, " * 500)
+    sentence = one_sentence(settings)
+    assert "is damaged" in sentence
+    assert "run `stickslip reindex --data" in sentence

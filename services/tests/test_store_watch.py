@@ -1,0 +1,163 @@
+"""A store that is full, read-only or not to be written pauses jobs within seconds; then they go on by themselves."""
+
+import errno
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import httpx
+import pytest
+from stickslip_schemas.states import JobState, Reason
+from stickslip_services.errors import ConflictError
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.store_watch import HOLD_SECONDS
+from stickslip_services.settings import Settings
+from stickslip_services.testing import (
+    ManualClock,
+    PretendWorker,
+    RunningServer,
+    failure,
+    parsed,
+    rods,
+    show_job,
+    start_server,
+    wait_until,
+)
+
+MIB = 2**20
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 48 MiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", place], capture_output=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"mounting needs root: {done.stderr.decode()}")
+    yield place
+    subprocess.run(["umount", "-l", place], check=True)
+
+
+def fill(disk: Path, *, but: int = 0) -> Path:
+    """Write a file until so many bytes are left."""
+    ballast = disk / "ballast"
+    with ballast.open("wb", buffering=0) as file:
+        free = os.statvfs(disk).f_bavail * os.statvfs(disk).f_bsize
+        with suppress(OSError):  # other writers are faster, perhaps
+            for _ in range(0, free - but, 4096):
+                file.write(bytes(4096))
+    return ballast
+
+
+def job_of(server: RunningServer, job: str) -> dict[str, object]:
+    answer = httpx.get(f"{server.url}/v1/jobs/{job}", timeout=5, trust_env=False)
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+@pytest.mark.parametrize("left", [0, 6 * MIB])
+def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
+    disk: Path, monkeypatch: pytest.MonkeyPatch, left: int
+) -> None:
+    """Database and store share the disk. With nothing left at all, not even the database can be written."""
+    monkeypatch.setenv("STICKSLIP_MIN_FREE_BYTES", str(8 * MIB))
+    server = start_server(disk / "data")
+    try:
+        worker = server.worker()
+        job = httpx.post(f"{server.url}/v1/jobs", json=rods(), trust_env=False).json()["id"]
+        ballast = fill(disk, but=left)
+        begin = time.monotonic()
+        wait_until(lambda: job_of(server, job)["reason"] == "store_unavailable", seconds=10)
+        assert time.monotonic() - begin < 10
+        shown = job_of(server, job)
+        assert "must stay free" in str(shown["message"])
+        if left:
+            wait_until(lambda: job_of(server, job)["state"] == "paused", seconds=5)
+            assert worker.lease() == ()
+            refused = httpx.post(f"{server.url}/v1/jobs/{job}:resume", trust_env=False)
+            assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
+            assert "goes on by itself" in refused.json()["detail"]
+        ballast.unlink()
+        wait_until(lambda: job_of(server, job)["state"] in ("queued", "running"), seconds=10)
+        wait_until(lambda: worker.work() > 0 and job_of(server, job)["state"] == "succeeded")
+    finally:
+        server.stop()
+
+
+def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path / "data", store_path=disk / "store", durable=False, min_free_bytes=0)
+    coordinator = Coordinator(settings, ManualClock())
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
+    (lease,) = worker.lease(simulate=1)
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    with pytest.raises(OSError, match="Read-only") as raised:  # what a worker meets
+        worker.result(lease.task)
+    assert raised.value.errno == errno.EROFS
+    worker.report((lease, failure(Reason.store_unavailable, str(raised.value))))
+    assert worker.lease() == ()
+    coordinator.sweep()
+    shown = show_job(coordinator, job)
+    assert shown.reason is Reason.store_unavailable
+    assert "Read-only file system" in shown.message
+    subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
+    coordinator.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
+    coordinator.sweep()
+    worker.work()
+    assert show_job(coordinator, job).state is JobState.succeeded
+    coordinator.close()
+
+
+def test_a_store_that_is_a_file_pauses_the_job(coordinator: Coordinator, worker: PretendWorker) -> None:
+    """Works without root: whatever keeps the store from being written is told with its reason."""
+    root = coordinator.settings.store_root
+    if root.exists():
+        root.rmdir()
+    root.write_text("in the way")
+    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
+    coordinator.sweep()
+    shown = show_job(coordinator, job)
+    assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
+    assert "File exists" in shown.message
+    root.unlink()
+    coordinator.sweep()
+    assert show_job(coordinator, job).state is JobState.queued
+    assert show_job(coordinator, job).message == ""
+
+
+def test_a_store_that_only_a_worker_cannot_use_costs_no_try(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job = coordinator.submit(parsed(rods(gamma=(1.0,), phi1=(1.0,))), None).id  # type: ignore[union-attr]
+    for _ in range(2 * coordinator.settings.max_tries):
+        (lease,) = worker.lease()
+        worker.start(lease)
+        worker.report((lease, failure(Reason.store_unavailable, "Permission denied")))
+        assert worker.lease() == ()
+        coordinator.sweep()
+        shown = show_job(coordinator, job)
+        assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
+        assert "worker pretend cannot use the store: Permission denied" in shown.message
+        with pytest.raises(ConflictError, match="goes on by itself"):
+            coordinator.resume(job)
+        clock.advance(HOLD_SECONDS + 1)
+        coordinator.sweep()
+        assert show_job(coordinator, job).state is JobState.running
+    worker.work()
+    assert show_job(coordinator, job).state is JobState.succeeded
+
+
+def test_who_pauses_a_waiting_job_keeps_it_paused(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
+    coordinator.store_watch.note("it is full")
+    coordinator.sweep()
+    assert show_job(coordinator, job).reason is Reason.store_unavailable
+    assert coordinator.pause(job).reason is None
+    coordinator.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
+    coordinator.sweep()
+    assert show_job(coordinator, job).state is JobState.paused
