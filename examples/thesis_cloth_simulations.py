@@ -44,7 +44,7 @@ def report(out: Path) -> None:
         rows = database.execute(
             "SELECT payload, cpu_seconds FROM tasks WHERE stage = 'simulate' AND state = 'succeeded'"
         )
-        found = [(json.loads(payload)["simulation"], seconds) for payload, seconds in rows]
+        found = [(json.loads(payload), seconds) for payload, seconds in rows]
     costs = np.array([seconds for _, seconds in found])
     names = [f"{document['material']}, mu {document['mu']:g}" for document, _ in found]
     labels = zarr.open_group(out / "dataset", mode="r")
