@@ -95,19 +95,19 @@ struct FrontRun {
 // then the rows below, tile after tile, so that a solve reads memory from one end to the other.
 struct Factor {
   int fronts;
-  const int* pivot_begin;   // (fronts + 1)
-  const int* row_begin;     // (fronts + 1)
-  const int* rows;          // nodes
-  const int* child_begin;   // (fronts + 1)
-  const int* children;      // fronts
-  const int* run_begin;     // (fronts + 1): rows of a front that follow each other in its parent's, too
+  const int* pivot_begin;  // (fronts + 1)
+  const int* row_begin;    // (fronts + 1)
+  const int* rows;         // nodes
+  const int* child_begin;  // (fronts + 1)
+  const int* children;     // fronts
+  const int* run_begin;    // (fronts + 1): rows of a front that follow each other in its parent's, too
   const FrontRun* runs;
   const long* update_begin;  // (fronts): where the part of a front that waits for its parent lies in `updates`
-  const long* tile_begin;   // (fronts + 1): offset of the first tile, floats
-  const long* entry_begin;  // (fronts + 1): entries of K that go into the front
-  const int* entry_slot;    // of a bending scalar
-  const int* entry_block;   // of a membrane block or -1
-  const int* entry_row;     // place in the front, nodes
+  const long* tile_begin;    // (fronts + 1): offset of the first tile, floats
+  const long* entry_begin;   // (fronts + 1): entries of K that go into the front
+  const int* entry_slot;     // of a bending scalar
+  const int* entry_block;    // of a membrane block or -1
+  const int* entry_row;      // place in the front, nodes
   const int* entry_column;
   float* tiles;
   float* panel;  // the front that is being made

@@ -26,8 +26,8 @@ class ContactState {
   Buffer<float> normal, direction, mu, turning;
   Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
-  // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method may
-  // else go to and fro between the two ways of slipping, where the law has it that they stick.
+  // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method
+  // may else go to and fro between the two ways of slipping, where the law has it that they stick.
   bool hold_reversed = false;
 
   // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from contact.

@@ -48,8 +48,8 @@ inline void multiply_column(const float* a, const float* b, long ld, int depth, 
   for (; i < rows; i += CLOTH_FLOATS) multiply_tile<1, columns, set>(a + i, b, ld, depth, c + i, ldc);
 }
 
-// Lower part of C = -A A^T, a square of `columns`, a multiple of 3; A has `rows` >= columns, padded. Tiles that touch the
-// diagonal are whole.
+// Lower part of C = -A A^T, a square of `columns`, a multiple of 3; A has `rows` >= columns, padded. Tiles that touch
+// the diagonal are whole.
 inline void negative_square(const float* a, long ld, int depth, float* c, long ldc, int rows, int columns) {
   for (int j = 0; j < columns; j += 6) {
     const int from = j / CLOTH_FLOATS * CLOTH_FLOATS;

@@ -55,7 +55,7 @@ inline float* keep_tiles(const Factor& factor, const FrontSize& size, int j, int
 inline void add_update(const Factor& factor, int child, const FrontSize& size, bool pivots, float* parent, long ld) {
   const FrontSize below(factor, child);
   const float* update = factor.updates + factor.update_begin[child];
-  const FrontRun *end = factor.runs + factor.run_begin[child + 1];
+  const FrontRun* end = factor.runs + factor.run_begin[child + 1];
   for (const FrontRun* run = factor.runs + factor.run_begin[child]; run < end; ++run) {
     if ((run->place < size.pivots) != pivots) continue;
     for (int j = 0; j < 3 * run->count; ++j) {
@@ -104,7 +104,8 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagona
         }
       }
     }
-    const int *child = factor.children + factor.child_begin[front], *last = factor.children + factor.child_begin[front + 1];
+    const int *child = factor.children + factor.child_begin[front],
+              *last = factor.children + factor.child_begin[front + 1];
     for (const int* c = child; c < last; ++c) add_update(factor, *c, size, true, panel, size.ld);
     float* tile = factor.tiles + factor.tile_begin[front];
     for (int j = 0; j < size.columns; j += tile_columns) {
