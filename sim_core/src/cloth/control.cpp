@@ -16,6 +16,9 @@ constexpr double factor_work = 9.0, newton_work = 1.5;
 // Longer steps may cost so much more per time than shorter ones before they are given up, and are forgiven so much of
 // it with each step.
 constexpr double dearer = 1.1, forgiving = 0.98, memory = 0.7;
+// Times that a step may be halved further than the error asks for, where it is not solved; such steps grow again after
+// one that took no more iterations than this.
+constexpr int hard = 2, easy = 6;
 
 int level_of(int steps, const char* name) {
   int level = 0;
@@ -35,8 +38,9 @@ StepController::StepController(Stepper& stepper, const StepControl& control)
       control_(control),
       coarsest_(level_of(control.coarsest, "coarsest")),
       finest_(level_of(control.finest, "finest")),
+      last_(finest_ + hard),
       level_(finest_),
-      cost_(finest_ + 1, 0.0) {
+      cost_(last_ + 1, 0.0) {
   if (!(control.error > 0.0) || !std::isfinite(control.error)) refuse("error: must be finite and > 0");
   if (coarsest_ > finest_) refuse("finest: must be at least coarsest");
 }
@@ -46,7 +50,7 @@ void StepController::restart() {
   std::fill(cost_.begin(), cost_.end(), 0.0);
 }
 
-int StepController::ticks(int level) const { return 1 << (finest_ - level); }
+int StepController::ticks(int level) const { return 1 << (last_ - level); }
 
 void StepController::learn(int level, double work, double progress) {
   const double rate = work / progress;
@@ -68,10 +72,9 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
     const double share = static_cast<double>(size) / all, dt = share * (end - begin);
     const Drive drive = motion(begin + (end - begin) * (tick + size) / all);
     StepReport report;
-    const bool last_resort = level_ == finest_;
     const bool solved = stepper_.attempt(dt, drive, report);
     const double missed = stepper_.missed() / control_.error;
-    if (!last_resort && !(solved && missed <= reject_at)) {
+    if (solved ? level_ < finest_ && missed > reject_at : level_ < last_) {
       stepper_.reject();
       total.add_work(report);
       ++total.halvings;
@@ -89,7 +92,8 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
     learn(level_, work_of(report), share);
     total.add(report);
     tick += size;
-    if (missed < grow_at && worth_growing(level_) && tick % ticks(level_ - 1) == 0) --level_;
+    const bool grows = level_ > finest_ ? report.newton <= easy : missed < grow_at && worth_growing(level_);
+    if (grows && tick % ticks(level_ - 1) == 0) --level_;
   }
   return total;
 }

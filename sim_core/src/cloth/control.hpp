@@ -15,7 +15,7 @@ namespace sim_core {
 
 struct StepControl {
   double error;          // m: largest distance of a node from where it was predicted
-  int coarsest, finest;  // steps that an interval takes at least and at most, powers of two
+  int coarsest, finest;  // steps that an interval takes at least, and at most for the error's sake: powers of two
 };
 
 // What drives the cloth at a time, kept by the caller.
@@ -36,8 +36,8 @@ class StepController {
 
   Stepper& stepper_;
   StepControl control_;
-  int coarsest_, finest_, level_;  // log2 of steps in an interval
-  std::vector<double> cost_;       // by level: work per interval of late, 0 where unknown
+  int coarsest_, finest_, last_, level_;  // log2 of steps in an interval; `last_`: of those that are not solved else
+  std::vector<double> cost_;              // by level: work per interval of late, 0 where unknown
 };
 
 }  // namespace sim_core

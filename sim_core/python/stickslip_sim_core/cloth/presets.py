@@ -51,7 +51,8 @@ class SolverSettings:
     """Steps that a frame of a scene takes at least, a power of two up to 1024."""
 
     finest: int = 32
-    """Steps that a frame takes at most, before one that does not converge is halved: a power of two."""
+    """Steps that a frame takes at most for the sake of `step_error`, a power of two; steps that do not converge are
+    halved further."""
 
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
