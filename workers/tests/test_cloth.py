@@ -62,7 +62,18 @@ class Core:
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     changes: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(self, fabric: Fabric, mu: float, *, preset: str, vertices: int, frames: int, seed: int) -> Run:
+    def __call__(
+        self,
+        fabric: Fabric,
+        mu: float,
+        *,
+        preset: str,
+        vertices: int,
+        frames: int,
+        seed: int,
+        on_frame: Callable[[int, int], None],
+    ) -> Run:
+        on_frame(frames, frames)
         self.calls.append((fabric.name, mu, preset, vertices, frames, seed))
         line = np.linspace(-0.1, 0.1, vertices)
         rest = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)

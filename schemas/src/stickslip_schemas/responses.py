@@ -5,7 +5,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
-from stickslip_schemas.base import Document
+from stickslip_schemas.base import Document, Int
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import AnyJobSpec
@@ -150,7 +150,7 @@ class SampleState(Document):
 class JobPatch(Document):
     """What can be changed of a job."""
 
-    priority: int = Field(ge=-100, le=100, description="tasks of the job with the highest number come first")
+    priority: Int = Field(ge=-100, le=100, description="tasks of the job with the highest number come first")
 
 
 class RunningTask(Document):
