@@ -23,7 +23,7 @@ from stickslip_schemas.responses import (
     WorkerEntry,
 )
 from stickslip_schemas.states import TaskState
-from tenacity import AsyncRetrying, retry_if_exception, stop_after_delay, wait_random_exponential
+from tenacity import AsyncRetrying
 
 from stickslip_services.addresses import coordinator_url
 from stickslip_services.client import calls
@@ -199,12 +199,7 @@ class AsyncClient:
 
     async def _ask(self, call: Call[T]) -> T:
         """Send a request, again where it did not come through; raise ClientError."""
-        attempts = AsyncRetrying(
-            retry=retry_if_exception(self._is_passing),
-            wait=wait_random_exponential(multiplier=0.25, max=3),
-            stop=stop_after_delay(self.patience),
-            reraise=True,
-        )
+        attempts = AsyncRetrying(**calls.retry_options(self.patience, lambda: self._was_answered))
         try:
             response: httpx.Response = await attempts(self._send, call)
         except httpx.TransportError as error:
@@ -221,12 +216,6 @@ class AsyncClient:
             response.raise_for_status()
         raise_for_problem(response)
         return response
-
-    def _is_passing(self, error: BaseException) -> bool:
-        """Tell whether an error may be gone in a moment; a coordinator that never answered is not there."""
-        if isinstance(error, httpx.ConnectError) and not self._was_answered:
-            return False
-        return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
 
     async def _items(self, call: Call[Page[T]]) -> AsyncIterator[T]:
         answer: Page[T] | None = None

@@ -4,7 +4,7 @@ import json
 import os
 import secrets
 import ssl
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -33,6 +33,7 @@ from stickslip_schemas.responses import (
     WorkerEntry,
 )
 from stickslip_schemas.states import TaskState
+from tenacity import retry_if_exception, stop_after_delay, wait_random_exponential
 
 T = TypeVar("T")
 
@@ -66,6 +67,25 @@ def connection_options(url: str, key: str | None) -> dict[str, Any]:
         "headers": {} if key is None else {"Authorization": f"Bearer {key}"},
         "verify": ssl.create_default_context(cafile=authorities) if authorities and url.startswith("https") else True,
         "trust_env": False,
+    }
+
+
+def retry_options(patience: float, was_answered: Callable[[], bool]) -> dict[str, Any]:
+    """Return tenacity's options for a request: it is sent again for `patience` [s] while the error may be gone soon.
+
+    A coordinator that has answered once may be restarting; one that never has is not there.
+    """
+
+    def may_pass(error: BaseException) -> bool:
+        if isinstance(error, httpx.ConnectError) and not was_answered():
+            return False
+        return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
+
+    return {
+        "retry": retry_if_exception(may_pass),
+        "wait": wait_random_exponential(multiplier=0.25, max=3),
+        "stop": stop_after_delay(patience),
+        "reraise": True,
     }
 
 

@@ -23,7 +23,7 @@ from stickslip_schemas.responses import (
     WorkerEntry,
 )
 from stickslip_schemas.states import TaskState
-from tenacity import Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
+from tenacity import Retrying
 
 from stickslip_services.addresses import coordinator_url
 from stickslip_services.client import calls
@@ -64,7 +64,6 @@ class Client:
         self.patience = patience
         self._sleep = sleep
         self._was_answered = False
-        """A coordinator that has answered once may be restarting; one that never has is not there."""
         self._http = httpx.Client(**calls.connection_options(self.url, key), transport=transport)
 
     def __enter__(self) -> Self:
@@ -200,13 +199,7 @@ class Client:
 
         Every request of this client may be sent twice: what changes something is idempotent or has a key.
         """
-        attempts = Retrying(
-            retry=retry_if_exception(self._is_passing),
-            wait=wait_random_exponential(multiplier=0.25, max=3),
-            stop=stop_after_delay(self.patience),
-            sleep=self._sleep,
-            reraise=True,
-        )
+        attempts = Retrying(**calls.retry_options(self.patience, lambda: self._was_answered), sleep=self._sleep)
         try:
             return attempts(self._send, method, path, **options)
         except httpx.TransportError as error:
@@ -226,12 +219,6 @@ class Client:
             response.raise_for_status()
         raise_for_problem(response)
         return response
-
-    def _is_passing(self, error: BaseException) -> bool:
-        """Tell whether an error may be gone in a moment."""
-        if isinstance(error, httpx.ConnectError) and not self._was_answered:
-            return False
-        return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
 
     def _ask(self, call: Call[T]) -> T:
         return call.read(self.request(call.method, call.path, **call.options))
