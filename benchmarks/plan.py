@@ -11,6 +11,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,31 +35,39 @@ def peak_megabytes(pid: int) -> float:
     raise ValueError("no VmHWM")
 
 
+@contextmanager
+def coordinator(data: Path) -> Iterator[tuple[httpx.Client, int]]:
+    """Run a coordinator in a process of its own, with a worker for rods; yield a client and the process id."""
+    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[-1]
+        try:
+            with httpx.Client(base_url=url, timeout=120) as client:
+                builds = dict.fromkeys(Builds.model_fields, "a" * 64)
+                worker = {"name": "bench", "builds": {"rod_hang": builds}, "slots": 1}
+                key = {"Authorization": f"Bearer {(data / 'worker-key').read_text().strip()}"}
+                client.post("/v1/workers", json=worker, headers=key).raise_for_status()
+                yield client, process.pid
+        finally:
+            process.terminate()
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=100_000)
     samples = parser.parse_args().samples
     result: dict[str, Any] = {"samples": samples}
-    with tempfile.TemporaryDirectory() as data:
-        command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", data, "--port", "0"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as coordinator:
-            assert coordinator.stdout is not None
-            url = coordinator.stdout.readline().split()[-1]
-            with httpx.Client(base_url=url, timeout=120) as client:
-                builds = dict.fromkeys(Builds.model_fields, "a" * 64)
-                worker = {"name": "bench", "builds": {"rod_hang": builds}, "slots": 1}
-                key = {"Authorization": f"Bearer {(Path(data) / 'worker-key').read_text().strip()}"}
-                client.post("/v1/workers", json=worker, headers=key).raise_for_status()
-                for name, start in (("first_seconds", 0.0), ("second_seconds", 500.0), ("same_again_seconds", 0.0)):
-                    begin = time.perf_counter()
-                    response = client.post("/v1/jobs", json=spec(samples, start=start))
-                    result[name] = round(time.perf_counter() - begin, 3)
-                    response.raise_for_status()
-                    result.setdefault("tasks", response.json()["progress"]["total"])
-            result["coordinator_peak_mb"] = round(peak_megabytes(coordinator.pid), 1)
-            result["database_mb"] = round((Path(data) / "coordinator.sqlite3").stat().st_size / 1e6, 1)
-            coordinator.terminate()
+    with tempfile.TemporaryDirectory() as data, coordinator(Path(data)) as (client, pid):
+        for name, start in (("first_seconds", 0.0), ("second_seconds", 500.0), ("same_again_seconds", 0.0)):
+            begin = time.perf_counter()
+            response = client.post("/v1/jobs", json=spec(samples, start=start))
+            result[name] = round(time.perf_counter() - begin, 3)
+            response.raise_for_status()
+            result.setdefault("tasks", response.json()["progress"]["total"])
+        result["coordinator_peak_mb"] = round(peak_megabytes(pid), 1)
+        result["database_mb"] = round((Path(data) / "coordinator.sqlite3").stat().st_size / 1e6, 1)
     print(json.dumps(result))
 
 
