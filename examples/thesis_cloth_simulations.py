@@ -48,7 +48,8 @@ def report(out: Path) -> None:
     costs = np.array([seconds for _, seconds in found])
     names = [f"{document['material']}, mu {document['mu']:g}" for document, _ in found]
     labels = zarr.open_group(out / "dataset", mode="r")
-    steps, unconverged = (np.asarray(labels[name]) for name in ("steps", "unconverged_steps"))
+    valid = np.asarray(labels["valid"])
+    steps, unconverged = (np.asarray(labels[name])[valid] for name in ("steps", "unconverged_steps"))
     shares = unconverged / steps
     console.rule("cost")
     console.print(f"{len(costs)} simulations, {costs.sum() / 3600:.2f} CPU h; median {np.median(costs):.1f} CPU s")
@@ -56,7 +57,8 @@ def report(out: Path) -> None:
         console.print(f"  {costs[i]:6.1f} CPU s, {costs[i] / np.median(costs):.1f} x the median: {names[i]}")
     console.print(
         f"steps that did not converge: {unconverged.sum()} of {steps.sum()}; at most {100 * shares.max():.3f} % of one "
-        f"simulation; in {np.count_nonzero(unconverged)} of {len(steps)} simulations"
+        f"simulation; in {np.count_nonzero(unconverged)} of {len(steps)} valid samples; "
+        f"{np.count_nonzero(~valid)} were rejected"
     )
 
 
