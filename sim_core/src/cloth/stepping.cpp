@@ -11,10 +11,6 @@ namespace {
 
 // Tolerance of GMRES where a step does not converge with that of the preset.
 constexpr double loose = 0.1;
-
-}  // namespace
-namespace {
-
 // Iterations up to which steps may grow again, of those that a step may take.
 constexpr double easy = 0.6;
 

@@ -11,8 +11,8 @@ typedef float Node __attribute__((vector_size(16), aligned(16), may_alias));
 typedef double NodeD __attribute__((vector_size(32), aligned(32), may_alias));
 typedef double Lane __attribute__((vector_size(8 * membrane_lanes), aligned(64), may_alias));
 
-// While it lives, floats too small for a normal number are zeros: those that a factor is full of where many nodes stick
-// take a processor a hundred times longer than others.
+// Takes denormal numbers for zeros while it lives. A factor has many of them where many nodes stick, and processors are
+// slow with them.
 struct FlushTiny {
 #if defined(__SSE__)
   unsigned before = __builtin_ia32_stmxcsr();
