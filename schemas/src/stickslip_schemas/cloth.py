@@ -168,7 +168,9 @@ class ClothSpec(JobSpec):
         ge=5,
         le=161,
         description="vertices along a side of the square mesh",
-        json_schema_extra={"x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 10 s, 41 takes 58 s"},
+        json_schema_extra={
+            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 5 s, 41 takes 33 s, 81 takes 5 min"
+        },
     )
     frames: Int = Field(
         default=30,
