@@ -72,7 +72,7 @@ SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
 """Steps for each of these, and their damping [1/s]."""
 
 FIRST_STEP, GROWTH = 0.002, 1.3
-"""The flat cloth buckles when it is let go: the first step [s], and how much longer each of the next is, up to 50 ms."""
+"""The flat cloth buckles when it is let go: the first step [s], and by how much the next ones grow, up to 50 ms."""
 
 LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
 """Steps then grow to this length [s], until no vertex moves further than this in one [m]; and how many there may be."""
