@@ -1,8 +1,14 @@
-"""Kill -9 anything in the middle of the demo's rods job and start again: every sample once, every hash right."""
+"""Kill -9 anything in the middle of jobs of rods and start again: every sample once, every hash right.
+
+pytest tests/test_chaos.py                                              a few chosen deaths
+STICKSLIP_KILLS=50 pytest -m slow tests/test_chaos.py -s                random ones, and the longest gap
+"""
 
 import os
+import random
 import signal
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +62,7 @@ def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
     service.stop()
     assert service.all_processes() == []
     check_ledger(service.data)
-    check_dataset(service.data, over["dataset"], builds)
+    check_dataset(service.data, over["dataset"], SPEC, builds)
 
 
 def renders_done(service: Service, job: str) -> int:
@@ -103,7 +109,7 @@ def check_ledger(data: Path) -> None:
     database.close()
 
 
-def check_dataset(data: Path, reference: dict[str, Any], builds: Builds) -> None:
+def check_dataset(data: Path, reference: dict[str, Any], spec: dict[str, Any], builds: Builds) -> None:
     """Every slot holds its own sample, and every byte is what the manifest says."""
     store = Store(data / "store")
     directory = store.dataset_path(reference["dataset"], reference["version"])
@@ -111,10 +117,11 @@ def check_dataset(data: Path, reference: dict[str, Any], builds: Builds) -> None
     assert sha256(text) == reference["manifest"]
     manifest = Manifest.model_validate_json(text)
     assert manifest.sample_keys == tuple(
-        sample.key for sample in samples(job_spec_adapter.validate_python(SPEC), builds)
+        sample.key for sample in samples(job_spec_adapter.validate_python(spec), builds)
     )
-    assert len(set(manifest.sample_keys)) == 48
-    assert manifest.valid_count == 48
+    count = len(manifest.sample_keys)
+    assert len(set(manifest.sample_keys)) == count
+    assert manifest.valid_count == count
     files = {str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file()}
     assert files == {file.path for file in manifest.files} | set(SEALED_NAMES) | {SEAL_NAME}
     for file in manifest.files:
@@ -123,7 +130,7 @@ def check_dataset(data: Path, reference: dict[str, Any], builds: Builds) -> None
     solution = solve_rods(group["gamma"], group["phi0"], group["phi1"])
     assert np.array_equal(group["centerline"], solution.centerline.astype(np.float32))
     pictures = {views.tobytes() for views in group["views"]}
-    assert len(pictures) == 48
+    assert len(pictures) == count
 
 
 RAY = ("raylet/raylet", "gcs/gcs_server")
@@ -149,3 +156,123 @@ def test_ray_listens_on_loopback_and_is_replaced_at_once_when_it_dies(service: S
             return None if new == old else new
 
         before = wait_for(f"a worker after the death of {part}", replaced, 45)
+
+
+RODS = 150
+"""Samples of each of the jobs that run while processes are killed."""
+
+LONGEST_GAP = 30.0
+"""How long a job may stand still after a death [s], at a load of 4; in proportion longer at more."""
+
+VICTIMS = {
+    "coordinator": "-m stickslip_services.coordinator",
+    "dispatcher": "-m stickslip_workers",
+    "stage or render process": "ray::Host",
+    "raylet": "raylet/raylet",
+    "gcs": "gcs/gcs_server",
+    "dashboard agent": "ray::DashboardAgent",
+    "runtime environment agent": "ray::RuntimeEnvAgent",
+    "supervisor": "",
+    "all": "",
+}
+
+
+def many_rods(number: int) -> dict[str, Any]:
+    """Return the spec of the job of this number: no two have a sample in common."""
+    axes = {"gamma": {"type": "linspace", "start": 100 + number, "stop": 1100 + number, "num": RODS}}
+    return {
+        "kind": "rod_hang",
+        "axes": axes | {"phi0": 1.0, "phi1": 6.0},
+        "views": "rod-4",
+        "quality": "draft",
+        "samples_per_shard": 50,
+        "seed": number,
+    }
+
+
+class Watch:
+    """Keeps one job at work and notes how long nothing is finished."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self.jobs: list[str] = []
+        self.done = -1
+        self.since = time.monotonic()
+        self.longest = 0.0
+
+    def look(self) -> bool:
+        """Submit a job where the last one is over; return whether there was progress since the last look."""
+        try:
+            if not self.jobs or self._service.get(f"/v1/jobs/{self.jobs[-1]}")["finished_at"] is not None:
+                self.jobs.append(self._service.submit(many_rods(len(self.jobs))))
+            text = httpx.get(f"{self._service.url}/metrics", timeout=30).text
+        except httpx.TransportError:
+            return False
+        lines = [line for line in text.splitlines() if line.startswith("stickslip_tasks{")]
+        done = sum(int(float(line.split()[-1])) for line in lines if 'state="succeeded"' in line)
+        if done <= self.done:
+            return False
+        now = time.monotonic()
+        self.longest = max(self.longest, now - self.since)
+        self.done, self.since = done, now
+        return True
+
+    def wait_for_progress(self) -> float:
+        """Return after how many seconds something was finished."""
+        begin = time.monotonic()
+        wait_for("progress", lambda: True if self.look() else None, 300)
+        return time.monotonic() - begin
+
+
+def kill_some(service: Service, victim: str) -> None:
+    """Kill what a victim names; what nobody starts again by itself is started again."""
+    assert service.process is not None
+    if victim in ("supervisor", "all"):
+        others = descendants(service.process.pid) if victim == "all" else []
+        service.kill()
+        for pid in others:
+            try:
+                kill(pid)
+            except ProcessLookupError:
+                continue
+        service.start()
+        return
+    pids = [pid for pid in descendants(service.process.pid) if VICTIMS[victim] in command_line(pid)]
+    if pids:
+        kill(random.choice(pids))
+
+
+@pytest.mark.slow
+def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    count, seed = int(os.environ.get("STICKSLIP_KILLS", "10")), int(os.environ.get("STICKSLIP_SEED", "0"))
+    random.seed(seed)
+    watch = Watch(service)
+    watch.wait_for_progress()
+    watch.longest = 0.0  # starting the service is no gap
+    gaps: dict[str, list[float]] = {}
+    worst_load = 0.0
+    for number in range(count):
+        deadline = time.monotonic() + random.uniform(1, 6)
+        while time.monotonic() < deadline:
+            watch.look()
+            time.sleep(0.1)
+        victim = random.choice(list(VICTIMS))
+        kill_some(service, victim)
+        gaps.setdefault(victim, []).append(watch.wait_for_progress())
+        worst_load = max(worst_load, os.getloadavg()[0])
+        with capsys.disabled():
+            print(f"{number + 1:3} {victim:28} {gaps[victim][-1]:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+    over = [service.finished(job) for job in watch.jobs]
+    assert [job["state"] for job in over] == ["succeeded"] * len(over)
+    builds = Builds.model_validate(service.get("/v1/workers")[0]["builds"]["rod_hang"])
+    service.stop()
+    assert service.all_processes() == []
+    check_ledger(service.data)
+    for number, job in enumerate(over):
+        check_dataset(service.data, job["dataset"], many_rods(number), builds)
+    with capsys.disabled():
+        print(f"{count} kills (seed {seed}): each of {len(over) * RODS} samples once")
+        for victim, seconds in sorted(gaps.items()):
+            print(f"    {victim:28} {len(seconds):3} times, {max(seconds):5.1f} s at most until something was finished")
+        print(f"    longest gap without progress {watch.longest:.1f} s, load {worst_load:.1f} at most")
+    assert watch.longest <= LONGEST_GAP * max(1.0, worst_load / 4.0)

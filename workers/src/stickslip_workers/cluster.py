@@ -18,7 +18,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +42,10 @@ LAST_SECONDS = 5.0
 
 _ESSENTIAL = ("gcs/gcs_server", "raylet/raylet", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 """Parts of the command lines of the processes without which a cluster does not work for long."""
+
+
+_UNNEEDED = ("ray/_private/log_monitor.py", "ray/autoscaler/_private/monitor.py")
+"""Those of the processes that do nothing for us: output of workers stays in their files, and no node is to be added."""
 
 
 class ClusterLostError(RuntimeError):
@@ -90,7 +94,10 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
     ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
     cluster = Cluster(int(ray.cluster_resources().get("CPU", 0)))
     if address is None:
-        threading.Thread(target=_watch, args=(cluster, _essential_processes()), name="watch", daemon=True).start()
+        for pid in _processes(_UNNEEDED):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGTERM)
+        threading.Thread(target=_watch, args=(cluster, _processes(_ESSENTIAL)), name="watch", daemon=True).start()
     try:
         yield cluster
     finally:
@@ -118,13 +125,13 @@ def _end() -> None:
     os._exit(1)
 
 
-def _essential_processes() -> dict[int, str]:
-    """Return the processes of the cluster of this process that must live, by pid."""
+def _processes(parts: Collection[str]) -> dict[int, str]:
+    """Return the processes of the cluster of this process that have one of these in their command lines, by pid."""
     parents = {pid: parent for pid in _pids() if (parent := _parent_of(pid)) is not None}
     found: dict[int, str] = {}
     for pid in parents:
         line = _command_line(pid)
-        name = next((part for part in _ESSENTIAL if part in line), None)
+        name = next((part for part in parts if part in line), None)
         if name is not None and os.getpid() in _ancestors(pid, parents):
             found[pid] = name.rpartition("/")[2].removeprefix("ray::")
     return found

@@ -298,15 +298,18 @@ class Dispatcher:
                 queue.clear()
                 queue.extend(wanted)
         long = (self._simulation_seconds or 0.0) > LONG_SIMULATION
+        waiting = {self._stage_pool: 0, self._render_pool: 0}
         for stage in reversed(Stage) if long else _PRECEDENCE:
             queue = self._queues[stage]
             pool = self._pool(stage)
             while queue and len(self._running) < self._open_slots():
                 process = pool.take()
                 if process is None:
-                    pool.grow(min(_batch_count(stage, queue), self._open_slots() - len(self._running)))
+                    waiting[pool] += _batch_count(stage, queue)
                     break
                 self._assign(_next_batch(queue), stage, process)
+        for pool, count in waiting.items():
+            pool.grow_if_worth(min(count, self._open_slots() - len(self._running)))
 
     def _assign(self, leases: list[Lease], stage: Stage, process: Process) -> None:
         if stage is Stage.render:

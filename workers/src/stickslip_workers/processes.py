@@ -20,6 +20,11 @@ _STARTS = 3
 """Processes in a row that may fail to start before the pool gives up."""
 
 
+WORTH_SECONDS = 2.0
+"""Work waits so long for a busy process, all waits together, before another process is started: about what it costs to
+start one."""
+
+
 class StartError(RuntimeError):
     """Processes of a pool do not start."""
 
@@ -67,6 +72,9 @@ class Pool:
         self._idle: list[Process] = []
         self._busy: set[Process] = set()
         self._failed_starts = 0
+        self._short_since: float | None = None
+        self._waited = 0.0
+        """How long work has waited for a process that was busy since the pool last grew [s]."""
         self.description: dict[str, Any] | None = None
         """What the first process said about itself; all others must say the same."""
 
@@ -83,6 +91,19 @@ class Pool:
         """Start processes until `count` are starting or idle, or the pool is full."""
         while len(self._starting) + len(self._idle) < count and self.size < self._settings.size:
             self._starting.append(self._start())
+
+    def grow_if_worth(self, count: int) -> None:
+        """Grow, `count` calls having to wait: at once where there is no process, else when they have waited for long.
+
+        Short tasks are done sooner by the processes that there are than by one that has to be started.
+        """
+        now = time.monotonic()
+        if self._short_since is not None:
+            self._waited += now - self._short_since
+        self._short_since = now if count > 0 else None
+        if count > 0 and (self.size == 0 or self._waited > WORTH_SECONDS):
+            self._waited = 0.0
+            self.grow(count)
 
     def take(self) -> Process | None:
         """Take an idle process."""

@@ -26,19 +26,24 @@ class JsonBody(Generic[T]):
 
     async def __call__(self, request: Request) -> T:
         """Return the document; raise ProblemError."""
+        body = await self.received(request)
+        # A body of many megabytes keeps a thread busy, and not the event loop.
+        document: T = await run_in_threadpool(self.read, body)
+        return document
+
+    async def received(self, request: Request) -> bytes:
+        """Return the body as it came; raise ProblemError where it is not said to be JSON."""
         media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if media_type != "application/json" and not media_type.endswith("+json"):
             detail = f"Content-Type must be application/json, and it is {media_type[:100]!r}"
             raise ProblemError(415, ProblemCode.malformed_body, detail)
         try:
-            body = await request.body()
+            return await request.body()
         except ClientDisconnect as error:
             raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
-        # A body of many megabytes keeps a thread busy, and not the event loop.
-        document: T = await run_in_threadpool(self._read, body)
-        return document
 
-    def _read(self, body: bytes) -> Any:
+    def read(self, body: bytes) -> T:
+        """Return the document in a body; raise ProblemError."""
         document = parse_json(body)
         try:
             valid = self._adapter.validate_python(document)
@@ -58,8 +63,10 @@ class JsonBody(Generic[T]):
 def parse_json(body: bytes) -> Any:
     """Parse JSON as RFC 8259 has it, UTF-8 and no key twice, but let NaN and infinities pass; raise ProblemError."""
     try:
-        document = json.loads(body.decode("utf-8"), object_pairs_hook=_no_key_twice)
-        json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
+        text = body.decode("utf-8")
+        document = json.loads(text, object_pairs_hook=_no_key_twice)
+        if "\\u" in text:
+            json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
     except RecursionError as error:
         raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
     except ValueError as error:  # also of bytes that are no UTF-8, and of integers of more than 4300 digits

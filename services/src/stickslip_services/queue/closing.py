@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from sqlalchemy import Connection, func, select, text, update
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks
 from stickslip_services.queue.costs import add_costs
 from stickslip_services.queue.eta import Run
@@ -29,27 +30,26 @@ from stickslip_services.queue.ledger import (
 )
 
 _OPEN = text("jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')")  # the partial index's words
-_OPEN_JOBS = text(
+_OPEN_JOBS = Prepared(
     "SELECT seq, state, (SELECT SUM(count) FROM job_counts WHERE job = jobs.seq AND state = 'failed') FROM jobs "
     "WHERE jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"
 )
-_QUEUED_JOBS = text(f"SELECT seq FROM jobs WHERE {_OPEN.text} AND jobs.state = 'queued'")
+_QUEUED_JOBS = Prepared(f"SELECT seq FROM jobs WHERE {_OPEN.text} AND jobs.state = 'queued'")
 _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # likewise
 
 
-# Made once: composing a statement costs more than running it.
-_ADD_TO_TASK_COUNTS = text(
+_ADD_TO_TASK_COUNTS = Prepared(
     "INSERT INTO task_counts (stage, state, count) VALUES (:stage, :state, :change) "
     "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
 )
-_ADD_TO_JOB_COUNTS = text(
-    "UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state"
+_ADD_TO_JOB_COUNTS = Prepared(
+    text("UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state")
 )
-_ADD_TO_JOB_GROUPS = text(
+_ADD_TO_JOB_GROUPS = Prepared(
     'UPDATE job_groups SET "left" = "left" + :b_change '
     "WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
 )
-_ADD_TO_JOB_STAGES = text(
+_ADD_TO_JOB_STAGES = Prepared(
     "UPDATE job_stages SET cpu_seconds = cpu_seconds + :b_cpu, wall_count = wall_count + :b_count, "
     "wall_sum = wall_sum + :b_wall, wall_squares = wall_squares + :b_squares WHERE job = :b_job AND stage = :b_stage"
 )
@@ -66,7 +66,7 @@ def ledger(connection: Connection, now: float) -> Iterator[Ledger]:
 def close(book: Ledger) -> None:
     """Bring counters and jobs up to date with what the ledger has noted."""
     given_up = _settle(book, frozenset())
-    open_jobs = book.connection.execute(_OPEN_JOBS).all()
+    open_jobs = _OPEN_JOBS.tuples(book.connection)
     for job in _blocked_jobs(
         book.connection, [seq for seq, state, failed in open_jobs if state in RUNNABLE and failed]
     ):
@@ -165,7 +165,7 @@ def _count(connection: Connection, moves: list[Move], holders: dict[int, list[Ho
         if change
     ]
     if changes:
-        connection.execute(_ADD_TO_JOB_COUNTS, changes)
+        _ADD_TO_JOB_COUNTS.run_all(connection, changes)
 
 
 def _count_left(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
@@ -181,7 +181,7 @@ def _count_left(connection: Connection, moves: list[Move], holders: dict[int, li
         if change
     ]
     if rows:
-        connection.execute(_ADD_TO_JOB_GROUPS, rows)
+        _ADD_TO_JOB_GROUPS.run_all(connection, rows)
 
 
 def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[Holder]]) -> None:
@@ -202,14 +202,14 @@ def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[
         for (job, stage), group in by_job.items()
     ]
     if rows:
-        connection.execute(_ADD_TO_JOB_STAGES, rows)
+        _ADD_TO_JOB_STAGES.run_all(connection, rows)
     add_costs(connection, runs)
 
 
 def _start_jobs(book: Ledger, job_seqs: Collection[int]) -> None:
     if not job_seqs:
         return
-    queued = [seq for seq in book.connection.scalars(_QUEUED_JOBS) if seq in job_seqs]
+    queued = [seq for (seq,) in _QUEUED_JOBS.tuples(book.connection) if seq in job_seqs]
     for job in queued:
         set_job_state(book.connection, job, JobState.running, book.now)
 
@@ -218,7 +218,7 @@ def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, Ta
     """Change the number of tasks by stage and state."""
     rows = [{"stage": stage, "state": state, "change": change} for (stage, state), change in changes.items() if change]
     if rows:
-        connection.execute(_ADD_TO_TASK_COUNTS, rows)
+        _ADD_TO_TASK_COUNTS.run_all(connection, rows)
 
 
 def _finish_cancelling(connection: Connection, now: float) -> None:

@@ -233,17 +233,20 @@ class Coordinator:
 
     def lease(self, request: LeaseRequest) -> LeaseBatch:
         """Lease tasks to a worker."""
-        self._take_back()
-        worker = self._meet(request.worker_id)
+        wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+        with self.database.read() as connection:
+            worker = find_worker(connection, request.worker_id)
+            due = is_sweep_due(connection, self.clock())
+            ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
+            waiting = ready or has_runnable_job(connection)
+        self._note_seen(worker)
         if worker.superseded:
             raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
-        wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+        if due:
+            self._take_back()
         if self.store_watch.trouble:
             return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
-        with self.database.read() as connection:
-            ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
-            waiting = has_runnable_job(connection)
-        if not ready:
+        if not (ready or due):
             return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
         with self._book() as book:
             worker = find_worker(book.connection, worker.id)
@@ -252,7 +255,9 @@ class Coordinator:
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         """Renew a worker's leases and tell it what to drop."""
-        worker = self._meet(heartbeat.worker_id)
+        with self.database.read() as connection:
+            worker = find_worker(connection, heartbeat.worker_id)
+        self._note_seen(worker)
         self._frames[worker.id] = {
             lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None
         }
@@ -264,10 +269,12 @@ class Coordinator:
 
     def report(self, batch: ReportBatch) -> ReportAnswer:
         """Take results in."""
-        worker = self._meet(batch.worker_id)
         versions: dict[str, ManifestSummary] = {}
         reports = [self._checked(report, versions) for report in batch.reports]
         with self._book() as book:
+            worker = find_worker(book.connection, batch.worker_id)
+            if self._is_silent(worker):
+                note_seen(book.connection, worker.id, book.now)
             taken = take_reports(book, worker.id, reports, versions)
             give_back(book, taken.released)
             for _, reason, message in taken.failures:
@@ -302,15 +309,14 @@ class Coordinator:
             return report.model_copy(update={"result": report.result.model_copy(update=update)})
         return report
 
-    def _meet(self, worker_id: str) -> RegisteredWorker:
-        """Return a worker that has just been heard of."""
-        now = self.clock()
-        with self.database.read() as connection:
-            worker = find_worker(connection, worker_id)
-        if now - worker.last_seen_at > self.settings.lease_seconds / 4:  # a poll is not worth a write each time
+    def _note_seen(self, worker: RegisteredWorker) -> None:
+        """Write down that a worker was heard of, unless that has just been done: a poll is not worth a write."""
+        if self._is_silent(worker):
             with self.database.write() as connection:
-                note_seen(connection, worker_id, now)
-        return worker
+                note_seen(connection, worker.id, self.clock())
+
+    def _is_silent(self, worker: RegisteredWorker) -> bool:
+        return self.clock() - worker.last_seen_at > self.settings.lease_seconds / 4
 
     # --- the coordinator itself ------------------------------------------------------------------------------------
 

@@ -5,16 +5,17 @@ A task's share is the wall time of the call that made it over the tasks of that 
 
 from collections.abc import Mapping, Sequence
 
-from sqlalchemy import Connection, select, text
+from sqlalchemy import Connection, select
 from stickslip_schemas.states import Stage
 
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import cost_groups
 from stickslip_services.queue.eta import Cost, Group, Run, StageTimings
 
 KEPT_RUNS = 200
 """Beyond so many tasks of a group the sums are halved: what was measured long ago fades."""
 
-_ALL_COSTS = select(cost_groups)
+_ALL_COSTS = Prepared(select(cost_groups))
 
 TIMES = 3.0
 """A call is ended after so many times what it is expected to take."""
@@ -26,7 +27,7 @@ def read_costs(connection: Connection) -> dict[Group, Cost]:
         (Stage(stage), kind, group): Cost(
             StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)
         )
-        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in connection.execute(_ALL_COSTS)
+        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in _ALL_COSTS.tuples(connection)
     }
 
 
@@ -55,8 +56,8 @@ def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
         if run.call_seconds is not None:
             by_group.setdefault((run.stage, run.kind, run.cost_group), []).append((run.wall_seconds, run.call_seconds))
     for (stage, kind, group), costs in by_group.items():
-        connection.execute(
-            _ADD_TO_COST_GROUPS,
+        _ADD_TO_COST_GROUPS.run(
+            connection,
             {
                 "stage": stage,
                 "kind": kind,
@@ -78,7 +79,7 @@ def _faded(column: str) -> str:
     return f"{column} = cost_groups.{column} / ({keep}) + excluded.{column}"
 
 
-_ADD_TO_COST_GROUPS = text(
+_ADD_TO_COST_GROUPS = Prepared(
     "INSERT INTO cost_groups (stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, call_squares) "
     "VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
     "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET " + ", ".join(_faded(column) for column in ("count", *_SUMS))

@@ -15,6 +15,7 @@ from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, make_page
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import idempotency_keys, job_stages, jobs, previews, samples, tasks
 from stickslip_services.errors import (
     ConflictError,
@@ -64,12 +65,12 @@ def fingerprint(spec: JobSpec) -> str:
     return sha256(spec.model_dump_json().encode())
 
 
-_RUNNABLE_JOB = select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1)
+_RUNNABLE_JOB = Prepared(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1))
 
 
 def has_runnable_job(connection: Connection) -> bool:
     """Tell whether there is any job to work for."""
-    return connection.scalar(_RUNNABLE_JOB) is not None
+    return _RUNNABLE_JOB.scalar(connection) is not None
 
 
 def runnable_jobs(connection: Connection) -> list[str]:

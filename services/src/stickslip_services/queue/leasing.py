@@ -16,6 +16,7 @@ from stickslip_schemas.states import Stage, TaskState
 from stickslip_schemas.worker_api import Lease, LeaseState
 
 from stickslip_services.database.database import batches
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
 from stickslip_services.queue.compose import StoredTask, compose_tasks, reserve_version
 from stickslip_services.queue.costs import limit_seconds, long_groups, read_costs
@@ -51,7 +52,6 @@ class _Ready:
     attempts: int
 
 
-# Made once: composing a statement costs more than running it.
 _OF_GROUP = (
     _READY,
     tasks.c.stage == bindparam("b_stage"),
@@ -59,12 +59,12 @@ _OF_GROUP = (
     tasks.c.kind == bindparam("b_kind"),
     tasks.c.cost_group.not_in(bindparam("b_left_out", expanding=True)),
 )
-_READY_TASK = (
+_READY_TASK = Prepared(
     select(tasks.c.seq)
     .where(*_OF_GROUP, tasks.c.job.in_(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))))
     .limit(1)
 )
-_READY_TASKS = (
+_READY_TASKS = Prepared(
     select(
         *(tasks.c[name] for name in ("seq", "key", "payload", "preview", "token", "attempts", "cost_group", "tries"))
     )
@@ -73,7 +73,7 @@ _READY_TASKS = (
     .limit(bindparam("b_count"))
     .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
 )
-_JOBS_WITH_PENDING = (
+_JOBS_WITH_PENDING = Prepared(
     select(
         job_counts.c.job,
         jobs.c.priority,
@@ -86,7 +86,7 @@ _JOBS_WITH_PENDING = (
     .group_by(job_counts.c.job, jobs.c.priority)
     .having(func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.pending) > 0)
 )
-_LEASE = (
+_LEASE = Prepared(
     update(tasks)
     .where(tasks.c.seq == bindparam("b_seq"))
     .values(
@@ -104,8 +104,8 @@ def has_ready_task(
     """Tell whether a lease request of these stages would be granted anything; `at_most` seconds a call."""
     costs = {} if at_most is None else read_costs(connection)
     return any(
-        connection.scalar(
-            _READY_TASK,
+        _READY_TASK.scalar(
+            connection,
             {
                 "b_stage": stage,
                 "b_build": build,
@@ -134,7 +134,7 @@ def grant_leases(
     for task in granted:
         book.moved(task.seq, task.stage, TaskState.pending, TaskState.leased)
     lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
-    book.connection.execute(_LEASE, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
+    _LEASE.run_all(book.connection, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
     stored = [StoredTask(task.seq, task.stage, task.payload, task.preview) for task in granted]
     for publish in (task for task in stored if task.stage is Stage.publish):
         reserve_version(book.connection, publish)
@@ -187,7 +187,7 @@ def _pick(
 
 def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int, int]]:
     """Return (job, priority, number of tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
-    return [(job, priority, held) for job, priority, held in connection.execute(_JOBS_WITH_PENDING, {"b_stage": stage})]
+    return _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage})
 
 
 def _ready_tasks(
@@ -199,8 +199,8 @@ def _ready_tasks(
     count: int,
     left_out: Sequence[str],
 ) -> list[_Ready]:
-    rows = connection.execute(
-        _READY_TASKS,
+    rows = _READY_TASKS.rows(
+        connection,
         {
             "b_stage": stage,
             "b_build": worker.stage_builds(kind)[stage],
@@ -219,7 +219,7 @@ def _ready_tasks(
             cost_group=row.cost_group,
             tries=row.tries,
             payload=row.payload,
-            preview=row.preview,
+            preview=bool(row.preview),
             token=row.token,
             attempts=row.attempts,
         )

@@ -14,6 +14,7 @@ from stickslip_schemas.responses import DatasetRef
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.database import batches
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.eta import Run
 
@@ -82,7 +83,7 @@ class HeldTask:
     losses: int
 
 
-_HOLDERS = (
+_HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
     .join(jobs, jobs.c.seq == job_tasks.c.job)
     .join(tasks, tasks.c.seq == job_tasks.c.task)
@@ -123,8 +124,8 @@ class Ledger:
         """Return the open jobs of each task."""
         found: dict[int, list[Holder]] = {}
         for batch in batches(set(task_seqs)):
-            for task, job, cached, cost_group in self.connection.execute(_HOLDERS, {"b_tasks": batch}):
-                found.setdefault(task, []).append(Holder(job, cached, cost_group))
+            for task, job, cached, cost_group in _HOLDERS.tuples(self.connection, {"b_tasks": batch}):
+                found.setdefault(task, []).append(Holder(job, bool(cached), cost_group))
         return found
 
 
@@ -196,7 +197,7 @@ def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) ->
     book.moved(task.seq, task.stage, task.state, state)
 
 
-_START = (
+_START = Prepared(
     update(tasks)
     .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
     .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=bindparam("b_now"))
@@ -206,9 +207,20 @@ _START = (
 def start_tasks(book: Ledger, leased: Collection[tuple[int, str]]) -> None:
     """Note that leased tasks (seq, stage) have been started: from here on they may fail."""
     for batch in batches(leased):
-        book.connection.execute(_START, {"b_tasks": [seq for seq, _ in batch], "b_now": book.now})
+        _START.run(book.connection, {"b_tasks": [seq for seq, _ in batch], "b_now": book.now})
     for seq, stage in leased:
         book.moved(seq, stage, TaskState.leased, TaskState.running)
+
+
+_OF_TASKS = job_tasks.c.task.in_(bindparam("b_tasks", expanding=True))
+_LIVE_JOBS = Prepared(
+    select(job_tasks.c.task, case((jobs.c.state.in_(RUNNABLE), 0), else_=1), jobs.c.priority, job_tasks.c.job)
+    .join(jobs, jobs.c.seq == job_tasks.c.job)
+    .where(_OF_TASKS, jobs.c.state.in_(LIVE))
+)
+_RUNNABLE_TASKS = Prepared(
+    select(job_tasks.c.task).join(jobs, jobs.c.seq == job_tasks.c.job).where(_OF_TASKS, jobs.c.state.in_(RUNNABLE))
+)
 
 
 def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collection[int] = ()) -> dict[int, int]:
@@ -217,14 +229,8 @@ def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collecti
     First is the one of the highest priority, and of these the oldest. Jobs in `but` are left out.
     """
     found: dict[int, tuple[int, int, int]] = {}
-    is_halted = case((jobs.c.state.in_(RUNNABLE), 0), else_=1)
     for batch in batches(task_seqs):
-        rows = connection.execute(
-            select(job_tasks.c.task, is_halted, jobs.c.priority, job_tasks.c.job)
-            .join(jobs, jobs.c.seq == job_tasks.c.job)
-            .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(LIVE))
-        )
-        for task, halted, priority, job in rows:
+        for task, halted, priority, job in _LIVE_JOBS.tuples(connection, {"b_tasks": batch}):
             if job not in but:
                 mine = (halted, -priority, job)
                 found[task] = min(mine, found.get(task, mine))
@@ -233,12 +239,4 @@ def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collecti
 
 def runnable_tasks(connection: Connection, task_seqs: Iterable[int]) -> set[int]:
     """Return those of the tasks that a runnable job needs."""
-    return {
-        task
-        for batch in batches(task_seqs)
-        for task in connection.scalars(
-            select(job_tasks.c.task)
-            .join(jobs, jobs.c.seq == job_tasks.c.job)
-            .where(job_tasks.c.task.in_(batch), jobs.c.state.in_(RUNNABLE))
-        )
-    }
+    return {task for batch in batches(task_seqs) for (task,) in _RUNNABLE_TASKS.tuples(connection, {"b_tasks": batch})}

@@ -17,6 +17,7 @@ from stickslip_schemas.worker_api import Report, ReportVerdict
 
 from stickslip_services.catalog.versions import ManifestSummary, commit_version, find_committed, find_reserved
 from stickslip_services.database.database import batches
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import task_id, task_key
@@ -59,14 +60,15 @@ class Taken:
     """Of failed tasks, the inputs that were damaged or missing."""
 
 
-# Made once: composing a statement costs more than running it.
-_NOTE_REPORT = (
+_NOTE_REPORT = Prepared(
     update(tasks)
     .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
     .values(reported_by=bindparam("b_worker"), reported_token=tasks.c.token)
 )
-_FIND = select(*(tasks.c[name] for name in _Row._fields)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
-_SETTLE = (
+_FIND = Prepared(
+    select(*(tasks.c[name] for name in _Row._fields)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
+)
+_SETTLE = Prepared(
     update(tasks)
     .where(tasks.c.seq == bindparam("b_seq"))
     .values(
@@ -81,12 +83,12 @@ _SETTLE = (
         finished_at=bindparam("b_now"),
     )
 )
-_DEPENDENTS = (
+_DEPENDENTS = Prepared(
     select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
     .join(tasks, tasks.c.seq == task_dependencies.c.task)
     .where(task_dependencies.c.depends_on.in_(bindparam("b_tasks", expanding=True)))
 )
-_COUNT_DOWN = (
+_COUNT_DOWN = Prepared(
     update(tasks)
     .where(tasks.c.seq == bindparam("b_seq"))
     .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled"))
@@ -120,7 +122,7 @@ def take_reports(
         verdicts.append(ReportVerdict(task_id=report.task_id, verdict=verdict))
     accepted = [*released, *(end.task for end in ended)]
     for batch in batches(accepted):
-        book.connection.execute(_NOTE_REPORT, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
+        _NOTE_REPORT.run(book.connection, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
     failures = _take_results(book, ended, versions)
     damaged = tuple((end.task.seq, end.result.damaged_inputs) for end in ended if end.result.damaged_inputs)
     return Taken(tuple(verdicts), tuple(released), failures, damaged)
@@ -129,22 +131,9 @@ def take_reports(
 def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
     keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
     return {
-        task_id(row.stage, row.key): _Row(
-            row.seq,
-            row.key,
-            Stage(row.stage),
-            row.kind,
-            row.cost_group,
-            TaskState(row.state),
-            row.tries,
-            row.losses,
-            row.owner,
-            row.token,
-            row.reported_by,
-            row.reported_token,
-        )
+        task_id(row.stage, row.key): row._replace(stage=Stage(row.stage), state=TaskState(row.state))
         for batch in batches(keys)
-        for row in book.connection.execute(_FIND, {"b_keys": batch})
+        for row in map(_Row._make, _FIND.tuples(book.connection, {"b_keys": batch}))
     }
 
 
@@ -212,8 +201,8 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
     """Write results down and let what depends on them go on."""
     if not settled:
         return
-    book.connection.execute(
-        _SETTLE,
+    _SETTLE.run_all(
+        book.connection,
         [
             {
                 "b_seq": end.task.seq,
@@ -249,18 +238,11 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
 
 def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
     """Count settled dependencies down; a rejected simulation rejects its renders, which settles them in turn."""
-    edges = [
-        (row.depends_on, row.task, row.stage, row.state)
-        for batch in batches(settled)
-        for row in book.connection.execute(_DEPENDENTS, {"b_tasks": batch})
-    ]
+    edges = [edge for batch in batches(settled) for edge in _DEPENDENTS.tuples(book.connection, {"b_tasks": batch})]
     if not edges:
         return
     waits = Counter(task for _, task, _, _ in edges)
-    book.connection.execute(
-        _COUNT_DOWN,
-        [{"b_seq": task, "b_settled": count} for task, count in waits.items()],
-    )
+    _COUNT_DOWN.run_all(book.connection, [{"b_seq": task, "b_settled": count} for task, count in waits.items()])
     doomed = [
         (task, state, rejected[dependency])
         for dependency, task, stage, state in edges

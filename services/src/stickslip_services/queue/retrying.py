@@ -15,6 +15,7 @@ from stickslip_schemas.events import TaskStateEvent
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.database import batches
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import task_id
@@ -105,7 +106,7 @@ def _count_failed(connection: Connection, job: int) -> int:
     return int(connection.scalar(query.where(job_tasks.c.job == job, tasks.c.state == TaskState.failed)) or 0)
 
 
-_IS_DUE = text(
+_IS_DUE = Prepared(
     "SELECT EXISTS (SELECT 1 FROM tasks WHERE tasks.owner IS NOT NULL AND tasks.expires_at <= :b_now) "
     "OR EXISTS (SELECT 1 FROM tasks WHERE tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now)"
 )
@@ -113,7 +114,7 @@ _IS_DUE = text(
 
 def is_sweep_due(connection: Connection, now: float) -> bool:
     """Tell whether a lease has expired or a retry is due, without taking the write lock."""
-    return bool(connection.scalar(_IS_DUE, {"b_now": now}))
+    return bool(_IS_DUE.scalar(connection, {"b_now": now}))
 
 
 def sweep(book: Ledger, settings: Settings) -> None:

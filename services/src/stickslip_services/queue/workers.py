@@ -3,14 +3,18 @@
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any
 
-from sqlalchemy import Connection, Row, bindparam, func, insert, select, text, update
+from sqlalchemy import Connection, bindparam, func, insert, select, text, update
 from stickslip_schemas import responses
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Stage
 from stickslip_schemas.worker_api import WorkerRegistration
 
 from stickslip_services.clock import as_datetime
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
 from stickslip_services.queue.ids import new_id, task_id
@@ -34,7 +38,7 @@ class RegisteredWorker:
 
     id: str
     name: str
-    builds: dict[str, Builds]
+    builds: Mapping[str, Builds]
     """Of each kind that it makes."""
     slots: int
     versions: dict[str, str]
@@ -71,15 +75,15 @@ def insert_worker(connection: Connection, registration: WorkerRegistration, now:
     return find_worker(connection, worker_id)
 
 
-_WORKER = select(workers).where(workers.c.id == bindparam("b_id"))
+_WORKER = Prepared(select(workers).where(workers.c.id == bindparam("b_id")))
 
 
 def find_worker(connection: Connection, worker_id: str) -> RegisteredWorker:
     """Return a worker, superseded or not; raise UnknownWorkerError."""
-    row = connection.execute(_WORKER, {"b_id": worker_id}).one_or_none()
-    if row is None:
+    rows = _WORKER.rows(connection, {"b_id": worker_id})
+    if not rows:
         raise UnknownWorkerError(f"no worker has the id {worker_id!r}: register again")
-    return _worker(row)
+    return _worker(rows[0])
 
 
 def present_workers(connection: Connection, *, seen_since: float | None = None) -> list[RegisteredWorker]:
@@ -160,7 +164,7 @@ def show_workers(
             id=worker.id,
             name=worker.name,
             slots=worker.slots,
-            builds=worker.builds,
+            builds=dict(worker.builds),
             versions=worker.versions,
             registered_at=as_datetime(worker.registered_at),
             last_seen_at=as_datetime(worker.last_seen_at),
@@ -172,14 +176,19 @@ def show_workers(
     ]
 
 
-def _worker(row: Row[tuple[object, ...]]) -> RegisteredWorker:
+@lru_cache(maxsize=64)
+def _builds(document: str) -> Mapping[str, Builds]:
+    return MappingProxyType({kind: Builds.model_validate(builds) for kind, builds in json.loads(document).items()})
+
+
+def _worker(row: Any) -> RegisteredWorker:
     return RegisteredWorker(
         id=row.id,
         name=row.name,
-        builds={kind: Builds.model_validate(builds) for kind, builds in json.loads(row.builds).items()},
+        builds=_builds(row.builds),
         slots=row.slots,
         versions=json.loads(row.versions),
         registered_at=row.registered_at,
         last_seen_at=row.last_seen_at,
-        superseded=row.superseded,
+        superseded=bool(row.superseded),
     )

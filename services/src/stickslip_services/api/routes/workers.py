@@ -1,8 +1,11 @@
 """The worker API: a dispatcher registers, leases tasks, says that it lives, and reports."""
 
-from typing import Annotated
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
+from pydantic import BaseModel
 from stickslip_schemas.responses import WorkerEntry
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -21,7 +24,13 @@ from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, coordinat
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.workers import show_workers
 
+T = TypeVar("T")
+
 router = APIRouter(tags=["workers"])
+
+_LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest)
+_HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat)
+_REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
 
 CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
@@ -52,36 +61,51 @@ def post_worker(
     responses=problem_responses(404, 409, *BODY_PROBLEMS),
     openapi_extra=body_schema("LeaseRequest") | KEYED,
 )
-def post_lease(
-    request: Annotated[LeaseRequest, Depends(JsonBody(LeaseRequest))], coordinator: CoordinatorDep
-) -> Response:
+async def post_lease(request: Request) -> Response:
     """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken over."""
-    # A batch may be megabytes: written as it is, not validated a second time.
-    return Response(coordinator.lease(request).model_dump_json(), media_type="application/json")
+    coordinator: Coordinator = coordinator_of(request)
+    return await _answer(request, _LEASE_REQUEST, coordinator.lease)
 
 
 @router.post(
     "/v1/worker/heartbeat",
+    response_model=HeartbeatAnswer,
     responses=problem_responses(404, *BODY_PROBLEMS),
     openapi_extra=body_schema("Heartbeat") | KEYED,
 )
-def post_heartbeat(
-    heartbeat: Annotated[Heartbeat, Depends(JsonBody(Heartbeat))], coordinator: CoordinatorDep
-) -> HeartbeatAnswer:
+async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
-    return coordinator.heartbeat(heartbeat)
+    coordinator: Coordinator = coordinator_of(request)
+    return await _answer(request, _HEARTBEAT, coordinator.heartbeat)
 
 
 @router.post(
     "/v1/worker/report",
+    response_model=ReportAnswer,
     responses=problem_responses(404, *BODY_PROBLEMS),
     openapi_extra=body_schema("ReportBatch") | KEYED,
 )
-def post_report(
-    batch: Annotated[ReportBatch, Depends(JsonBody(ReportBatch))], coordinator: CoordinatorDep, request: Request
-) -> ReportAnswer:
+async def post_report(request: Request) -> Response:
     """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
-    answer = coordinator.report(batch)
+    coordinator: Coordinator = coordinator_of(request)
     metrics: Metrics = request.app.state.metrics
-    metrics.count_reports(batch, answer)
-    return answer
+
+    def report(batch: ReportBatch) -> ReportAnswer:
+        answer = coordinator.report(batch)
+        metrics.count_reports(batch, answer)
+        return answer
+
+    return await _answer(request, _REPORT_BATCH, report)
+
+
+async def _answer(request: Request, document: JsonBody[T], verb: Callable[[T], BaseModel]) -> Response:
+    """Read a document, do what it says and write the answer, all in one go in one thread.
+
+    Workers ask many times a second. The answer, which may have megabytes, is not validated a second time.
+    """
+    body = await document.received(request)
+
+    def work() -> str:
+        return verb(document.read(body)).model_dump_json()
+
+    return Response(await asyncio.to_thread(work), media_type="application/json")

@@ -1,0 +1,121 @@
+"""Statements of the queue's daily work, compiled once and handed to the driver as they are.
+
+SQLAlchemy takes 0.1 ms of CPU to execute a statement that SQLite runs in 0.01 ms, and a lease and its report execute
+thirty. A prepared statement has two limits: values come back as the driver has them (a Boolean is 0 or 1), and
+SQLAlchemy's events do not see it.
+"""
+
+from collections import namedtuple
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Dialect, text
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.sql.base import Executable
+from sqlalchemy.sql.compiler import SQLCompiler
+
+Values = Mapping[str, Any]
+
+_NO_VALUES = "SELECT NULL WHERE 1 != 1"  # PostgreSQL has no `IN ()`
+
+
+@dataclass(frozen=True, slots=True)
+class _Compiled:
+    sql: str
+    names: tuple[str, ...]
+    """The parameters in the order of the SQL."""
+    defaults: Values
+    lists: tuple[str, ...]
+    """Those of the parameters that are the values of an IN (...)."""
+    mark: str
+
+
+class Prepared:
+    """A statement with its parameters as `bindparam`s, or SQL with `:parameters`; an expanding one takes a list."""
+
+    def __init__(self, statement: Executable | str) -> None:
+        self._statement = text(statement) if isinstance(statement, str) else statement
+        self._compiled: dict[str, _Compiled] = {}
+        columns = getattr(self._statement, "selected_columns", ())
+        row = namedtuple("row", [column.key for column in columns], rename=True)  # type: ignore[misc]
+        self._make: Any = row._make
+
+    def rows(self, connection: Connection, values: Values | None = None) -> list[Any]:
+        """Return the rows, named tuples of the selected columns."""
+        return list(map(self._make, self.tuples(connection, values)))
+
+    def tuples(self, connection: Connection, values: Values | None = None) -> list[Any]:
+        """Return the rows as plain tuples, also those of a statement that is written as text."""
+        sql, parameters = self._filled(connection, values or {})
+        with _translated(connection, sql):
+            found: list[Any] = _driver(connection).execute(sql, parameters).fetchall()
+        return found
+
+    def scalar(self, connection: Connection, values: Values | None = None) -> Any:
+        """Return the first column of the first row; None where there is no row."""
+        sql, parameters = self._filled(connection, values or {})
+        with _translated(connection, sql):
+            row = _driver(connection).execute(sql, parameters).fetchone()
+        return None if row is None else row[0]
+
+    def run(self, connection: Connection, values: Values) -> None:
+        """Execute it."""
+        sql, parameters = self._filled(connection, values)
+        with _translated(connection, sql):
+            _driver(connection).execute(sql, parameters)
+
+    def run_all(self, connection: Connection, values: Sequence[Values]) -> None:
+        """Execute it with each of the values; it must not have expanding parameters."""
+        compiled = self._compile(connection.dialect)
+        names, defaults = compiled.names, compiled.defaults
+        rows = [[row[name] if name in row else defaults[name] for name in names] for row in values]
+        with _translated(connection, compiled.sql):
+            _driver(connection).executemany(compiled.sql, rows)
+
+    def _filled(self, connection: Connection, values: Values) -> tuple[str, list[Any]]:
+        compiled = self._compile(connection.dialect)
+        sql = compiled.sql
+        for name in compiled.lists:
+            count = len(values[name] if name in values else compiled.defaults[name])
+            sql = sql.replace(_list_mark(name), ", ".join([compiled.mark] * count) or _NO_VALUES)
+        parameters: list[Any] = []
+        for name in compiled.names:
+            value = values[name] if name in values else compiled.defaults[name]
+            if name in compiled.lists:
+                parameters.extend(value)
+            else:
+                parameters.append(value)
+        return sql, parameters
+
+    def _compile(self, dialect: Dialect) -> _Compiled:
+        compiled = self._compiled.get(dialect.name)
+        if compiled is None:
+            made = self._statement.compile(dialect=dialect)  # type: ignore[attr-defined]
+            assert isinstance(made, SQLCompiler)
+            names = tuple(made.positiontup or ())
+            lists = tuple(dict.fromkeys(name for name in names if made.binds[name].expanding))
+            defaults = {name: value for name, value in made.params.items() if not made.binds[name].required}
+            mark = {"qmark": "?", "format": "%s"}[dialect.paramstyle]
+            compiled = _Compiled(str(made), names, defaults, lists, mark)
+            self._compiled[dialect.name] = compiled
+        return compiled
+
+
+def _list_mark(name: str) -> str:
+    return f"__[POSTCOMPILE_{name}]"
+
+
+def _driver(connection: Connection) -> Any:
+    return connection.connection.cursor()
+
+
+@contextmanager
+def _translated(connection: Connection, sql: str) -> Iterator[None]:
+    """Raise the driver's errors as SQLAlchemy does."""
+    base = connection.dialect.loaded_dbapi.Error
+    try:
+        yield
+    except base as error:
+        raise DBAPIError.instance(sql, None, error, base) from error
