@@ -35,7 +35,7 @@ class Splits(Document):
 
     by: Literal["simulation", "clip"] = Field(
         default="simulation",
-        description="`clip` draws each sample by itself, so tests see simulations that were trained on: to compare only",
+        description="`clip` draws each sample by itself: tests then see simulations that were trained on",
     )
     train: Float = Field(default=0.8, ge=0, le=1)
     validation: Float = Field(default=0.1, ge=0, le=1)
