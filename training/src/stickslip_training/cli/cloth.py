@@ -167,17 +167,19 @@ def predict(
                 clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
             slots = found.tolist()
         answers = predictions(friction.estimate(clips), slots)
+        for answer, far in zip(answers, friction.strangeness(clips).tolist(), strict=True):
+            answer["strangeness"] = round(far, 3)
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
         return
     table = Table()
-    for title in ("slot", "material", "mu", "80 %"):
-        table.add_column(title, justify="left" if title == "material" else "right")
+    for title in ("slot", "material", "mu", "80 %", ""):
+        table.add_column(title, justify="left" if title in ("material", "") else "right")
     for answer in answers:
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
         told = f"{mu['low']:.2f} to {mu['high']:.2f}"
-        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told)
+        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told, _warning(answer))
     Console().print(table)
 
 
@@ -205,6 +207,10 @@ def score(
             raise ValueError(f"{predictions} must hold a list of answers, and holds a {type(answers).__name__}")
         scores = score_predictions(answers, reader.categories("material"), truth)
     Console().print(_scores(scores))
+
+
+def _warning(answer: dict[str, Any]) -> str:
+    return f"unlike the training clips: {answer['strangeness']:.1f} of 1" if answer["strangeness"] > 1 else ""
 
 
 def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
