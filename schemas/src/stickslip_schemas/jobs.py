@@ -31,8 +31,12 @@ class Quality(StrEnum):
 
 
 class Splits(Document):
-    """Shares of the simulations in each split; all renders of one simulation fall in the same one."""
+    """Shares of each split: of the simulations, all renders of one falling in the same split, or of the clips."""
 
+    by: Literal["simulation", "clip"] = Field(
+        default="simulation",
+        description="`clip` draws each sample by itself: tests then see simulations that were trained on",
+    )
     train: Float = Field(default=0.8, ge=0, le=1)
     validation: Float = Field(default=0.1, ge=0, le=1)
     test: Float = Field(default=0.1, ge=0, le=1)
@@ -105,7 +109,10 @@ class JobSpec(Document):
         default="product",
         description="product: every combination of the axes; zip: the axes have one length and go together",
     )
-    splits: Splits = Field(default=Splits(), description="shares of the simulations in each split; they add up to 1")
+    splits: Splits = Field(
+        default=Splits(),
+        description="shares of the simulations in each split; they add up to 1. `by: clip` draws samples instead",
+    )
     samples_per_shard: Int = Field(
         default=64,
         ge=1,

@@ -142,7 +142,8 @@ def keyed_points(spec: JobSpec, builds: Builds) -> Iterator[KeyedPoint]:
     labels_text = _format({name: _hole(name) for name in names})
     simulation_text = _format(simulation.document)
     simulation_keyed = _format({"simulation": simulation.document, "build": builds.simulate}, "simulate")
-    split_seed = _format({"seed": spec.seed, "for": simulation.unseeded}, "seed/split")
+    drawn = {name: _hole(name) for name in names} if spec.splits.by == "clip" else simulation.unseeded
+    split_seed = _format({"seed": spec.seed, "for": drawn}, "seed/split")
     render_text = render_keyed = ""
     if render is not None:
         render_text = _format(render.document)
@@ -187,7 +188,12 @@ def samples(spec: JobSpec, builds: Builds) -> Iterator[Sample]:
 
 
 def split_of(spec: JobSpec, point: Mapping[str, Any]) -> int:
-    """Return the number of the split of a sample: a hash of its physics, so that no build or order moves it."""
+    """Return the number of the split of a sample: a hash of its physics, so that no build or order moves it.
+
+    With `by: clip` it is a hash of all its axes.
+    """
+    if spec.splits.by == "clip":
+        return _split_at(spec.splits, derived_seed(spec.seed, "split", dict(point)))
     seeds = {rule.field for rule in spec.simulation_seeds}
     physics = spec.simulation(point).model_dump(mode="json", exclude=seeds)
     return _split_at(spec.splits, derived_seed(spec.seed, "split", physics))

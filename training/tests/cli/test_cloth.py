@@ -65,7 +65,7 @@ def test_predictions_of_a_dataset_are_a_list_that_can_be_scored(model, clips, tm
     answers = json.loads(result.stdout)
     assert [answer["slot"] for answer in answers] == [0, 2, 3]
     for answer in answers:
-        assert set(answer) == {"slot", "material", "mu"}
+        assert set(answer) == {"slot", "material", "mu", "strangeness"}
         assert sum(answer["material"].values()) == pytest.approx(1.0, abs=1e-4)
         assert 0 <= answer["mu"]["low"] <= answer["mu"]["median"] <= answer["mu"]["high"] <= 1.6
     (tmp_path / "answers.json").write_text(result.stdout)

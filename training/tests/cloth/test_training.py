@@ -50,6 +50,7 @@ def test_saved_and_loaded(few, tmp_path):
     again = load_friction(tmp_path / "friction.pt")
     clips = render_clips(few[2], 2, 0)
     assert np.array_equal(again.estimate(clips).joint, model.estimate(clips).joint)
+    assert np.array_equal(again.strangeness(clips), model.strangeness(clips))
     assert again.card["training_runs"] == 9
     assert (again.materials, again.instants) == (model.materials, model.instants)
 

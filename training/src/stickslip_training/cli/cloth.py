@@ -112,34 +112,74 @@ def evaluate(
     console.print(f"{out}: report.html, report.json, records.jsonl", soft_wrap=True)
 
 
+@cloth.command("import")
+def import_(
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="of the stage, from before it starts on")],
+    camera: Annotated[Path, typer.Option(help="the calibrated camera, TOML: see the README of training")],
+    out: Annotated[Path, typer.Option(help="file for the clip (.npz), for `cloth predict`")],
+    start: Annotated[str, typer.Option(help="when the stage starts in the video [s], or auto")] = "auto",
+    holders: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            help="column and row of the middles of both held patches in the first frame [px], smaller y first"
+        ),
+    ] = None,
+) -> None:
+    """Put a video of your own on the stage's clock and register it to the holders."""
+    from stickslip_training.cloth.video import import_video, load_calibration, save_clip
+
+    with errors_told():
+        try:
+            began = None if start == "auto" else float(start)
+        except ValueError as error:
+            raise ValueError(f"start must be auto or seconds, and is {start!r}") from error
+        calibration = load_calibration(camera)
+        crops, instants, found = import_video(video, calibration, start=began, holders=holders)
+        save_clip(out, crops, instants, calibration, found)
+    Console().print(
+        f"The stage starts at {found.start:.2f} s (the halves differ by {found.timing:.2f} s); the holders are "
+        f"({found.offset[0]:+.1f}, {found.offset[1]:+.1f}) px from the calibration, the camera shakes by "
+        f"{found.shake:.2f} px, the residual is {found.residual:.2f} px.\n{out}: {len(instants)} pictures",
+        soft_wrap=True,
+    )
+
+
 @cloth.command()
 def predict(
-    dataset: DatasetArgument,
+    dataset: Annotated[str, typer.Argument(metavar="DATASET_OR_CLIP", help="a dataset, or what `cloth import` wrote")],
     model: Annotated[Path, typer.Option(help="friction.pt of `cloth train`")],
     split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
-    """Tell material and friction of every clip of a dataset, with the interval that holds mu with 80 %."""
+    """Tell material and friction of every clip of a dataset, or of a video of your own, with the interval that holds mu
+    with 80 %."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.training import load_friction
+    from stickslip_training.cloth.video import load_clip
 
     with errors_told():
         friction = load_friction(model)
-        with DatasetReader(dataset) as reader:
-            clips, slots = read_clips(reader, None if split is None else _split(split), friction.materials)
-        answers = predictions(friction.estimate(clips), slots.tolist())
+        if dataset.endswith(".npz"):
+            clips, slots = load_clip(dataset), [0]
+        else:
+            with DatasetReader(dataset) as reader:
+                clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
+            slots = found.tolist()
+        answers = predictions(friction.estimate(clips), slots)
+        for answer, far in zip(answers, friction.strangeness(clips).tolist(), strict=True):
+            answer["strangeness"] = round(far, 3)
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
         return
     table = Table()
-    for title in ("slot", "material", "mu", "80 %"):
-        table.add_column(title, justify="left" if title == "material" else "right")
+    for title in ("slot", "material", "mu", "80 %", ""):
+        table.add_column(title, justify="left" if title in ("material", "") else "right")
     for answer in answers:
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
         told = f"{mu['low']:.2f} to {mu['high']:.2f}"
-        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told)
+        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told, _warning(answer))
     Console().print(table)
 
 
@@ -167,6 +207,10 @@ def score(
             raise ValueError(f"{predictions} must hold a list of answers, and holds a {type(answers).__name__}")
         scores = score_predictions(answers, reader.categories("material"), truth)
     Console().print(_scores(scores))
+
+
+def _warning(answer: dict[str, Any]) -> str:
+    return f"unlike the training clips: {answer['strangeness']:.1f} of 1" if answer["strangeness"] > 1 else ""
 
 
 def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from stickslip_schemas.cameras import Camera
 
-from stickslip_training.arrays import Floats
+from stickslip_training.arrays import Array, Floats
 
 HEIGHT, WIDTH = 72, 88
 """Of a crop [px]."""
@@ -89,8 +89,9 @@ class Crops:
         return (pixels - origin) * self.scale.reshape(*self.scale.shape, *extra, 1) + anchor
 
 
-def stage(instants: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return where the middle of the holders is at instants, of 2.4 a second: x and z (F,) [m] [thesis, 4.2.3].
+def stage(instants: Sequence[int] | Array) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return where the middle of the holders is at instants, of 2.4 a second and whole or not: x and z (F,) [m]
+    [thesis, 4.2.3].
 
     6 cm down, then 30 cm to and fro: 10 mm/s^2 up to 10 mm/s, and as it began to an end.
     """

@@ -42,15 +42,22 @@ class PosteriorNet(nn.Module):
         self.material = nn.Linear(2 * width, materials)
         self.mu = nn.Linear(2 * width, materials * bins)
 
-    def forward(self, crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return log p(m) and log p(mu | m)."""
+    def features(self, crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        """Return what material and mu are read off, (B, 2 width)."""
         clips, frames = crops.shape[:2]
         deviation, mean = torch.std_mean(crops, dim=(1, 2, 3), keepdim=True)
         x = (crops - mean) / (deviation + 1e-3)
         features = self.frame(self.encoder(x.reshape(clips * frames, 1, *crops.shape[2:])))
-        joined = self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1))
-        mu = self.mu(joined).reshape(clips, self.sizes["materials"], self.sizes["bins"])
-        return torch.log_softmax(self.material(joined), dim=1), torch.log_softmax(mu, dim=2)
+        return torch.as_tensor(self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1)))
+
+    def read(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return log p(m) and log p(mu | m) of features."""
+        mu = self.mu(features).reshape(len(features), self.sizes["materials"], self.sizes["bins"])
+        return torch.log_softmax(self.material(features), dim=1), torch.log_softmax(mu, dim=2)
+
+    def forward(self, crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return log p(m) and log p(mu | m)."""
+        return self.read(self.features(crops, direction))
 
 
 class Extractor(nn.Sequential):

@@ -14,6 +14,7 @@ from torch import nn
 from stickslip_training.arrays import Floats, Integers, SingleFloats
 from stickslip_training.cloth.crop import Cameras
 from stickslip_training.cloth.evaluation import Truth
+from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
 from stickslip_training.cloth.render import Style, draw_style, render_crops, turned
@@ -109,6 +110,8 @@ class FrictionModel:
     bins: Bins
     temperature: tuple[float, float]
     """By which log p(m) and log p(mu | m) are divided: see `calibrated`."""
+    familiarity: tuple[Familiarity, ...]
+    """Of each network: what it was trained on."""
     card: dict[str, Any]
     """Where the network comes from: runs, settings, measures, limits."""
 
@@ -116,6 +119,13 @@ class FrictionModel:
         """Return the posterior of every clip: the mean over the networks."""
         answers = [answer(net, clips) for net in self.nets]
         return Posterior.mean([_posterior(*each, self.materials, self.bins, self.temperature) for each in answers])
+
+    def strangeness(self, clips: Clips) -> Floats:
+        """Return how far every clip is from what was trained on, over the limit: more than 1 is unfamiliar."""
+        far = [
+            own.distance(features(net, clips)) / own.limit for net, own in zip(self.nets, self.familiarity, strict=True)
+        ]
+        return np.asarray(np.mean(far, axis=0))
 
 
 def train_friction(
@@ -158,6 +168,8 @@ def train_friction(
         assert isinstance(net, PosteriorNet)
         seen = learner.validation
         temperature = calibrated(*answer(net, seen), seen.material, seen.mu, MU_BINS)
+        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
+        familiarity = Familiarity.of(features(net, known), known.material, features(net, seen), len(train.materials))
     card = {
         "settings": asdict(settings),
         "training_runs": len(train),
@@ -168,7 +180,8 @@ def train_friction(
         "history": [asdict(report) for report in fitted.history],
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
     }
-    return FrictionModel((net,), train.materials, frames_at(train.instants)[1], MU_BINS, temperature, card)
+    instants = frames_at(train.instants)[1]
+    return FrictionModel((net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card)
 
 
 def save_friction(path: Path, model: FrictionModel) -> None:
@@ -180,6 +193,10 @@ def save_friction(path: Path, model: FrictionModel) -> None:
         "instants": list(model.instants),
         "bins": asdict(model.bins),
         "temperature": list(model.temperature),
+        "familiarity": [
+            {"means": torch.from_numpy(own.means), "precision": torch.from_numpy(own.precision), "limit": own.limit}
+            for own in model.familiarity
+        ],
         "card": model.card,
     }
     save_tensors(path, content)
@@ -200,6 +217,9 @@ def load_friction(path: str | Path) -> FrictionModel:
         tuple(content["instants"]),
         Bins(**content["bins"]),
         (first, second),
+        tuple(
+            Familiarity(own["means"].numpy(), own["precision"].numpy(), own["limit"]) for own in content["familiarity"]
+        ),
         content["card"],
     )
 
@@ -336,15 +356,23 @@ class _FrictionLearner(Learner):
 
 def answer(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, SingleFloats]:
     """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K)."""
+    with torch.inference_mode():
+        material, mu = net.read(torch.from_numpy(features(net, clips)).to(next(net.parameters()).device))
+    return material.cpu().numpy(), mu.cpu().numpy()
+
+
+def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
+    """Return the last features of clips, (clips, n)."""
     device = next(net.parameters()).device
     net.eval()
     with torch.inference_mode():
         parts = [
-            net(clips.crops[start : start + _CHUNK].to(device), clips.direction[start : start + _CHUNK].to(device))
-            for start in range(0, len(clips.crops), _CHUNK)
+            net.features(
+                clips.crops[first : first + _CHUNK].to(device), clips.direction[first : first + _CHUNK].to(device)
+            )
+            for first in range(0, len(clips.crops), _CHUNK)
         ]
-    material, mu = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
-    return material, mu
+    return np.asarray(torch.cat(parts).cpu().numpy())
 
 
 def _posterior(

@@ -1,0 +1,377 @@
+"""A user's own video of the stage: its frames on the stage's clock, registered to the holders.
+
+The stage moves the two holders on a known path, so they tell both clocks and cameras apart. Two small patches of cloth
+under the holders are followed through the video [Lucas and Kanade 1981]. With P the projection by the calibrated
+camera, h_c(t) the place of holder c on the path, and o the same for all frames,
+
+    p_c(t) = P(h_c(t - t0)) + o + w(t)
+
+gives the start t0 of the path and o; what both holders do alike besides, w(t), is a camera that is not at rest. Both
+are taken out of every frame. What the two do differently is the residual.
+"""
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+from scipy.optimize import least_squares
+from stickslip_schemas.cameras import Camera
+from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.store import write_durably
+
+from stickslip_training.arrays import Array, Floats
+from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, stage
+from stickslip_training.cloth.training import INSTANTS, Clips, frames_at
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FRAMES, ALL_INSTANTS, RATE = 30, 300, 2.4
+"""Pictures of a clip, instants of the motion, and instants a second [thesis, 4.2.3]."""
+
+PATCH = 0.095
+"""y of the middle of the held patches [m]; they are 1 cm wide."""
+
+PATCH_BELOW = 0.005
+"""Their depth below the held edge [m]."""
+
+WINDOW = 0.012
+"""Side of what is followed [m]."""
+
+RESIDUAL_MAX = 1.0
+"""[px of a picture 224 px wide]"""
+
+TIMING_MAX = 0.1
+"""How far the starts may be apart that a video and its two halves tell [s]."""
+
+TILT_MAX = 5.0
+"""Angle between the line of the holders in the video and in the calibrated camera [degree]."""
+
+LATE_MAX = 0.1
+"""How far the frame of an instant may be from it [s]."""
+
+
+class VideoError(ValueError):
+    """The video cannot be measured: the message says why, with number and limit."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera as OpenCV calibrates it: pinhole, and how its lens distorts."""
+
+    camera: Camera
+    distortion: tuple[float, ...]
+    """(k1, k2, p1, p2, k3), or fewer, or none [Brown 1966]."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How a video lies on the stage's clock and picture."""
+
+    start: float
+    """When the stage starts, in the video's time [s]."""
+    timing: float
+    """By how much the starts differ that the whole, or the user, and the first and the second half tell [s]."""
+    offset: tuple[float, float]
+    """Of the holders in the video from where the calibration has them [px]."""
+    shake: float
+    """Root mean square of what both holders do besides the path, per coordinate [px]."""
+    residual: float
+    """Root mean square of what the two do differently, per coordinate [px of a picture 224 px wide]."""
+    tilt: float
+    """Of the line of the holders against that of the calibration [degree]."""
+    frames: int
+    """Of the video."""
+
+    def refusals(self) -> list[str]:
+        """Return why the video must not be measured, if it must not."""
+        reasons = []
+        if not self.residual <= RESIDUAL_MAX:
+            reasons.append(
+                f"the holders must move as one on the stage's path to within {RESIDUAL_MAX:g} px of a picture 224 px "
+                f"wide, and are {self.residual:.2f} px off"
+            )
+        if not self.timing <= TIMING_MAX:
+            reasons.append(
+                f"the start must be the same in both halves of the video to within {TIMING_MAX:g} s, and differs by "
+                f"{self.timing:.2f} s"
+            )
+        if not abs(self.tilt) <= TILT_MAX:
+            reasons.append(
+                f"the line of the holders must have the calibration's direction to within {TILT_MAX:g} degrees, and "
+                f"is turned by {self.tilt:.1f}"
+            )
+        return reasons
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a camera: the keys of a camera of our rigs, and `distortion`; `rotation` may be OpenCV's vector.
+
+    Raises ValueError, naming the field, the rule and the value.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path} must be TOML: {error}") from error
+    distortion = content.pop("distortion", [])
+    if (
+        not isinstance(distortion, list)
+        or len(distortion) not in (0, 4, 5)
+        or not all(isinstance(k, int | float) and math.isfinite(k) for k in distortion)
+    ):
+        raise ValueError(f"distortion must be 4 or 5 finite numbers (k1, k2, p1, p2, k3) or none, and is {distortion}")
+    rotation = content.get("rotation")
+    if isinstance(rotation, list) and len(rotation) == 3 and all(isinstance(r, int | float) for r in rotation):
+        content["rotation"] = _matrix(np.array(rotation, dtype=np.float64)).tolist()
+    try:
+        camera = Camera.model_validate({"name": "own", **content})
+    except ValidationError as error:
+        told = [f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()]
+        raise ValueError(f"{path} must describe a camera: {'; '.join(told)}") from error
+    return Calibration(camera, tuple(map(float, distortion)))
+
+
+def import_video(
+    path: str | Path,
+    calibration: Calibration,
+    *,
+    start: float | None = None,
+    holders: tuple[float, float, float, float] | None = None,
+) -> tuple[torch.Tensor, tuple[int, ...], Registration]:
+    """Return crops (F, 72, 88) of a video, the instants that they show, and how the video was registered.
+
+    `start` is when the stage starts [s]; without it, the path is found. `holders` are columns and rows of the middles
+    of the two held patches in the first frame, that with the smaller y first [px]; without it, the calibration's. The
+    video must begin before the stage starts. Raises VideoError where it cannot be measured.
+    """
+    times, tracks, size = _follow(path, calibration, holders)
+    camera = calibration.camera
+    if size != (camera.width, camera.height):
+        raise VideoError(
+            f"frames must have the size of the calibration, {camera.width} x {camera.height}, and have "
+            f"{size[0]} x {size[1]}"
+        )
+    last = frames_at(tuple(range(ALL_INSTANTS)))[1][-1] / RATE
+    if times[-1] - times[0] < last:
+        raise VideoError(f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.0f} s")
+    registration, wanders = _register(times, tracks, camera, start)
+    if reasons := registration.refusals():
+        raise VideoError("; ".join(reasons))
+    instants, chosen = _frames_of(times, registration.start)
+    crops = _cut(path, calibration, chosen, instants, np.asarray(registration.offset) + wanders[chosen])
+    return crops, instants, registration
+
+
+def save_clip(
+    path: Path, crops: torch.Tensor, instants: tuple[int, ...], calibration: Calibration, registration: Registration
+) -> None:
+    """Write what `import_video` returned; `load_clip` reads it."""
+    import io
+
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        crops=np.round(crops.numpy() * 255).astype(np.uint8),
+        instants=np.array(instants),
+        direction=np.asarray(calibration.camera.rotation[2], dtype=np.float32),
+        registration=np.array(json.dumps(asdict(registration))),
+    )
+    write_durably(path, buffer.getvalue())
+
+
+def load_clip(path: str | Path) -> Clips:
+    """Read an imported clip, of which nothing is known to be true."""
+    try:
+        with np.load(path) as file:
+            frames, _ = frames_at(tuple(file["instants"].tolist()))
+            crops = torch.from_numpy(file["crops"][frames].astype(np.float32) / 255)[None]
+            direction = torch.from_numpy(file["direction"])[None]
+    except (KeyError, OSError, ValueError) as error:
+        raise ValueError(f"{path} must be a clip that `cloth import` wrote: {error}") from error
+    unknown = np.array([-1])
+    return Clips(crops, direction, unknown, np.array([math.nan]), unknown, np.array([0]))
+
+
+# --- following the holders -------------------------------------------------------------------------------------
+
+
+def _matrix(vector: Floats) -> Floats:
+    """Return exp([v]) [Rodrigues 1840]."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def _frames(path: str | Path) -> Iterator[tuple[float, "NDArray[np.uint8]"]]:
+    """Yield the time [s] and the grey levels (H, W) of every frame."""
+    try:
+        import av
+    except ModuleNotFoundError as error:
+        raise VideoError("reading videos needs PyAV: pip install 'stickslip-training[video]'") from error
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise VideoError(f"{path} must have a picture: it has none")
+            for frame in container.decode(video=0):
+                if frame.time is None:
+                    raise VideoError(f"every frame of {path} must have a time, and one has none")
+                yield float(frame.time), frame.to_ndarray(format="gray").astype(np.uint8, copy=False)
+    except (av.error.FFmpegError, OSError) as error:
+        raise VideoError(f"{path} must be a video that FFmpeg reads: {error}") from error
+
+
+def holder_points(instants: Array) -> Floats:
+    """Return the middles of the two held patches at instants (F,), which need not be whole: (F, 2, 3) [m]."""
+    x, z = (np.asarray(part, dtype=np.float64) for part in stage(instants))
+    points = np.zeros((len(x), 2, 3))
+    points[:, :, 0] = x[:, None]
+    points[:, :, 1] = (-PATCH, PATCH)
+    points[:, :, 2] = z[:, None] - PATCH_BELOW
+    return points
+
+
+def _follow(
+    path: str | Path, calibration: Calibration, holders: tuple[float, float, float, float] | None
+) -> tuple[Floats, Floats, tuple[int, int]]:
+    """Return times (N,), places (N, 2, 2) of the held patches without distortion [px], and the size of the frames."""
+    try:
+        import cv2
+    except ModuleNotFoundError as error:
+        raise VideoError("following the holders needs OpenCV: pip install 'stickslip-training[video]'") from error
+    camera = calibration.camera
+    matrix = _intrinsics(camera)
+    distortion = np.array(calibration.distortion or (0.0,) * 4)
+    first, depth = camera.project(holder_points(np.zeros(1))[0])
+    if holders is None:
+        homogeneous = (first - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        rays = np.concatenate([homogeneous, np.ones((2, 1))], axis=1)
+        seen = cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(2, 2)
+    else:
+        seen = np.array(holders).reshape(2, 2)
+    window = max(9, round(WINDOW * camera.fx / float(depth.mean())) | 1)
+    precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
+    times: list[float] = []
+    places: list[Any] = []
+    before, size = None, (0, 0)
+    place = seen.astype(np.float32)[:, None]
+    for time, picture in _frames(path):
+        if before is not None:
+            if picture.shape != before.shape:
+                raise VideoError(f"frames must have one size, and have {before.shape} and {picture.shape}")
+            place, found, _ = cv2.calcOpticalFlowPyrLK(
+                before, picture, place, None, winSize=(window, window), maxLevel=2, criteria=precise
+            )
+            if not found.all():
+                raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
+        size = picture.shape[1], picture.shape[0]
+        times.append(time)
+        places.append(place.reshape(2, 2).copy())
+        before = picture
+    if len(times) < 2:
+        raise VideoError(f"{path} must have frames, and has {len(times)}")
+    raw = np.array(places, dtype=np.float64)
+    flat = cv2.undistortPoints(raw.reshape(-1, 1, 2), matrix, distortion, P=matrix)
+    return np.array(times), np.asarray(flat, dtype=np.float64).reshape(raw.shape), size
+
+
+def _intrinsics(camera: Camera) -> Floats:
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None) -> tuple[Registration, Floats]:
+    """Return the registration, and what both holders do besides the path in every frame, (N, 2) [px]."""
+
+    def off(t0: float, some: slice = slice(None)) -> Floats:
+        """Return tracks less the path, less their mean, (N, 2, 2)."""
+        path = camera.project(holder_points(np.maximum(times[some] - t0, 0.0) * RATE))[0]
+        apart = tracks[some] - path
+        return np.asarray(apart - np.median(apart, axis=(0, 1)))
+
+    def found(some: slice, near: float) -> float:
+        def residuals(t0: Floats) -> Floats:
+            return off(float(t0[0]), some).ravel()
+
+        fit = least_squares(residuals, np.array([near]), loss="soft_l1", diff_step=np.array([1e-4]))
+        return float(fit.x[0])
+
+    if start is None:
+        coarse = np.arange(times[0], times[-1] - 30.0, 0.5)
+        if not len(coarse):
+            raise VideoError(f"the video must last more than 30 s, and lasts {times[-1] - times[0]:.0f} s")
+        every = slice(None, None, max(1, len(times) // 600))
+        near = float(coarse[np.argmin([np.abs(off(t, every)).sum() for t in coarse])])
+        t0 = found(slice(None), near)
+    else:
+        t0 = start
+    half = int(np.searchsorted(times, t0 + 0.5 * (times[-1] - t0)))
+    halves = [found(part, t0) for part in (slice(None, half), slice(half, None))]
+    path = camera.project(holder_points(np.maximum(times - t0, 0.0) * RATE))[0]
+    apart = tracks - path
+    offset = np.median(apart, axis=(0, 1))
+    wander = apart.mean(axis=1) - offset
+    apart = apart - apart.mean(axis=1, keepdims=True)
+    apart = apart - apart.mean(axis=0)  # a holder that is off by a constant is one that was marked so
+    lines = [np.diff(points, axis=1)[0, 0] for points in (tracks[:1], path[:1])]
+    angles = [math.degrees(math.atan2(line[1], line[0])) for line in lines]
+    tilt = (angles[0] - angles[1] + 180.0) % 360.0 - 180.0
+    return (
+        Registration(
+            start=t0,
+            timing=float(np.ptp([t0, *halves])),
+            offset=(float(offset[0]), float(offset[1])),
+            shake=float(np.sqrt((wander**2).mean())),
+            residual=float(np.sqrt((apart**2).mean())) * 224.0 / camera.width,
+            tilt=tilt,
+            frames=len(times),
+        ),
+        wander,
+    )
+
+
+def _frames_of(times: Floats, start: float) -> tuple[tuple[int, ...], "NDArray[np.int64]"]:
+    """Return the instants of a clip that the video shows, and the frame that is nearest to each."""
+    instants = np.array(shown_frames(FRAMES, ALL_INSTANTS))
+    wanted = start + instants / RATE
+    shown = wanted <= times[-1] + LATE_MAX
+    frames = np.array([int(np.abs(times - time).argmin()) for time in wanted[shown]])
+    late = np.abs(times[frames] - wanted[shown])
+    for instant in INSTANTS:
+        place = np.flatnonzero(instants[shown] == instant)
+        if not len(place) or late[place[0]] > LATE_MAX:
+            raise VideoError(
+                f"the video must have a frame within {LATE_MAX:g} s of {start + instant / RATE:.1f} s, and has none"
+            )
+    return tuple(instants[shown].tolist()), frames
+
+
+def _cut(
+    path: str | Path,
+    calibration: Calibration,
+    chosen: "NDArray[np.int64]",
+    instants: tuple[int, ...],
+    off: Floats,
+) -> torch.Tensor:
+    """Return the crops of some frames, whose holders are `off` (F, 2) [px]."""
+    import cv2
+
+    camera = calibration.camera
+    wanted = set(chosen.tolist())
+    pictures = {}
+    for number, (_, picture) in enumerate(_frames(path)):
+        if number in wanted:
+            flat = cv2.undistort(picture, _intrinsics(camera), np.array(calibration.distortion or (0.0,) * 4))
+            pictures[number] = torch.from_numpy(flat.astype(np.float32) / 255)
+    crops = holder_crops(Cameras.of([camera]), instants)
+    place = Crops(crops.origin + torch.from_numpy(off.astype(np.float32))[None], crops.scale)
+    parts = [
+        cut(pictures[number][None, None], Crops(place.origin[:, frame : frame + 1], place.scale[:, frame : frame + 1]))
+        for frame, number in enumerate(chosen.tolist())
+    ]
+    return torch.cat(parts, dim=1)[0]

@@ -1,0 +1,157 @@
+"""Videos of one's own: a film of rendered cloth, with a lens, a hand that shakes and a codec that loses."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from stickslip_schemas.cameras import load_rig
+from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, stage
+from stickslip_training.cloth.render import _refined, splat
+from stickslip_training.cloth.training import INSTANTS
+from stickslip_training.cloth.video import (
+    RATE,
+    Calibration,
+    VideoError,
+    import_video,
+    load_calibration,
+    load_clip,
+    save_clip,
+)
+
+av = pytest.importorskip("av")
+cv2 = pytest.importorskip("cv2")
+
+START, FRAMES_A_SECOND, DISTORTION = 1.7, 6, (-0.12, 0.05, 0.001, -0.0005, 0.0)
+CAMERA = next(camera for camera in load_rig("drag") if camera.name == "calibrated")
+
+
+def meshes_at(run, seconds):
+    """Return the mesh at times after the start, (F, side, side, 3): between instants it moves on with the holders."""
+    times = np.maximum(np.asarray(seconds), 0.0) * RATE
+    known = np.array(run.instants)
+    after = np.clip(np.searchsorted(known, times, side="right"), 1, len(known) - 1)
+    share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)
+
+    def carried(frame):
+        x, z = stage(known[frame])
+        return run.positions[0, frame] - np.stack([x, np.zeros(len(x)), z], axis=-1)[:, None, None]
+
+    shape = carried(after - 1) * (1 - share)[:, None, None, None] + carried(after) * share[:, None, None, None]
+    x, z = stage(times)
+    return torch.tensor(shape + np.stack([x, np.zeros(len(x)), z], axis=-1)[:, None, None], dtype=torch.float32)
+
+
+def pictures(run, seconds):
+    """Return grey levels (F, 224, 224) as a pinhole camera sees them: a checked cloth on a dark floor."""
+    lines = torch.linspace(0, 1, 112)
+    checks = 0.35 + 0.3 * ((lines[:, None] * 20).floor() + (lines * 20).floor()).remainder(2)
+    found = []
+    for mesh in meshes_at(run, seconds).split(32):
+        fine = _refined(mesh[None], 112)
+        whole = Crops(torch.zeros(1, len(mesh), 2), torch.ones(1, len(mesh)), (0.0, 0.0))
+        colors = checks.expand(fine.shape[:-1])
+        alpha, color = splat(fine, colors, Cameras.of([CAMERA]), whole, size=(224, 224))
+        found.append((alpha * color + (1 - alpha) * 0.05)[0])
+    return torch.cat(found).numpy()
+
+
+def filmed(path, frames, shake, distortion=DISTORTION):
+    """Write an H.264 film of pictures through a lens, each moved by `shake` (F, 2) [px]."""
+    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    columns, rows = np.meshgrid(np.arange(224.0), np.arange(224.0))
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=FRAMES_A_SECOND)
+        stream.width = stream.height = 224
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "20"}
+        for frame, moved in zip(frames, shake, strict=True):
+            seen = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+            flat = cv2.undistortPoints(seen, matrix, np.array(distortion), P=matrix).reshape(224, 224, 2) - moved
+            picture = cv2.remap(frame, *np.moveaxis(flat.astype(np.float32), -1, 0), cv2.INTER_CUBIC)
+            grey = np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.repeat(grey[..., None], 3, 2), format="rgb24")))
+        container.mux(stream.encode())
+
+
+@pytest.fixture(scope="module")
+def run(runs):
+    return runs[np.flatnonzero(runs.mu > 0.4)[:1]]
+
+
+@pytest.fixture(scope="module")
+def film(run, tmp_path_factory):
+    """93 s after the start, six frames a second, 1 px of shake."""
+    path = tmp_path_factory.mktemp("film") / "film.mp4"
+    seconds = np.arange(0.0, START + INSTANTS[-1] / RATE + 1.0, 1 / FRAMES_A_SECOND) - START
+    shake = np.random.default_rng(1).normal(0.0, 0.05, (len(seconds), 2)).cumsum(axis=0)
+    shake -= shake[0]
+    filmed(path, pictures(run, seconds), shake)
+    return path
+
+
+def test_start_shake_and_crops_are_found(film, run, tmp_path):
+    crops, instants, found = import_video(film, Calibration(CAMERA, DISTORTION))
+    assert found.start == pytest.approx(START, abs=0.1)
+    assert found.residual < 0.5
+    assert set(INSTANTS) <= set(instants)
+    frames = [instants.index(instant) for instant in INSTANTS]
+    direct = torch.from_numpy(pictures(run, np.array(INSTANTS) / RATE))[None]
+    wanted = cut(direct, holder_crops(Cameras.of([CAMERA]), INSTANTS))[0]
+    blind = (crops[frames] - wanted).abs().mean()
+    assert blind < 0.02  # lens, codec, and the nearest of six frames a second; contrast is 0.3 to 0.6
+    save_clip(tmp_path / "clip.npz", crops, instants, Calibration(CAMERA, DISTORTION), found)
+    clips = load_clip(tmp_path / "clip.npz")
+    assert (clips.crops[0] - crops[frames]).abs().max() <= 0.5 / 255 + 1e-6
+    assert clips.direction[0].tolist() == pytest.approx(CAMERA.rotation[2])
+
+
+def test_a_wrong_start_is_refused(film):
+    with pytest.raises(VideoError, match=r"the start must be the same in both halves .* and differs by"):
+        import_video(film, Calibration(CAMERA, DISTORTION), start=START - 1.0)
+
+
+def test_another_camera_is_refused(film):
+    with pytest.raises(VideoError, match="frames must have the size of the calibration, 300 x 224, and have 224 x 224"):
+        import_video(film, Calibration(CAMERA.model_copy(update={"width": 300}), DISTORTION))
+
+
+def test_a_short_video_is_refused(run, tmp_path):
+    filmed(tmp_path / "short.mp4", pictures(run, np.arange(30) / 6.0), np.zeros((30, 2)))
+    with pytest.raises(VideoError, match="the video must show 92 s from the start on, and lasts 5 s"):
+        import_video(tmp_path / "short.mp4", Calibration(CAMERA, DISTORTION))
+
+
+def test_what_is_no_video_is_refused(tmp_path):
+    (tmp_path / "none.mp4").write_text("nothing")
+    with pytest.raises(VideoError, match="must be a video that FFmpeg reads"):
+        import_video(tmp_path / "none.mp4", Calibration(CAMERA, ()))
+
+
+def test_calibration_is_read_as_opencv_writes_it(tmp_path):
+    vector = cv2.Rodrigues(np.array(CAMERA.rotation))[0].ravel().tolist()
+    keys = {key: getattr(CAMERA, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    lines = [f"{key} = {value}" for key, value in keys.items()]
+    lines += [f"rotation = {vector}", f"translation = {list(CAMERA.translation)}", "distortion = [-0.1, 0.0, 0.0, 0.0]"]
+    (tmp_path / "camera.toml").write_text("\n".join(lines))
+    read = load_calibration(tmp_path / "camera.toml")
+    assert np.allclose(read.camera.rotation, CAMERA.rotation, atol=1e-9)
+    assert read.distortion == (-0.1, 0.0, 0.0, 0.0)
+    (tmp_path / "camera.toml").write_text("\n".join([*lines[:-1], "distortion = [1.0]"]))
+    with pytest.raises(ValueError, match="distortion must be 4 or 5 finite numbers"):
+        load_calibration(tmp_path / "camera.toml")
+    (tmp_path / "camera.toml").write_text("\n".join(lines[1:]))
+    with pytest.raises(ValueError, match=r"must describe a camera: width: Field required"):
+        load_calibration(tmp_path / "camera.toml")
+
+
+def test_reasons_name_rule_and_value(film):
+    found = import_video(film, Calibration(CAMERA, DISTORTION))[2]
+    wrong = replace(found, residual=2.5, timing=math.nan, tilt=-9.0)
+    assert [reason.split(" must")[0] for reason in wrong.refusals()] == [
+        "the holders",
+        "the start",
+        "the line of the holders",
+    ]
+    assert "are 2.50 px off" in wrong.refusals()[0]
