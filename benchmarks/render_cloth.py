@@ -4,23 +4,31 @@ Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajector
 
     .venv/bin/python benchmarks/render_trajectory.py /tmp/cloth.npz
     .venv-blender/bin/python benchmarks/render_cloth.py /tmp/cloth.npz [--frames 12] [--references DIR] [--substrates]
+    .venv-blender/bin/python benchmarks/render_cloth.py /tmp/cloth.npz --clip CLIPS.npy
 
 References are rendered directly, with another seed, in the window that the cloth is in; those of --substrates are
 denoised, for gloss is still noisy at 256 samples. They take most of the time, and DIR keeps them. Decibels pool the
 squared error of 8-bit sRGB over the pixels that the cloth covers by half or more, over frames, views and textures.
 CPU time is a median over frames, per frame and texture, with eight textures.
+
+--clip makes what a render process makes of a task, 8 clips of 30 frames in a store, says how much of its time is not
+Blender's, and writes the clips to a file.
 """
 
 import argparse
 import hashlib
+import io
 import platform
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from stickslip_blender.actor import RenderActor
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.build import build_digest
 from stickslip_blender.clips import ClothRenderer
@@ -29,20 +37,26 @@ from stickslip_blender.geometry import FLOOR
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import grained, look_of
 from stickslip_blender.multiplexed import encode
+from stickslip_blender.pixels import FrameReader
 from stickslip_blender.raster import Textures, Window, projected, see
 from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.cameras import load_rig, rig_digest
+from stickslip_schemas.chunks import decode_chunk
+from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.jobs import Quality
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.textures import Texture
 
 MATERIAL = "gray-interlock"
 TEXTURES = tuple(Texture)[:8]
 COMPARED = (Texture.checker, Texture.houndstooth, Texture.floral)
 CREASES = 0.5
-SMOOTH = Sampling(REFERENCE.samples, "fast", REFERENCE.seed)
+SMOOTH = Sampling(REFERENCE.samples, "guided", REFERENCE.seed)
 
 
 @dataclass(frozen=True)
@@ -105,9 +119,10 @@ class Bench:
         trace = self.stage.trace(shot, sampling, seed=7)
         traced = time.process_time()
         camera = self.rig[view.view]
-        made = self.stage.composer.compose(trace, shot.points, camera, view.substrate, floor, self.textures)
+        pictures = np.empty((len(TEXTURES), *trace.shape), dtype=np.uint8)
+        self.stage.composer.compose(trace, shot.points, camera, view.substrate, floor, self.textures, pictures)
         ended = time.process_time()
-        return made.pictures, traced - placed, ended - traced + self._per_frame(view)
+        return pictures, traced - placed, ended - traced + self._per_frame(view)
 
     def _per_frame(self, view: View) -> float:
         """Return the seconds that it takes to place everything: once a frame, the rest of `set_up` once a clip."""
@@ -178,15 +193,77 @@ def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Vi
     )
 
 
+def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> None:
+    """Make the clips of a task, all of it, and print where the time goes."""
+    with np.load(trajectory) as file:
+        record = {"positions": file["track"][None], "rest": file["rest"][None], "triangles": file["triangles"][None]}
+    spent = [0.0, 0.0]  # in Blender, and for all
+    rendered = FrameReader._rendered
+
+    def timed(*arguments: Any) -> Any:
+        start = time.process_time()
+        result = rendered(*arguments)
+        spent[0] += time.process_time() - start
+        return result
+
+    FrameReader._rendered = timed  # type: ignore[method-assign]
+    look = ClothDragRender(
+        rig="drag",
+        rig_digest=rig_digest("drag"),
+        quality=quality,
+        material=MATERIAL,
+        texture=TEXTURES[0],
+        viewpoint="calibrated",
+        substrate=substrate,
+        creases=CREASES,
+        instants=shown_frames(30, len(record["positions"][0])),
+        light_seed=3,
+        crease_seed=1,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(folder)
+        data = io.BytesIO()
+        np.savez(data, **record)
+        reference = RecordRef(digest=store.publish(data.getvalue()), row=0)
+        actor = RenderActor(folder)
+        short = look.model_copy(update={"instants": look.instants[:1]})
+        for document, wanted in ((short, ()), (look, TEXTURES)):  # shaders are compiled once, with the first
+            task = RenderTask(render=document, record=reference, textures=wanted)
+            spent = [0.0, 0.0]
+            start = time.process_time()
+            result = TaskResult.model_validate(actor.render(task.model_dump(mode="json")))
+            spent[1] = time.process_time() - start
+        assert isinstance(result.output, RenderOutput)
+        shape = (len(TEXTURES), len(look.instants), 224, 224, 3)
+        clips = np.empty(shape, dtype=np.uint8)
+        for clip, where in zip(clips, result.output.clips.values(), strict=True):
+            decode_chunk(store.read(where.digest, offset=where.offset, length=where.length), clip)
+        actor.close()
+    np.save(out, clips)
+    blender, every = spent
+    print(
+        f"{quality}, {substrate}: {every / (shape[0] * shape[1]):.4f} CPU s per frame and texture; Blender "
+        f"{blender:.2f} s, all else {every - blender:.2f} s ({100 * (every / blender - 1):.1f} %); "
+        f"gate {result.output.labels['gate_db']:.1f} dB",
+        flush=True,
+    )
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("trajectory", type=Path)
     arguments.add_argument("--frames", type=int, default=12, help="instants, each in three views")
     arguments.add_argument("--references", type=Path, help="folder that keeps them")
     arguments.add_argument("--substrates", action="store_true", help="the seven of the thesis, one instant each")
+    arguments.add_argument("--clip", type=Path, metavar="NPY", help="make whole clips instead, and write them there")
+    arguments.add_argument("--quality", default="standard", help="of --clip")
+    arguments.add_argument("--substrate", default="matt", help="of --clip")
     arguments.add_argument("--direct", action="store_true", help="direct renderings too")
     arguments.add_argument("--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings")
     options = arguments.parse_args()
+    if options.clip is not None:
+        whole_clips(options.trajectory, options.clip, options.quality, options.substrate)
+        return
 
     bench = Bench(options.trajectory, options.references)
     app = import_bpy().app
@@ -203,7 +280,7 @@ def main() -> None:
         for samples in (16, 32):
             errors, seconds = [], []
             for view in chosen[:6]:
-                picture, spent = bench.direct(view, Texture.floral, Sampling(samples, "fast"))
+                picture, spent = bench.direct(view, Texture.floral, Sampling(samples, "guided"))
                 part, reference = bench.reference(view, Texture.floral)
                 errors.append(squared(picture[part.slices], reference)[bench.cloth(view, part)].ravel())
                 seconds.append(spent)

@@ -22,7 +22,7 @@ from stickslip_schemas.cameras import load_rig
 OTHERS = {
     f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(samples=samples, denoiser=denoiser)
     for samples in (4, 8, 16, 32, 64, 128)
-    for denoiser in ("none", "fast")
+    for denoiser in ("none", "guided")
 }
 
 

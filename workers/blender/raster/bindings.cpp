@@ -10,6 +10,7 @@
 #include <tuple>
 
 #include "build_constants.hpp"
+#include "composition.hpp"
 #include "raster.hpp"
 
 namespace nb = nanobind;
@@ -24,6 +25,11 @@ using Coordinates = Input<double, nb::shape<-1, 2>>;
 using Triangles = Input<std::int32_t, nb::shape<-1, 3>>;
 using Seen = Input<std::int32_t, nb::shape<-1, -1>>;
 using Texels = Input<float, nb::shape<-1, -1, -1>>;
+using Halves = Input<std::uint16_t, nb::shape<-1, -1, 3>>;
+using Plane = Input<float, nb::shape<-1, -1>>;
+using Colors = Input<float, nb::shape<-1, -1, -1>>;
+using Doubles = Input<double, nb::shape<-1, -1>>;
+using Pictures = nb::ndarray<std::uint8_t, nb::shape<-1, -1, -1, 3>, nb::device::cpu>;
 using WindowTuple = std::tuple<int, int, int, int>;
 
 template <class Scalar, class Shape>
@@ -99,7 +105,77 @@ auto albedo(const Seen& seen, const Points& points, const Triangles& triangles, 
       handed_over<float, nb::shape<-1, -1>>(std::move(result.coverage), {height, width}),
       handed_over<float, nb::shape<-1, -1, -1, 3>>(std::move(result.mean),
                                                    {height, width, static_cast<std::size_t>(count), 3}),
-      handed_over<std::int32_t, nb::shape<-1>>(std::move(result.hits), {static_cast<std::size_t>(end)}));
+      handed_over<std::int32_t, nb::shape<-1>>(std::move(result.hits), {static_cast<std::size_t>(end)}),
+      handed_over<float, nb::shape<-1, 3>>(std::move(result.overall), {static_cast<std::size_t>(count), 3}),
+      result.area);
+}
+
+raster::Part part(const Colors& albedo, const WindowTuple& window, std::size_t colors) {
+  const raster::Window place = as_window(window);
+  if (place.width < 0 || place.height < 0 || albedo.shape(0) != static_cast<std::size_t>(place.height) ||
+      albedo.shape(1) != static_cast<std::size_t>(place.width) || albedo.shape(2) != colors)
+    throw std::invalid_argument("albedo: must be of the shape of its window, and of three colours a picture");
+  return {place, {albedo.data(), albedo.size()}};
+}
+
+void compose(const Halves& trace, std::tuple<float, float> albedos, const Input<float, nb::shape<-1>>& overall,
+             const Plane& coverage, const Colors& mean, const WindowTuple& window, const Colors& reflected,
+             const WindowTuple& reflected_window, const Input<float, nb::shape<-1, -1, 3>>& floor, float reflectance,
+             Pictures pictures) {
+  const std::size_t height = trace.shape(0), width = trace.shape(1), colors = overall.size();
+  if (colors != 3 * pictures.shape(0) || pictures.shape(1) != height || pictures.shape(2) != width ||
+      floor.shape(0) != height || floor.shape(1) != width)
+    throw std::invalid_argument("trace, overall, floor and pictures: must be of one height, width and colours");
+  if (pictures.stride(3) != 1 || pictures.stride(2) != 3 || pictures.stride(1) != static_cast<std::int64_t>(3 * width))
+    throw std::invalid_argument("pictures: each must be contiguous");
+  const raster::Part cloth = part(mean, window, colors), mirrored = part(reflected, reflected_window, colors);
+  if (coverage.shape(0) != mean.shape(0) || coverage.shape(1) != mean.shape(1))
+    throw std::invalid_argument("coverage: must be of the shape of its window");
+  const raster::Trace light{{trace.data(), trace.size()},
+                            static_cast<int>(width),
+                            static_cast<int>(height),
+                            std::get<0>(albedos),
+                            std::get<1>(albedos)};
+  nb::gil_scoped_release release;
+  raster::compose(light, {overall.data(), overall.size()}, cloth, {coverage.data(), coverage.size()}, mirrored,
+                  {floor.data(), floor.size()}, reflectance, pictures.data(),
+                  static_cast<std::size_t>(pictures.stride(0)));
+}
+
+auto tiled(const Doubles& picture, double density, const Input<double, nb::shape<3, 3>>& rays,
+           const Input<double, nb::shape<3>>& position, double height, std::tuple<int, int> size, int subsamples) {
+  const auto [columns, rows] = size;
+  if (picture.shape(0) != picture.shape(1) || picture.size() == 0 || columns < 1 || rows < 1 || subsamples < 1)
+    throw std::invalid_argument("picture must be square, and size and subsamples at least 1");
+  std::vector<float> result =
+      raster::tiled({picture.data(), picture.size()}, static_cast<int>(picture.shape(0)), density,
+                    {rays.data(), rays.size()}, {position.data(), 3}, height, columns, rows, subsamples);
+  return handed_over<float, nb::shape<-1, -1>>(std::move(result),
+                                               {static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
+}
+
+auto blurred(const Colors& values, const Plane& down, const Plane& across) {
+  const std::size_t height = values.shape(0), width = values.shape(1), count = values.shape(2);
+  for (const Plane* radius : {&down, &across})
+    if (radius->shape(0) != height || radius->shape(1) != width ||
+        std::any_of(radius->data(), radius->data() + radius->size(), [](float r) { return !(r >= 0.0f); }))
+      throw std::invalid_argument("down and across: radii must be at least 0, and one for each pixel");
+  std::vector<float> result;
+  {
+    nb::gil_scoped_release release;
+    result = raster::blurred({values.data(), values.size()}, {down.data(), down.size()}, {across.data(), across.size()},
+                             static_cast<int>(width), static_cast<int>(height), static_cast<int>(count));
+  }
+  return handed_over<float, nb::shape<-1, -1, -1>>(std::move(result), {height, width, count});
+}
+
+auto normals(const Points& points, const Triangles& triangles) {
+  const auto count = static_cast<std::int32_t>(points.shape(0));
+  const std::int32_t* indices = triangles.data();
+  if (std::any_of(indices, indices + triangles.size(), [=](std::int32_t v) { return v < 0 || v >= count; }))
+    throw std::invalid_argument("triangles: indices must be from 0 to " + std::to_string(count - 1));
+  return handed_over<double, nb::shape<-1, 3>>(
+      raster::normals({points.data(), points.size()}, rows_of<raster::Triangle>(triangles)), {points.shape(0), 3});
 }
 
 }  // namespace
@@ -109,8 +185,18 @@ NB_MODULE(_raster, module) {
   module.def("visible", &visible, "points"_a, "triangles"_a, "window"_a, "grid"_a,
              "Return the triangle seen at each sample, shape (grid height, grid width), -1 where there is none.\n\n"
              "Points (V, 3): column, row [px] and depth. The window: left, top, width, height [px].");
-  module.def("albedo", &albedo, "seen"_a, "points"_a, "triangles"_a, "coordinates"_a, "end"_a, "texels"_a, "count"_a,
-             "window"_a, "grid"_a,
-             "Return coverage (h, w), mean linear albedo (h, w, count, 3), and samples by triangle (end,).");
+  module.def(
+      "albedo", &albedo, "seen"_a, "points"_a, "triangles"_a, "coordinates"_a, "end"_a, "texels"_a, "count"_a,
+      "window"_a, "grid"_a,
+      "Return coverage (h, w), mean linear albedo (h, w, count, 3), samples by triangle (end,), the mean of all\n"
+      "(count, 3), and the area of the triangles, each seen alone [px].");
+  module.def("compose", &compose, "trace"_a, "albedos"_a, "overall"_a, "coverage"_a, "mean"_a, "window"_a,
+             "reflected"_a, "reflected_window"_a, "floor"_a, "reflectance"_a, "pictures"_a,
+             "Write pictures (count, h, w, 3) of a trace (h, w, 3), half floats given as uint16.");
+  module.def("tiled", &tiled, "picture"_a, "density"_a, "rays"_a, "position"_a, "height"_a, "size"_a, "subsamples"_a,
+             "Return the mean of a picture that repeats over a plane, (h, w); size is (width, height) [px].");
+  module.def("blurred", &blurred, "values"_a, "down"_a, "across"_a,
+             "Return values (h, w, k), blurred about each pixel by radii of its own (h, w) [px].");
+  module.def("normals", &normals, "points"_a, "triangles"_a, "Return the unit normals of vertices (V, 3).");
   module.def("decoded", &raster::decoded, "srgb"_a, "Decode sRGB in [0, 1] to linear light, within 2.2e-5.");
 }

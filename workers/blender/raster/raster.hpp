@@ -51,6 +51,8 @@ struct Albedo {
   std::vector<float> coverage;  // share of a pixel's samples, (height) x (width)
   std::vector<float> mean;      // linear, of the samples that see a triangle, height x width x count x 3; 0 elsewhere
   std::vector<std::int32_t> hits;  // samples that see each triangle before `end`
+  std::vector<float> overall;      // mean over the window, count x 3
+  double area;                     // of all triangles before `end`, each seen alone [pixels]
 };
 
 // Mean the textures over what is visible. A texture is looked up as Cycles does it: bilinear between texel centres in

@@ -24,7 +24,7 @@ from stickslip_blender.engine import CLOTH_SAMPLING, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR, Geometry, Set
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import Look, grained, look_of
-from stickslip_blender.multiplexed import encode
+from stickslip_blender.multiplexed import Sight, encode
 from stickslip_blender.preview import moving
 from stickslip_blender.raster import Textures
 from stickslip_blender.stage import ClothStage, Shot
@@ -125,36 +125,42 @@ class ClipRenderer:
         picture = grained(texture_image(GATE_TEXTURE), self.fabric)
         window = self.stage.window(shot)
         whole = np.zeros(light.shape, dtype=np.float16)
-        whole[window.slices] = self.stage.direct(shot, picture, Sampling(_GATE_SAMPLES, "fast", self.seed + 1), window)
+        whole[window.slices] = self.stage.direct(
+            shot, picture, Sampling(_GATE_SAMPLES, "guided", self.seed + 1), window
+        )
         direct = self._finished(whole, shot)[window.slices]
-        (composed,) = self._composed(light, shot, Textures([picture])).pictures
-        return block_decibels(composed[window.slices], direct)
+        composed = np.empty((1, *light.shape), dtype=np.uint8)
+        self._compose(light, shot, Textures([picture]), composed)
+        return block_decibels(composed[0][window.slices], direct)
 
     def clips(self, trace: Trace, textures: Sequence[Texture]) -> tuple[Clip, dict[str, Any]]:
         """Return the clips of textures (textures, frames, height, width, 3), and labels that they share."""
         pictures = [grained(texture_image(texture), self.fabric) for texture in textures]
         packed = Textures(pictures)
-        frames, in_frame, in_sight = [], [], []
-        for shot, light in zip(self.shots, trace.light, strict=True):
-            composed = self._composed(light, shot, packed)
-            in_frame.append(composed.frame_share)
-            in_sight.append(composed.visible_share)
-            frames.append(composed.pictures if trace.composed else np.stack(list(self._direct(shot, pictures))))
+        camera = self.camera
+        videos = np.empty((len(pictures), len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
+        sights = []
+        for number, (shot, light) in enumerate(zip(self.shots, trace.light, strict=True)):
+            sights.append(self._compose(light, shot, packed, videos[:, number]))
+            if not trace.composed:
+                videos[:, number] = list(self._direct(shot, pictures))
         labels = self.labels | {
-            "frame_share": float(np.mean(in_frame)),
-            "visible_share": float(np.mean(in_sight)),
+            "frame_share": float(np.mean([sight.frame_share for sight in sights])),
+            "visible_share": float(np.mean([sight.visible_share for sight in sights])),
             "gate_db": trace.gate_db,
             "composed": trace.composed,
         }
-        return np.stack(frames, axis=1), labels
+        return videos, labels
 
-    def _composed(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures) -> Any:
-        return self.stage.composer.compose(light, shot.points, self.camera, self.stage.substrate, self.floor, textures)
+    def _compose(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures, pictures: Clip) -> Sight:
+        return self.stage.composer.compose(
+            light, shot.points, self.camera, self.stage.substrate, self.floor, textures, pictures
+        )
 
     def _direct(self, shot: Shot, pictures: Sequence[Clip]) -> Iterator[Clip]:
         for picture in pictures:
             yield self._finished(
-                self.stage.direct(shot, picture, Sampling(self.sampling.window, "fast", self.seed)), shot
+                self.stage.direct(shot, picture, Sampling(self.sampling.window, "guided", self.seed)), shot
             )
 
     def _finished(self, light: npt.NDArray[np.float16], shot: Shot) -> Clip:

@@ -18,8 +18,11 @@ class Sampling:
 
     samples: int
     """Paths per pixel, the same for every pixel (no adaptive sampling)."""
-    denoiser: Literal["none", "fast"] = "none"
-    """`fast`: OpenImageDenoise, guided by albedo and normal without prefiltering."""
+    denoiser: Literal["none", "plain", "guided"] = "none"
+    """OpenImageDenoise, fast; `guided` by albedo and normal, for textures have edges.
+
+    Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even cloth is `plain`.
+    """
     seed: int = 0
     """Of the sampling noise, the same for every frame: what is left of it does not flicker, and clips compress."""
 
@@ -100,9 +103,9 @@ def set_sampling(scene: Any, sampling: Sampling) -> None:
     cycles.samples = sampling.samples
     cycles.seed = sampling.seed
     cycles.use_denoising = sampling.denoiser != "none"
-    if sampling.denoiser == "fast":
+    if sampling.denoiser != "none":
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.denoising_quality = "FAST"
         cycles.denoising_prefilter = "NONE"
-        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+        cycles.denoising_input_passes = "RGB" if sampling.denoiser == "plain" else "RGB_ALBEDO_NORMAL"
         cycles.denoising_use_gpu = False

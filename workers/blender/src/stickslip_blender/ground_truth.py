@@ -12,7 +12,7 @@ import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
 from stickslip_blender.geometry import FLOOR, Geometry
-from stickslip_blender.raster import Window, projected, see
+from stickslip_blender.raster import Window, _raster, projected, see
 
 BACKGROUND, GROUND, CLOTH, PROP = range(4)
 """Codes of the segmentation."""
@@ -44,7 +44,7 @@ def ground_truth(
     here = projected(camera, points)
     seen = see(here, geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
     moved = projected(camera, following)
-    normals = _vertex_normals(points, geometry.triangles) @ np.asarray(camera.rotation).T
+    normals = _raster.normals(points, geometry.triangles) @ np.asarray(camera.rotation).T
     values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, (moved - here)[:, :2], normals], axis=1))
     thing = seen.triangle >= 0
     cloth = thing & (seen.triangle < geometry.cloth_triangles)
@@ -63,15 +63,6 @@ def ground_truth(
         normals=normal.astype(np.float32),
         uv=np.where(cloth[..., None], values[..., 1:3], np.nan).astype(np.float32),
         flow=np.where(thing[..., None], values[..., 3:5], 0.0).astype(np.float32),
-    )
-
-
-def _vertex_normals(points: npt.NDArray[np.float64], triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    face = np.cross(b - a, c - a)
-    index = triangles.T.ravel()
-    return np.stack(
-        [np.bincount(index, weights=np.tile(face[:, x], 3), minlength=len(points)) for x in range(3)], axis=1
     )
 
 

@@ -44,6 +44,11 @@ class Window:
         """Index of the window in a frame (height, width, ...)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
+    @property
+    def place(self) -> tuple[int, int, int, int]:
+        """Left, top, width and height, as the compiled rasteriser takes them."""
+        return self.left, self.top, self.right - self.left, self.bottom - self.top
+
 
 class FrameReader:
     """Renders a scene into arrays. With a scratch folder given, frames go through a file there instead of memory."""

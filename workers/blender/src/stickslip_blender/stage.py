@@ -100,10 +100,10 @@ class ClothStage:
         """
         self._fabric.set_color(ALBEDOS)
         self._place(shot)
-        set_sampling(self._scene, Sampling(sampling.frame, "fast", seed))
+        set_sampling(self._scene, Sampling(sampling.frame, "plain", seed))
         light = self._reader.read_light()
         part = self.window(shot)
-        set_sampling(self._scene, Sampling(sampling.window, "fast", seed))
+        set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
         light[part.slices] = self._reader.read_light(part)
         return light
 

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
+from stickslip_blender.raster import _raster
+
 GRAIN_SIZE = 512
 """Side of the picture of a floor's grain [texels]."""
 GRAIN_EXTENT = 0.5
@@ -91,28 +93,14 @@ def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDA
 
     Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m].
     """
-    offsets = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
-    rows = (np.arange(camera.height)[:, None] + offsets).ravel()
-    columns = (np.arange(camera.width)[:, None] + offsets).ravel()
-    u, v = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.asarray(camera.rotation)
-    reach = (height - camera.position[2]) / np.minimum(rays[..., 2], -1e-3)
-    place = (camera.position[:2] + reach[..., None] * rays[..., :2]) / GRAIN_EXTENT * GRAIN_SIZE
-    marks = _marks(substrate)
-    texel = np.floor(place).astype(int)
-    share = place - texel
-
-    def at(down: int, right: int) -> npt.NDArray[np.float64]:
-        found: npt.NDArray[np.float64] = marks[
-            (texel[..., 1] + down) % GRAIN_SIZE, (texel[..., 0] + right) % GRAIN_SIZE
-        ]
-        return found
-
-    low = at(0, 0) + share[..., 0] * (at(0, 1) - at(0, 0))
-    high = at(1, 0) + share[..., 0] * (at(1, 1) - at(1, 0))
-    fine = low + share[..., 1] * (high - low)
-    factor = fine.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(axis=(1, 3))
-    tinted: npt.NDArray[np.float32] = (factor[..., None] * np.asarray(substrate.tint)).astype(np.float32)
+    inverse = np.array(  # of the camera's matrix: from a pixel (column, row, 1) to its ray, in the camera's axes
+        [[1 / camera.fx, 0, -camera.cx / camera.fx], [0, 1 / camera.fy, -camera.cy / camera.fy], [0, 0, 1]]
+    )
+    rays = np.ascontiguousarray(np.asarray(camera.rotation).T @ inverse)
+    density, place = GRAIN_SIZE / GRAIN_EXTENT, np.array(camera.position, dtype=np.float64)
+    size = camera.width, camera.height
+    factor = _raster.tiled(_marks(substrate), density, rays, place, height, size, _SUBSAMPLES)
+    tinted: npt.NDArray[np.float32] = factor[..., None] * np.asarray(substrate.tint, dtype=np.float32)
     return tinted
 
 
@@ -131,8 +119,9 @@ def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
 
 def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64]:
     """Return smooth noise of unit deviation that repeats; `extent` of its spots [texels]."""
-    frequency = np.fft.fftfreq(GRAIN_SIZE)
-    decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))
-    noise = np.fft.ifft2(np.fft.fft2(random.standard_normal((GRAIN_SIZE, GRAIN_SIZE))) * decay).real
+    down, along = np.fft.fftfreq(GRAIN_SIZE)[:, None], np.fft.rfftfreq(GRAIN_SIZE)
+    decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (down**2 + along**2))
+    spectrum = np.fft.rfft2(random.standard_normal((GRAIN_SIZE, GRAIN_SIZE)))
+    noise = np.fft.irfft2(spectrum * decay, (GRAIN_SIZE, GRAIN_SIZE))
     spots: npt.NDArray[np.float64] = noise / noise.std()
     return spots

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from stickslip_blender.raster import _raster
 from stickslip_blender.subdivision import Subdivision, subdivide
 
 FINE_VERTICES = 6000
@@ -67,7 +68,7 @@ class Surface:
         sheet = np.asarray(positions, dtype=np.float64)
         for level in self._levels:
             sheet = level(sheet)
-        normals = self._normals(sheet)
+        normals = _raster.normals(sheet, self._sheet)
         if self._height is not None:
             lifted = sheet + self._height[:, None] * normals
             lifted[:, 2] = np.maximum(lifted[:, 2], np.minimum(sheet[:, 2], 0.0))  # not into the floor
@@ -75,16 +76,6 @@ class Surface:
         middle = np.einsum("hk,hkx->hx", self._weights, sheet[self._corners])
         upward = np.einsum("hk,hkx->hx", self._weights, normals[self._corners])
         return np.concatenate([sheet, middle + self._hem * upward])
-
-    def _normals(self, sheet: Array) -> Array:
-        a, b, c = (sheet[self._sheet[:, k]] for k in range(3))
-        face = np.cross(b - a, c - a)
-        index = self._sheet.T.ravel()
-        summed = np.stack(
-            [np.bincount(index, weights=np.tile(face[:, x], 3), minlength=self._count) for x in range(3)], axis=1
-        )
-        normals: Array = summed / np.linalg.norm(summed, axis=1, keepdims=True)
-        return normals
 
 
 def _creases(uv: Array, seed: int) -> Array:

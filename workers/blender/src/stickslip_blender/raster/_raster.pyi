@@ -20,5 +20,31 @@ def albedo(
     count: int,
     window: _Part,
     grid: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]: ...
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.float32], float]: ...
+def compose(
+    trace: NDArray[np.uint16],
+    albedos: tuple[float, float],
+    overall: NDArray[np.float32],
+    coverage: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    window: _Part,
+    reflected: NDArray[np.float32],
+    reflected_window: _Part,
+    floor: NDArray[np.float32],
+    reflectance: float,
+    pictures: NDArray[np.uint8],
+) -> None: ...
+def tiled(
+    picture: NDArray[np.float64],
+    density: float,
+    rays: NDArray[np.float64],
+    position: NDArray[np.float64],
+    height: float,
+    size: tuple[int, int],
+    subsamples: int,
+) -> NDArray[np.float32]: ...
+def blurred(
+    values: NDArray[np.float32], down: NDArray[np.float32], across: NDArray[np.float32]
+) -> NDArray[np.float32]: ...
+def normals(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]: ...
 def decoded(srgb: float) -> float: ...

@@ -39,14 +39,24 @@ class Albedo:
     """Linear albedo of what is seen of the cloth, 0 where nothing is; shape (height, width, textures, 3)."""
     hits: npt.NDArray[np.int32]
     """Samples that see each of the cloth's triangles."""
+    overall: npt.NDArray[np.float32]
+    """Mean albedo of all that is seen of the cloth, shape (textures, 3)."""
+    area: float
+    """Of the cloth's triangles, each seen alone [pixels]."""
 
 
 def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
     """Mean textures over what is seen of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
-    window = seen.window
-    part = (window.left, window.top, window.right - window.left, window.bottom - window.top)
     return Albedo(
         *_raster.albedo(
-            seen.triangle, seen.points, seen.triangles, uv, cloth, textures.texels, textures.count, part, seen.grid
+            seen.triangle,
+            seen.points,
+            seen.triangles,
+            uv,
+            cloth,
+            textures.texels,
+            textures.count,
+            seen.window.place,
+            seen.grid,
         )
     )

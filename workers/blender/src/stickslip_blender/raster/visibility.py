@@ -89,5 +89,4 @@ def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
 
 def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
     """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window."""
-    part = (window.left, window.top, window.right - window.left, window.bottom - window.top)
-    return Seen(points, triangles, window, grid, _raster.visible(points, triangles, part, grid))
+    return Seen(points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid))

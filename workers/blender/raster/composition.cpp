@@ -1,0 +1,216 @@
+#include "composition.hpp"
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cmath>
+
+#include "kernel.hpp"
+
+namespace raster {
+
+namespace {
+
+constexpr int levels = 65536;  // of the table that encodes linear light
+
+// Linear light as 8-bit sRGB [IEC 61966-2-1].
+const std::vector<std::uint8_t>& encoding() {
+  static const std::vector<std::uint8_t> table = [] {
+    std::vector<std::uint8_t> codes(levels);
+    for (int k = 0; k < levels; ++k) {
+      const double light = k / (levels - 1.0);
+      const double srgb = light <= 0.0031308 ? 12.92 * light : 1.055 * std::pow(light, 1.0 / 2.4) - 0.055;
+      codes[k] = static_cast<std::uint8_t>(std::lrint(255.0 * srgb));
+    }
+    return codes;
+  }();
+  return table;
+}
+
+// A half float that is not NaN; infinity is 65536.
+float single(std::uint16_t half) {
+  const float magnitude = std::bit_cast<float>(static_cast<std::uint32_t>(half & 0x7fff) << 13) * 0x1p112f;
+  return half & 0x8000 ? -magnitude : magnitude;
+}
+
+// Write to `codes` where the table has (once + twice * other) * albedo + gloss, times the factor.
+RASTER_KERNEL void add_up(float gloss, float once, float twice, const float* __restrict albedo,
+                          const float* __restrict other, const float* __restrict factor, std::int32_t* __restrict codes,
+                          int count) {
+  for (int k = 0; k < count; ++k) {
+    const float light = (gloss + (once + twice * other[k]) * albedo[k]) * factor[k];
+    const float bounded = light > 0.0f ? (light < 1.0f ? light : 1.0f) : 0.0f;
+    codes[k] = static_cast<std::int32_t>(bounded * (levels - 1.0f) + 0.5f);
+  }
+}
+
+// Where in a part of the frame a pixel is, or -1.
+std::ptrdiff_t index_in(const Window& window, int column, int row) {
+  const int x = column - window.left, y = row - window.top;
+  if (x < 0 || y < 0 || x >= window.width || y >= window.height) return -1;
+  return static_cast<std::ptrdiff_t>(y) * window.width + x;
+}
+
+}  // namespace
+
+void compose(const Trace& trace, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
+             const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
+             std::size_t stride) {
+  const std::vector<std::uint8_t>& table = encoding();
+  const int colors = static_cast<int>(overall.size());
+  std::vector<float> albedo(colors), factor(colors);
+  std::vector<std::int32_t> codes(colors);
+  for (int row = 0; row < trace.height; ++row) {
+    for (int column = 0; column < trace.width; ++column) {
+      const std::size_t pixel = static_cast<std::size_t>(row) * trace.width + column;
+      const std::uint16_t* const light = trace.light.data() + 3 * pixel;
+      const float gloss = single(light[0]);
+      const float to_first = (single(light[1]) - gloss) / trace.first;
+      const float to_second = (single(light[2]) - gloss) / trace.second;
+      const float twice = (to_second - to_first) / (trace.second - trace.first);
+      const float once = to_first - trace.first * twice;
+
+      const std::ptrdiff_t there = index_in(reflected.window, column, row);
+      if (there < 0)
+        std::copy(overall.begin(), overall.end(), albedo.begin());
+      else
+        std::copy_n(reflected.albedo.begin() + there * colors, colors, albedo.begin());
+      float cover = 0.0f;
+      if (const std::ptrdiff_t here = index_in(cloth.window, column, row); here >= 0) {
+        cover = coverage[here];
+        if (cover > 0.0f) {
+          const float share = cover / (cover + (1.0f - cover) * reflectance);
+          const float* const seen = cloth.albedo.data() + here * colors;
+          for (int k = 0; k < colors; ++k) albedo[k] += share * (seen[k] - albedo[k]);
+        }
+      }
+      for (int k = 0; k < colors; ++k) factor[k] = 1.0f + (1.0f - cover) * (floor[3 * pixel + k % 3] - 1.0f);
+      add_up(gloss, once, twice, albedo.data(), overall.data(), factor.data(), codes.data(), colors);
+      std::uint8_t* out = pictures + 3 * pixel;
+      for (int k = 0; k < colors; k += 3, out += stride) {
+        out[0] = table[codes[k]];
+        out[1] = table[codes[k + 1]];
+        out[2] = table[codes[k + 2]];
+      }
+    }
+  }
+}
+
+std::vector<float> tiled(std::span<const double> picture, int size, double density, std::span<const double> rays,
+                         std::span<const double> position, double height, int columns, int rows, int subsamples) {
+  std::vector<float> result(static_cast<std::size_t>(columns) * rows);
+  const auto wrapped = [size](int k) { return (k % size + size) % size; };
+  for (int row = 0; row < rows; ++row) {
+    for (int column = 0; column < columns; ++column) {
+      double total = 0.0;
+      for (int sample = 0; sample < subsamples * subsamples; ++sample) {
+        const double u = column + (sample % subsamples + 0.5) / subsamples - 0.5;
+        const double v = row + (sample / subsamples + 0.5) / subsamples - 0.5;
+        std::array<double, 3> ray;
+        for (int k = 0; k < 3; ++k) ray[k] = rays[3 * k] * u + rays[3 * k + 1] * v + rays[3 * k + 2];
+        const double reach = (height - position[2]) / std::min(ray[2], -1e-3);
+        const double x = (position[0] + reach * ray[0]) * density, y = (position[1] + reach * ray[1]) * density;
+        const double left = std::floor(x), top = std::floor(y), along = x - left, down = y - top;
+        const int i0 = wrapped(static_cast<int>(left)), i1 = wrapped(static_cast<int>(left) + 1);
+        const double* const low = picture.data() + static_cast<std::size_t>(wrapped(static_cast<int>(top))) * size;
+        const double* const high = picture.data() + static_cast<std::size_t>(wrapped(static_cast<int>(top) + 1)) * size;
+        const double lower = low[i0] + along * (low[i1] - low[i0]), upper = high[i0] + along * (high[i1] - high[i0]);
+        total += lower + down * (upper - lower);
+      }
+      result[static_cast<std::size_t>(row) * columns + column] = static_cast<float>(total / (subsamples * subsamples));
+    }
+  }
+  return result;
+}
+
+namespace {
+
+// A line of a table that lies between two of its own: (1 - share) table[low] + share table[low + 1].
+struct Between {
+  std::size_t low;
+  double share;
+};
+
+Between between(double place, int count) {
+  const double inside = std::min(std::max(place, 0.0), static_cast<double>(count));
+  const int low = std::min(static_cast<int>(inside), count - 1);
+  return {static_cast<std::size_t>(low), inside - low};
+}
+
+// Add `sign` times the table, taken between its lines and columns, to `sums`.
+RASTER_KERNEL void add_corner(const double* __restrict table, std::size_t row_step, int count, Between row,
+                              Between column, double sign, double* __restrict sums) {
+  const double* const __restrict at = table + row.low * row_step + column.low * count;
+  const double* const __restrict below = at + row_step;
+  const double d = sign * row.share, c = column.share;
+  const double w00 = (sign - d) * (1.0 - c), w01 = (sign - d) * c, w10 = d * (1.0 - c), w11 = d * c;
+  for (int k = 0; k < count; ++k)
+    sums[k] += w00 * at[k] + w01 * at[k + count] + w10 * below[k] + w11 * below[k + count];
+}
+
+}  // namespace
+
+std::vector<float> blurred(std::span<const float> values, std::span<const float> down, std::span<const float> across,
+                           int width, int height, int count) {
+  const std::size_t row_step = static_cast<std::size_t>(width + 1) * count;
+  std::vector<double> table(row_step * (height + 1), 0.0), sums(count);
+  std::vector<float> result(values.begin(), values.end());
+  for (int pass = 0; pass < 2; ++pass) {
+    for (int row = 0; row < height; ++row) {
+      std::fill(sums.begin(), sums.end(), 0.0);
+      const float* from = result.data() + static_cast<std::size_t>(row) * width * count;
+      const double* above = table.data() + row * row_step + count;
+      double* here = table.data() + (row + 1) * row_step + count;
+      for (int column = 0; column < width; ++column, from += count, above += count, here += count) {
+        for (int k = 0; k < count; ++k) {
+          sums[k] += from[k];
+          here[k] = above[k] + sums[k];
+        }
+      }
+    }
+    for (int row = 0; row < height; ++row) {
+      for (int column = 0; column < width; ++column) {
+        const std::size_t pixel = static_cast<std::size_t>(row) * width + column;
+        const double half_down = std::sqrt(0.25 + down[pixel] * down[pixel]);
+        const double half_across = std::sqrt(0.25 + across[pixel] * across[pixel]);
+        const Between top = between(row + 0.5 - half_down, height), bottom = between(row + 0.5 + half_down, height);
+        const Between left = between(column + 0.5 - half_across, width),
+                      right = between(column + 0.5 + half_across, width);
+        std::fill(sums.begin(), sums.end(), 0.0);
+        add_corner(table.data(), row_step, count, bottom, right, 1.0, sums.data());
+        add_corner(table.data(), row_step, count, top, right, -1.0, sums.data());
+        add_corner(table.data(), row_step, count, bottom, left, -1.0, sums.data());
+        add_corner(table.data(), row_step, count, top, left, 1.0, sums.data());
+        const double area = 4.0 * half_down * half_across;
+        for (int k = 0; k < count; ++k) result[pixel * count + k] = static_cast<float>(sums[k] / area);
+      }
+    }
+  }
+  return result;
+}
+
+std::vector<double> normals(std::span<const double> points, std::span<const Triangle> triangles) {
+  std::vector<double> sums(points.size(), 0.0);
+  for (const Triangle& triangle : triangles) {
+    const double *const a = points.data() + 3 * triangle.a, *const b = points.data() + 3 * triangle.b,
+                        *const c = points.data() + 3 * triangle.c;
+    std::array<double, 3> p, q;
+    for (int k = 0; k < 3; ++k) {
+      p[k] = b[k] - a[k];
+      q[k] = c[k] - a[k];
+    }
+    for (int k = 0; k < 3; ++k) {
+      const int i = (k + 1) % 3, j = (k + 2) % 3;
+      const double part = p[i] * q[j] - p[j] * q[i];
+      for (const std::int32_t vertex : {triangle.a, triangle.b, triangle.c}) sums[3 * vertex + k] += part;
+    }
+  }
+  for (std::size_t n = 0; n < sums.size(); n += 3) {
+    const double length = std::sqrt(sums[n] * sums[n] + sums[n + 1] * sums[n + 1] + sums[n + 2] * sums[n + 2]);
+    if (length > 0.0)
+      for (int k = 0; k < 3; ++k) sums[n + k] /= length;
+  }
+  return sums;
+}
+
+}  // namespace raster

@@ -1,0 +1,53 @@
+// Pictures of many textures from one trace, and what geometry adds to a frame. stickslip_blender.multiplexed has the
+// formula.
+#pragma once
+
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "raster.hpp"
+
+namespace raster {
+
+// The light of a frame, for three albedos of the cloth.
+struct Trace {
+  std::span<const std::uint16_t> light;  // half floats, height x width x 3
+  int width, height;
+  float first, second;  // the second and third albedo; the first is 0
+};
+
+// Albedos in a part of the frame, height x width x colours; texture n has the colours 3 n to 3 n + 2.
+struct Part {
+  Window window;
+  std::span<const float> albedo;
+};
+
+// Write pictures of colours / 3 textures, height x width x 3 each and `stride` bytes apart, 8-bit sRGB.
+//
+// `coverage` is the share of the pixels of the cloth's window that see cloth. `overall` is the albedo (colours) of
+// light that met the cloth elsewhere; `reflected` what the floor shows of the cloth in its window, instead of it.
+// `floor` (height x width x 3) is a factor of the floor's light, and `reflectance` how bright the floor is beside the
+// cloth, where both are in a pixel.
+void compose(const Trace& trace, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
+             const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
+             std::size_t stride);
+
+// Return the mean of a picture that repeats over the plane z = height, seen through pixels (height x width) of a
+// camera.
+//
+// A pixel (column, row, 1) looks along `rays` (3 x 3, row by row) from `position`. The picture has size x size texels,
+// `density` of them to a unit of length; each pixel is the mean of subsamples^2 places.
+std::vector<float> tiled(std::span<const double> picture, int size, double density, std::span<const double> rays,
+                         std::span<const double> position, double height, int columns, int rows, int subsamples);
+
+// Return values (height x width x count), blurred about each pixel by radii of its own, in rows `down` and in columns
+// `across` [px], not necessarily whole: twice the mean over a box, from a summed-area table [Crow 1984]. A side of a
+// box is sqrt(1 + 4 radius^2): its variance is that of a pixel and radius^2 / 3. There are zeros around the values.
+std::vector<float> blurred(std::span<const float> values, std::span<const float> down, std::span<const float> across,
+                           int width, int height, int count);
+
+// Return the normals of vertices, of length 1: sums of the normals of their triangles, weighted by area.
+std::vector<double> normals(std::span<const double> points, std::span<const Triangle> triangles);
+
+}  // namespace raster
