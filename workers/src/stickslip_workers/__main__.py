@@ -1,18 +1,25 @@
 """Command line: `python -m stickslip_workers dispatch | replay | certify | describe`."""
 
 import argparse
+import ctypes
 import json
 import logging
 import os
 import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 from pydantic import ValidationError
 from stickslip_schemas.tasks import task_adapter
 
+from stickslip_workers.backoff import Backoff
 from stickslip_workers.coordinator_client import CoordinatorError
 from stickslip_workers.settings import Settings, default_blender_python
+
+STEADY_SECONDS = 60.0
+"""A dispatcher that has run for so long starts again without a wait that has grown [s]."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
     dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
     dispatch.add_argument("--ray-address", help="an existing Ray cluster (default: a cluster of its own)")
+    dispatch.add_argument("--once", action="store_true", help="end when the cluster at --ray-address is gone")
     dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
 
     replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator")
@@ -46,6 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
     commands.add_parser("describe", help="print the builds of this environment")
 
     options = parser.parse_args(arguments)
+    if options.command == "dispatch" and options.ray_address is not None and not options.once:
+        command = [sys.executable, "-m", "stickslip_workers", *(sys.argv[1:] if arguments is None else arguments)]
+        return run_for_ever([*command, "--once"], Backoff(first=1.0, most=30.0))
     if options.command == "dispatch":
         return _dispatch(options)
     if options.command == "replay":
@@ -102,6 +113,45 @@ def _dispatch(options: argparse.Namespace) -> int:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
     return 0
+
+
+def run_for_ever(command: list[str], backoff: Backoff) -> int:
+    """Run a dispatcher on somebody else's cluster, again where it fails; return its status when it was stopped.
+
+    A driver of Ray may die with its cluster, whatever it does, and cannot connect to another one.
+    """
+    stopped: list[int] = []
+    child: subprocess.Popen[bytes] | None = None
+
+    def stop(number: int, _frame: object) -> None:
+        stopped.append(number)
+        if child is not None:
+            child.send_signal(number)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+    while True:
+        began = time.monotonic()
+        # In a group of its own: what Ctrl-C sends is passed on once, and not also sent to it.
+        child = subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
+        status = child.wait()
+        if stopped or status in (0, 2):  # 2: what it was told makes no sense
+            return status
+        if time.monotonic() - began > STEADY_SECONDS:
+            backoff.succeeded()
+        backoff.failed()
+        wait = max(backoff.next_try - time.monotonic(), 0.0)
+        sys.stderr.write(f"the dispatcher ended with status {status}; it starts again in {wait:.1f} s\n")
+        deadline = time.monotonic() + wait
+        while not stopped and time.monotonic() < deadline:
+            time.sleep(0.1)
+        if stopped:
+            return 128 + stopped[0]
+
+
+def _die_with_parent() -> None:
+    """Let the kernel end this process when its parent dies, however it dies [prctl(2)]."""
+    ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM)
 
 
 def _replay(options: argparse.Namespace) -> int:

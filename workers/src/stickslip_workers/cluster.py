@@ -15,13 +15,15 @@ import os
 import secrets
 import shutil
 import signal
+import socket
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from stickslip_schemas.keys import sha256
 
@@ -36,6 +38,12 @@ OWNER = "STICKSLIP_RAY_OWNER"
 
 WATCH_SECONDS = 0.5
 """Time between two looks at the processes of a cluster of our own [s]."""
+
+ASK_SECONDS = 2.0
+"""Time between two questions to the GCS of a cluster that was there already [s]."""
+
+FAILED_ASKS = 3
+"""So many of them in a row without an answer, and the cluster counts as lost."""
 
 LAST_SECONDS = 5.0
 """How long the dispatcher may still report what it has after its cluster was lost [s]."""
@@ -58,7 +66,7 @@ class Cluster:
 
     cpus: int
     lost: str = ""
-    """Which process of it is gone; empty while all are there. Known only of a cluster of our own."""
+    """What of it is gone; empty while all is there."""
     closing: bool = False
     """Whether its processes are being ended on purpose."""
 
@@ -91,13 +99,20 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
 
     import ray  # after the environment is set
 
-    ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
+    try:
+        ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
+    except ConnectionError as error:
+        raise ClusterLostError(f"no Ray cluster answers at {address}: {error}") from error
     cluster = Cluster(int(ray.cluster_resources().get("CPU", 0)))
     if address is None:
         for pid in _processes(_UNNEEDED):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGTERM)
-        threading.Thread(target=_watch, args=(cluster, _processes(_ESSENTIAL)), name="watch", daemon=True).start()
+        watch: Callable[[Cluster, Any], None] = _watch
+        watched: Any = _processes(_ESSENTIAL)
+    else:
+        watch, watched = _ask, ray.get_runtime_context().gcs_address
+    threading.Thread(target=watch, args=(cluster, watched), name="watch", daemon=True).start()
     try:
         yield cluster
     finally:
@@ -111,10 +126,29 @@ def _watch(cluster: Cluster, processes: dict[int, str]) -> None:
     """Wait until a process of the cluster is gone, and see that this one ends soon after."""
     while not (gone := [name for pid, name in processes.items() if _parent_of(pid) is None]):
         time.sleep(WATCH_SECONDS)
-    if cluster.closing:
-        return
-    cluster.lost = gone[0]
-    log.error("%s is gone: this dispatcher ends, and a new one starts with a cluster of its own", gone[0])
+    if not cluster.closing:
+        _lose(cluster, gone[0])
+
+
+def _ask(cluster: Cluster, gcs: str) -> None:
+    """Wait until the GCS at an address does not answer any more, and see that this process ends soon after."""
+    host, _, port = gcs.rpartition(":")
+    failed = 0
+    while failed < FAILED_ASKS:
+        time.sleep(ASK_SECONDS)
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), ASK_SECONDS).close()
+            failed = 0
+        except OSError:
+            failed += 1
+        if cluster.closing:
+            return
+    _lose(cluster, f"the Ray cluster at {gcs}")
+
+
+def _lose(cluster: Cluster, what: str) -> None:
+    cluster.lost = what
+    log.error("%s is gone: this dispatcher ends, and another one starts as soon as there is a cluster", what)
     time.sleep(LAST_SECONDS)
     _end()
 

@@ -162,10 +162,16 @@ def release_jobs(book: Ledger) -> None:
         resume_job(book, job_id)
 
 
+_HELD_JOBS = Prepared(
+    select(jobs.c.id)
+    .where(jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable)
+    .order_by(jobs.c.seq)
+)
+
+
 def held_jobs(connection: Connection) -> list[str]:
     """Return the jobs that wait for the store."""
-    waiting = jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable
-    return list(connection.scalars(select(jobs.c.id).where(*waiting).order_by(jobs.c.seq)))
+    return [job_id for (job_id,) in _HELD_JOBS.tuples(connection)]
 
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:

@@ -17,6 +17,7 @@ from stickslip_schemas.states import JobState, Stage, TaskState
 
 from stickslip_services.catalog.versions import find_committed
 from stickslip_services.database.database import batches, insert_rows
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import LIVE, Ending, Ledger, live_jobs
@@ -57,22 +58,24 @@ def make_again(book: Ledger, consumer: int, digests: Collection[Sha256]) -> int:
     return len(makers)
 
 
+_MADE_JOBS = Prepared(
+    select(
+        jobs.c.seq,
+        jobs.c.publish_task,
+        dataset_versions.c.manifest,
+        dataset_versions.c.group_digest,
+        dataset_versions.c.bytes,
+    )
+    .join(tasks, tasks.c.seq == jobs.c.publish_task)
+    .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)
+    .where(jobs.c.state.in_(LIVE), tasks.c.state == TaskState.succeeded)
+    .order_by(jobs.c.seq)
+)
+
+
 def made_jobs(connection: Connection) -> list[MadeJob]:
     """Return the live jobs whose dataset was made before they came; its files have to be checked."""
-    rows = connection.execute(
-        select(
-            jobs.c.seq,
-            jobs.c.publish_task,
-            dataset_versions.c.manifest,
-            dataset_versions.c.group_digest,
-            dataset_versions.c.bytes,
-        )
-        .join(tasks, tasks.c.seq == jobs.c.publish_task)
-        .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)
-        .where(jobs.c.state.in_(LIVE), tasks.c.state == TaskState.succeeded)
-        .order_by(jobs.c.seq)
-    )
-    return [MadeJob(*row) for row in rows]
+    return [MadeJob(*row) for row in _MADE_JOBS.tuples(connection)]
 
 
 def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:

@@ -4,24 +4,26 @@ from sqlalchemy import Connection, select
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import JobState, Reason
 
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.workers import RegisteredWorker, present_workers, stage_builds
 from stickslip_services.settings import Settings
 
+_PLANNED = Prepared(
+    select(jobs.c.seq, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
+        jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None)
+    )
+)
+
 
 def find_stranded(connection: Connection, now: float, settings: Settings) -> dict[int, str]:
     """Return, by job, the message that a planned live job should bear now; empty where it is being served."""
     seen_since = now - settings.lease_seconds
     alive = present_workers(connection, seen_since=seen_since)
-    rows = connection.execute(
-        select(jobs.c.seq, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
-            jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None)
-        )
-    )
     found = {}
-    for row in rows:
+    for row in _PLANNED.rows(connection):
         message = _stranded_message(row.kind, Builds.model_validate_json(row.builds), alive)
         if message != row.message and (message or row.reason == Reason.waiting_for_worker):
             found[row.seq] = message

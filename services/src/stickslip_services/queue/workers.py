@@ -86,12 +86,17 @@ def find_worker(connection: Connection, worker_id: str) -> RegisteredWorker:
     return _worker(rows[0])
 
 
+_PRESENT_WORKERS = Prepared(
+    select(workers)
+    .where(~workers.c.superseded, workers.c.last_seen_at >= bindparam("b_since"))
+    .order_by(workers.c.seq.desc())
+)
+
+
 def present_workers(connection: Connection, *, seen_since: float | None = None) -> list[RegisteredWorker]:
     """Return the newest session of every name, newest first; with `seen_since`, those heard of since then."""
-    query = select(workers).where(~workers.c.superseded).order_by(workers.c.seq.desc())
-    if seen_since is not None:
-        query = query.where(workers.c.last_seen_at >= seen_since)
-    return [_worker(row) for row in connection.execute(query)]
+    since = float("-inf") if seen_since is None else seen_since
+    return [_worker(row) for row in _PRESENT_WORKERS.rows(connection, {"b_since": since})]
 
 
 def builds_for(connection: Connection, kind: str) -> Builds | None:
