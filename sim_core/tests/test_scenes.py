@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric
+from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric, fabric_names
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes import cloth_drag as scenes
@@ -117,6 +117,14 @@ class TestDropAndDrag:
         ]
         assert (starts[0] == starts[1]).all()
         assert (starts[0] == starts[2]).all()
+
+    def test_every_fabric_comes_to_rest(self) -> None:
+        """Also one that stiffens so fast that its steps swing about the shape at rest."""
+        mesh = meshes.grid(scenes.SIDE, scenes.SIDE, 20, 20)
+        for name in fabric_names():
+            hung = scenes.hang(mesh, fabric(name), seed=0)
+            assert hung.reason == "", name
+            assert hung.softest > 0.0, name
 
     def test_hung_shape_that_does_not_settle_is_not_valid(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(scenes, "HANGING_STEPS_MAX", 2)

@@ -69,10 +69,17 @@ HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
 """The bias is this many times as large at first: the cloth then has one shape, which is followed as the bias falls."""
 
 SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
-"""Steps for each of these, of 50 ms, and their damping [1/s]."""
+"""Steps for each of these, and their damping [1/s]."""
 
-LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 200
+FIRST_STEP, GROWTH = 0.002, 1.3
+"""The flat cloth buckles when it is let go: the first step [s], and by how much the next ones grow, up to 50 ms."""
+
+LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
 """Steps then grow to this length [s], until no vertex moves further than this in one [m]; and how many there may be."""
+
+SHORTENED = 0.1
+"""Part of each step that is taken once a step is longer than half of the one before. A step has the stiffness that the
+cloth had at the step's start, so a fabric that stiffens fast would swing about its shape at rest for ever."""
 
 FRAMES = 300
 """Frames of a whole drop-and-drag."""
@@ -181,16 +188,22 @@ def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = N
     twist = float(rng.uniform(-0.3, 0.3))
     tilt = Tilt(side, bias, side * bias * (1.0 + twist * mesh.rest[:, 0] / (SIDE / 2)))
     cloth.set_state(flat)
+    dt = FIRST_STEP
     for times in HANGING_TILTS:
         cloth.gravity[:, 0] = times * tilt.of_vertices * GRAVITY
         for _ in range(SETTLING_STEPS):
-            cloth.step(HANGING.time_step, held=flat[held], damping=SETTLING_DAMPING)
-    dt, moved, steps = HANGING.time_step, np.inf, 0
+            cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
+            dt = min(GROWTH * dt, HANGING.time_step)
+    moved, steps, share = np.inf, 0, 1.0
     while (dt < LONGEST or moved > AT_REST) and steps < HANGING_STEPS_MAX:
-        before = cloth.positions
+        before, moved_before = cloth.positions, moved
         dt = min(1.5 * dt, LONGEST)
         cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
         moved, steps = float(np.abs(cloth.positions - before).max()), steps + 1
+        if dt == LONGEST and moved > 0.5 * moved_before:
+            share = SHORTENED
+        if share < 1.0 and moved > AT_REST:
+            cloth.set_state(before + share * (cloth.positions - before))
     softest = cloth.softest()
     reason = ""
     if not moved <= AT_REST:

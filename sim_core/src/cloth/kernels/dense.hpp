@@ -13,8 +13,10 @@ inline int padded(int rows) { return (rows + front_padding - 1) / front_padding 
 template <int vectors, int columns, bool set>
 inline void multiply_tile(const float* a, const float* b, long ld, int depth, float* c, long ldc) {
   Floats sum[vectors][columns];
-  for (int v = 0; v < vectors; ++v) {
-    for (int j = 0; j < columns; ++j) sum[v][j] = Floats{};
+#pragma GCC unroll 8
+  for (int j = 0; j < columns; ++j) {
+#pragma GCC unroll 4
+    for (int v = 0; v < vectors; ++v) sum[v][j] = Floats{};
   }
   for (int p = 0; p < depth; ++p) {
     Floats left[vectors];
@@ -27,7 +29,9 @@ inline void multiply_tile(const float* a, const float* b, long ld, int depth, fl
       for (int v = 0; v < vectors; ++v) sum[v][j] += left[v] * right;
     }
   }
+#pragma GCC unroll 8
   for (int j = 0; j < columns; ++j) {
+#pragma GCC unroll 4
     for (int v = 0; v < vectors; ++v) {
       Floats* out = reinterpret_cast<Floats*>(c + j * ldc + CLOTH_FLOATS * v);
       *out = set ? -sum[v][j] : *out - sum[v][j];

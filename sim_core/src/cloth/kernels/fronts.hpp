@@ -23,31 +23,44 @@ struct FrontSize {
   long place(int node) const { return node < pivots ? 3L * node : pivot_rows + 3L * (node - pivots); }
 };
 
+// Reads and writes whole vectors: what lies behind `count` is read, and written as it was.
 inline void add_floats(const float* from, float* to, int count) {
   int i = 0;
   for (; i + CLOTH_FLOATS <= count; i += CLOTH_FLOATS) {
     *reinterpret_cast<Floats*>(to + i) += *reinterpret_cast<const Floats*>(from + i);
   }
-  for (; i < count; ++i) to[i] += from[i];
+  if (i == count) return;
+  const Integers inside = lane_numbers() < count - i;
+  *reinterpret_cast<Floats*>(to + i) += Floats(Integers(*reinterpret_cast<const Floats*>(from + i)) & inside);
+}
+
+inline void copy_rows(const float* from, float* to) {
+  for (int v = 0; v < tile_rows; v += CLOTH_FLOATS) {
+    *reinterpret_cast<Floats*>(to + v) = *reinterpret_cast<const Floats*>(from + v);
+  }
 }
 
 // Writes the tiles of a block of columns that is done, and returns where they end.
 inline float* keep_tiles(const Factor& factor, const FrontSize& size, int j, int width, float* tile) {
-  const int end = size.columns + 3 * size.rows, first = j + width, own = size.columns - first;
+  const int first = j + width, own = size.columns - first, end = own + 3 * size.rows;
   __builtin_memset(tile, 0, sizeof(float) * width * tile_rows);
   invert_triangle(factor.panel + j * size.ld + j, size.ld, width, tile);
   tile += width * tile_rows;
-  float* rows = factor.local;
-  for (int q = 0; q < width; ++q) {
-    const float* column = factor.panel + (j + q) * size.ld;
-    __builtin_memcpy(rows, column + first, sizeof(float) * own);
-    __builtin_memcpy(rows + own, column + size.pivot_rows, sizeof(float) * 3 * size.rows);
-    __builtin_memset(rows + end - first, 0, sizeof(float) * tile_rows);
-    for (int i = 0; i < end - first; i += tile_rows) {
-      __builtin_memcpy(tile + i * width + q * tile_rows, rows + i, sizeof(float) * tile_rows);
+  // Pivot rows and other rows lie apart in the panel.
+  const float *upper = factor.panel + j * size.ld + first, *lower = factor.panel + j * size.ld + size.pivot_rows - own;
+  for (int i = 0; i < end; i += tile_rows) {
+    if (i + tile_rows <= own || (i >= own && i + tile_rows <= end)) {
+      const float* from = (i < own ? upper : lower) + i;
+      for (int q = 0; q < width; ++q, from += size.ld, tile += tile_rows) copy_rows(from, tile);
+      continue;
+    }
+    for (int q = 0; q < width; ++q, tile += tile_rows) {
+      for (int r = 0; r < tile_rows; ++r) {
+        tile[r] = i + r < own ? upper[q * size.ld + i + r] : i + r < end ? lower[q * size.ld + i + r] : 0.0f;
+      }
     }
   }
-  return tile + tile_floats(width, end - first) - width * tile_rows;
+  return tile;
 }
 
 // Adds what waits of a child to those columns of its parent that are pivots, or to the others; column j of the parent

@@ -7,6 +7,7 @@ namespace sim_core {
 namespace {
 
 typedef float Floats __attribute__((vector_size(4 * CLOTH_FLOATS), aligned(4), may_alias));
+typedef int Integers __attribute__((vector_size(4 * CLOTH_FLOATS), aligned(4), may_alias));
 typedef float Node __attribute__((vector_size(16), aligned(16), may_alias));
 typedef double NodeD __attribute__((vector_size(32), aligned(32), may_alias));
 typedef double Lane __attribute__((vector_size(8 * membrane_lanes), aligned(64), may_alias));
@@ -20,6 +21,12 @@ struct FlushTiny {
   ~FlushTiny() { __builtin_ia32_ldmxcsr(before); }
 #endif
 };
+
+inline Integers lane_numbers() {
+  Integers lanes;
+  for (int l = 0; l < CLOTH_FLOATS; ++l) lanes[l] = l;
+  return lanes;
+}
 
 inline Node spread(float s) { return Node{s, s, s, s}; }
 inline NodeD spread(double s) { return NodeD{s, s, s, s}; }
