@@ -31,6 +31,7 @@ def test_only_the_texture_may_differ() -> None:
     same = trace_of(clip("dots"))
     assert trace_of(clip("plaid", preview=True)) == same
     others = [clip("dots", light_seed=2), clip("dots", viewpoint="right"), clip("dots", creases=0.5)]
+    others.append(clip("dots", ground_truth=("depth",)))
     others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
     assert same not in {trace_of(task) for task in others}
     with pytest.raises(ValueError, match="renders of one trace"):
@@ -50,14 +51,15 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     tasks = [clip("dots"), clip("plaid", preview=True), clip("floral")]
     asked = together(tasks)
     assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
+    depth = {"depth": chunk(9)}
     output = RenderOutput(
-        chunks={},
+        chunks=depth,
         labels={"light_seed": 1},
         clips={name: chunk(number) for number, name in enumerate(asked.textures)},
         previews=dict.fromkeys(asked.textures, "e" * 64),
     )
     results = apart(tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0))
-    assert [result.output.chunks["video"] for result in results] == [chunk(0), chunk(1), chunk(2)]
+    assert [result.output.chunks for result in results] == [{"video": chunk(n), **depth} for n in range(3)]
     assert [result.output.preview for result in results] == [None, "e" * 64, None]
     assert all(result.output.labels == {"light_seed": 1} for result in results)
     assert [(result.cpu_seconds, result.wall_seconds) for result in results] == [(2.0, 1.0)] * 3

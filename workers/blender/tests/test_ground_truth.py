@@ -4,10 +4,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from stickslip_blender import ground_truth as module
 from stickslip_blender.geometry import FLOOR, Geometry
 from stickslip_blender.ground_truth import CLOTH, GROUND, PROP, ground_truth
 from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.cloth import SEGMENTS, GroundTruth
+
+
+def test_the_contract_and_the_renderer_name_the_same_things() -> None:
+    codes = (module.BACKGROUND, module.GROUND, module.CLOTH, module.PROP)
+    assert dict(zip(SEGMENTS, codes, strict=True)) == {"background": 0, "floor": 1, "cloth": 2, "prop": 3}
+    assert set(module.GroundTruth.__annotations__) == set(GroundTruth)
 
 
 def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any]) -> None:
@@ -25,7 +33,7 @@ def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any]) ->
     np.testing.assert_allclose(place[floor][:, 2], FLOOR, atol=1e-6)
     assert not truth.flow[floor].any()
     up = np.asarray(camera.rotation) @ [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(truth.normals[floor], np.broadcast_to(up, truth.normals[floor].shape), atol=1e-6)
+    np.testing.assert_allclose(truth.normals[floor], np.broadcast_to(up, truth.normals[floor].shape), atol=5e-4)
 
     cloth = truth.segmentation == CLOTH
     assert cloth.sum() > 2000
@@ -41,5 +49,5 @@ def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any]) ->
     moved, _ = camera.project(place[cloth] + shift)
     np.testing.assert_allclose(truth.flow[cloth], moved - np.column_stack([u[cloth], v[cloth]]), atol=0.02)
     facing = (truth.normals[cloth] * ray[cloth]).sum(axis=1)
-    assert (facing <= 0.0).all()
-    np.testing.assert_allclose(np.linalg.norm(truth.normals[cloth], axis=1), 1.0, atol=1e-5)
+    assert (facing <= 1e-3).all()
+    np.testing.assert_allclose(np.linalg.norm(truth.normals[cloth].astype(np.float64), axis=1), 1.0, atol=2e-3)

@@ -43,7 +43,7 @@ def apart(tasks: Sequence[RenderTask], result: TaskResult) -> list[TaskResult]:
 def _own(task: RenderTask, output: RenderOutput) -> RenderOutput:
     name = task.render.variant
     return RenderOutput(
-        chunks={"video": output.clips[name]},
+        chunks={"video": output.clips[name], **output.chunks},
         preview=output.previews[name] if task.preview else None,
         labels=output.labels,
     )

@@ -1,6 +1,7 @@
-"""The command `stickslip-train info`."""
+"""The commands `stickslip-train info` and `stickslip-train coco`."""
 
 from collections import Counter
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,6 +10,7 @@ from rich.table import Table
 from stickslip_schemas.samples import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.data.coco import export_coco
 from stickslip_training.data.reader import DatasetReader
 
 
@@ -47,6 +49,20 @@ def info(
                 array.description,
             )
         console.print(arrays)
+
+
+def coco(
+    dataset: DatasetArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="directory for images/ and annotations.json")],
+    every: Annotated[int, typer.Option(min=1, help="frames: the first and then every n-th of a clip")] = 1,
+    split: Annotated[str | None, typer.Option(help="train, validation or test; by default all")] = None,
+) -> None:
+    """Write frames and segments of cloth in COCO's format; the spec must ask for `ground_truth: [segmentation]`."""
+    if split is not None and split not in SPLITS:
+        raise typer.BadParameter(f"must be one of {', '.join(SPLITS)}; got {split!r}", param_hint="--split")
+    with errors_told(), DatasetReader(dataset) as reader:
+        images, annotations = export_coco(reader, out, every=every, split=split)
+        Console().print(f"{images} images, {annotations} segments in {out}")
 
 
 def _megabytes(count: int) -> str:

@@ -22,6 +22,7 @@ from stickslip_schemas.textures import Texture
 from stickslip_blender.build import build_digest
 from stickslip_blender.engine import CLOTH_SAMPLING, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR, Geometry, Set
+from stickslip_blender.ground_truth import ground_truth
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import Look, grained, look_of
 from stickslip_blender.multiplexed import Sight, encode
@@ -152,6 +153,17 @@ class ClipRenderer:
         }
         return videos, labels
 
+    def ground_truth(self, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+        """Return arrays of what is known of every pixel (frames, height, width, ...), by name."""
+        if not names:
+            return {}
+        points = [shot.points for shot in self.shots]
+        known = [
+            ground_truth(self.stage.geometry, here, following, self.camera)
+            for here, following in zip(points, [*points[1:], points[-1]], strict=True)
+        ]
+        return {name: np.stack([getattr(frame, name) for frame in known]) for name in names}
+
     def _compose(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures, pictures: Clip) -> Sight:
         return self.stage.composer.compose(
             light, shot.points, self.camera, self.stage.substrate, self.floor, textures, pictures
@@ -192,12 +204,15 @@ def render_clips(
     )
     clip = renderer.clip(look, camera, track[list(look.instants)])
     trace = _trace(clip, look, task, workshop)
+    known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}
     wanted = [Texture(name) for name in task.textures] or [look.texture]
     videos, labels = clip.clips(trace, wanted)
     if not task.textures:
-        return workshop.rendered("video", videos[0], moving(videos[0]) if task.preview else None, labels)
+        preview = workshop.store.publish(moving(videos[0])) if task.preview else None
+        chunks = {"video": workshop.chunk(videos[0]), **known}
+        return TaskResult(outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels))
     output = RenderOutput(
-        chunks={},
+        chunks=known,
         labels=labels,
         clips={texture: workshop.chunk(video) for texture, video in zip(wanted, videos, strict=True)},
         previews={texture: workshop.store.publish(moving(video)) for texture, video in zip(wanted, videos, strict=True)}
@@ -209,7 +224,8 @@ def render_clips(
 
 def _trace(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Trace:
     """Return the trace of a clip: one that was made before, if it is still kept, or a new one."""
-    shared = {"record": task.record.model_dump(), "look": look.trace, "build": build_digest(look.kind)}
+    light = {name: value for name, value in look.trace.items() if name != "ground_truth"}
+    shared = {"record": task.record.model_dump(), "look": light, "build": build_digest(look.kind)}
     key = content_key("trace", shared)
     kept = workshop.traces
     if key not in kept:

@@ -15,9 +15,10 @@ from stickslip_blender.geometry import FLOOR, Geometry
 from stickslip_blender.raster import Window, _raster, projected, see
 
 BACKGROUND, GROUND, CLOTH, PROP = range(4)
-"""Codes of the segmentation."""
+"""Codes of the segmentation, in the order of `stickslip_schemas.cloth.SEGMENTS`."""
 
 Floats = npt.NDArray[np.float32]
+Halves = npt.NDArray[np.float16]
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,12 @@ class GroundTruth:
     """Along the optical axis [m], infinite where there is nothing; shape (height, width)."""
     segmentation: npt.NDArray[np.uint8]
     """Codes, shape (height, width)."""
-    normals: Floats
+    normals: Halves
     """Of length 1, towards the camera, in its axes (x right, y down, z forward); 0 where there is nothing; shape
     (height, width, 3)."""
-    uv: Floats
+    uv: Halves
     """Texture coordinates of the cloth, NaN elsewhere; shape (height, width, 2)."""
-    flow: Floats
+    flow: Halves
     """How far what is seen moves until the next frame [px], columns and rows; shape (height, width, 2)."""
 
 
@@ -60,9 +61,9 @@ def ground_truth(
     return GroundTruth(
         depth=depth.astype(np.float32),
         segmentation=segmentation,
-        normals=normal.astype(np.float32),
-        uv=np.where(cloth[..., None], values[..., 1:3], np.nan).astype(np.float32),
-        flow=np.where(thing[..., None], values[..., 3:5], 0.0).astype(np.float32),
+        normals=normal.astype(np.float16),
+        uv=np.where(cloth[..., None], values[..., 1:3], np.nan).astype(np.float16),
+        flow=np.where(thing[..., None], values[..., 3:5], 0.0).astype(np.float16),
     )
 
 

@@ -57,7 +57,7 @@ class ClothStage:
     """
 
     def __init__(self, geometry: Geometry, *, scratch: str | Path | None = None) -> None:
-        self._geometry = geometry
+        self.geometry = geometry
         self.composer = Composer(geometry)
         self._scene = new_scene()
         self._scene.cycles.max_bounces = 3
@@ -118,16 +118,16 @@ class ClothStage:
 
     def window(self, shot: Shot) -> Window:
         """Return the part of the frame that the cloth is in, and its image in a floor that mirrors it."""
-        cloth = shot.points[: self._geometry.cloth_vertices]
+        cloth = shot.points[: self.geometry.cloth_vertices]
         if self.substrate.roughness < _MIRRORING:
             cloth = np.concatenate([cloth, mirrored(cloth)])
         return window_about(projected(self._camera, cloth), self._camera, _WINDOW_MARGIN)
 
     def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
         """Return where everything is at an instant of the motion, the solver's vertices at positions (V', 3) [m]."""
-        stage = self._geometry.stage
+        stage = self.geometry.stage
         return Shot(
-            self._geometry.points(positions, instant), stage.poses(instant, positions), stage.aim(instant, positions)
+            self.geometry.points(positions, instant), stage.poses(instant, positions), stage.aim(instant, positions)
         )
 
     def _place(self, shot: Shot) -> None:
@@ -136,7 +136,7 @@ class ClothStage:
 
         for prop, pose in zip(self._props, shot.poses, strict=True):
             prop.matrix_world = Matrix(pose.tolist())
-        cloth = shot.points[: self._geometry.cloth_vertices]
+        cloth = shot.points[: self.geometry.cloth_vertices]
         self._mesh.attributes["position"].data.foreach_set("vector", cloth.astype(np.float32).ravel())
         self._mesh.update()
         a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
