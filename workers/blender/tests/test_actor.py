@@ -93,7 +93,7 @@ def test_a_rod_becomes_a_chunk_and_a_preview(
     data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
     views = np.frombuffer(data, dtype=np.uint8).reshape(1, 4, 224, 224, 3)[0]
     with RodRenderer(quality=Quality.draft) as renderer:
-        assert np.array_equal(views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5)))
+        assert np.array_equal(views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5), seed=5))
 
     assert result.output.preview is not None
     with Image.open(io.BytesIO(store.read(result.output.preview))) as preview:

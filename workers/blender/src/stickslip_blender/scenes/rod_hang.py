@@ -54,7 +54,7 @@ def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskRes
     renderer = workshop.renderer(
         ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality, scratch=workshop.scratch)
     )
-    views = renderer.render(line, cameras, color=color, radius=look.radius)
+    views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
     return workshop.rendered(
         "views", views, side_by_side(views) if task.preview else None, {"color": list(to_linear(color))}
     )
@@ -74,7 +74,8 @@ class RodRenderer:
         scratch: str | Path | None = None,
     ) -> None:
         self._scene = new_scene()
-        set_sampling(self._scene, quality if isinstance(quality, Sampling) else SAMPLING[quality])
+        self._sampling = quality if isinstance(quality, Sampling) else SAMPLING[quality]
+        set_sampling(self._scene, self._sampling)
         self._scene.cycles.max_bounces = 2
         self._scene.cycles.diffuse_bounces = 1
         self._scene.cycles.glossy_bounces = 1
@@ -104,8 +105,12 @@ class RodRenderer:
         *,
         color: Color,
         radius: float = RADIUS,
+        seed: int = 0,
     ) -> npt.NDArray[np.uint8]:
-        """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB, shape (cameras, height, width, 3)."""
+        """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB, shape (cameras, height, width, 3).
+
+        Seed: added to that of the sampling, so that noise is not the same in every picture of a dataset.
+        """
         line = np.asarray(centerline, dtype=np.float64)
         if line.shape != (self._points, 3) or not np.isfinite(line).all():
             raise ValueError(f"centerline must be finite, of shape ({self._points}, 3); got shape {line.shape}")
@@ -114,6 +119,7 @@ class RodRenderer:
         vertices = tube_vertices(line, radius).astype(np.float32)
         self._mesh.attributes["position"].data.foreach_set("vector", vertices.ravel())
         self._mesh.update()
+        self._scene.cycles.seed = self._sampling.seed + seed
         self._shader.inputs["Base Color"].default_value = (*to_linear(color), 1.0)
         return np.stack([self._view(vertices, camera) for camera in cameras])
 
