@@ -13,6 +13,7 @@ from stickslip_services.cli import app
 from stickslip_services.database.opening import locked
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, list_datasets, list_jobs, parsed, rods, show_job
 from typer.testing import CliRunner, Result
@@ -31,6 +32,8 @@ def made(settings: Settings) -> list[str]:
         job = coordinator.submit(parsed(rods(gamma=gamma)), None)
         worker.work()
         ids.append(show_job(coordinator, job.id).dataset.dataset)
+    for file in unused(coordinator.database, coordinator.store, older_than=-1):
+        file.path.unlink()  # a pretended worker leaves something behind
     coordinator.close()
     return ids
 
@@ -59,6 +62,11 @@ def look(settings: Settings) -> tuple[list[str], list[Any], Coordinator]:
 
 def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -> None:
     before = artifacts(settings)
+    _, datasets, coordinator = look(settings)
+    for dataset in datasets:
+        (version,) = dataset.versions
+        assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
+    coordinator.close()
     age(settings, 30 * DAY)
     result = run(settings, "gc", "--delete", "--older-than", 0)
     assert result.exit_code == 0, result.output

@@ -20,6 +20,8 @@ from typer.testing import CliRunner
 
 run = CliRunner().invoke
 
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the libraries that read; some warn as they are imported
+
 
 @pytest.fixture(params=["clips", "rods", "seen_rods"])
 def source(request: pytest.FixtureRequest) -> Any:

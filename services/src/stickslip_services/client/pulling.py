@@ -265,15 +265,24 @@ def verify(target: Path) -> list[Fault]:
         return [Fault(MANIFEST_NAME, "manifest", str(error).splitlines()[0])]
     except BrokenSealError as error:
         return [Fault(SEAL_NAME, "seal", str(error))]
-    named = {file.path for file in manifest.files}
+    named = frozenset(file.path for file in manifest.files)
+    wanted = named
     try:
-        wanted = _files_of_part(target, manifest, sha256(sealed[MANIFEST_NAME]))
-    except (ClientError, CorruptChunkError, OSError, ValueError) as error:
+        part = read_part(target)
+        if part.manifest != sha256(sealed[MANIFEST_NAME]):
+            return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {part.manifest}")]
+        needed = part_files(manifest, part.selection, None)
+        faults = _faults(target, [file for file in manifest.files if file.path in needed])
+        if faults:  # the labels tell what else belongs to the part
+            return sorted(faults, key=lambda fault: fault.path)
+        wanted = part_files(manifest, part.selection, lambda name: _label(target, manifest, name))
+    except FileNotFoundError:
+        pass  # all of it
+    except (DamagedError, ValueError) as error:
         return [Fault(SELECTION_NAME, "selection", str(error))]
     there = set(_files_below(target))
     checked = [file for file in manifest.files if file.path in wanted or file.path in there]
-    with ThreadPoolExecutor(CONNECTIONS) as pool:
-        faults = [fault for fault in pool.map(lambda file: _fault(target, file), checked) if fault is not None]
+    faults = _faults(target, checked)
     for path in there:
         if path not in named and path not in (*SEALED_NAMES, SELECTION_NAME):
             faults.append(Fault(path, "extra", "not in the manifest"))
@@ -282,15 +291,9 @@ def verify(target: Path) -> list[Fault]:
     return sorted(faults, key=lambda fault: fault.path)
 
 
-def _files_of_part(target: Path, manifest: Manifest, digest: Sha256) -> frozenset[str]:
-    """Return the paths of the files that must be there: all, or those of the part that `selection.json` names."""
-    try:
-        part = read_part(target)
-    except FileNotFoundError:
-        return frozenset(file.path for file in manifest.files)
-    if part.manifest != digest:
-        raise DamagedError(f"it is of another version, whose manifest is {part.manifest}")
-    return part_files(manifest, part.selection, lambda name: _label(target, manifest, name))
+def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        return [fault for fault in pool.map(lambda file: _fault(target, file), files) if fault is not None]
 
 
 def _sample_key_faults(target: Path, manifest: Manifest) -> list[Fault]:
