@@ -1,22 +1,28 @@
 """Removing versions, and files that nothing refers to."""
 
+import io
 import os
 import time
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.states import JobState
+from stickslip_schemas.store import Store
+from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
-from stickslip_services.database.opening import locked
+from stickslip_services.database.opening import locked, opened
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.reindexing import reindex
 from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, list_datasets, list_jobs, parsed, rods, show_job
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 DAY = 24 * 3600.0
 
@@ -38,8 +44,21 @@ def made(settings: Settings) -> list[str]:
     return ids
 
 
-def run(settings: Settings, *arguments: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments), "--data", str(settings.data)])
+@dataclass(frozen=True)
+class Ended:
+    """What the program said."""
+
+    exit_code: int
+    stdout: str
+    stderr: str
+
+
+def run(settings: Settings, *arguments: object) -> Ended:
+    """Do what `stickslip rm` and `stickslip gc` start as a process."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        status = upkeep.main([*map(str, arguments), "--data", str(settings.data)])
+    return Ended(status, out.getvalue(), err.getvalue())
 
 
 def artifacts(settings: Settings) -> dict[str, int]:
@@ -69,7 +88,7 @@ def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -
     coordinator.close()
     age(settings, 30 * DAY)
     result = run(settings, "gc", "--delete", "--older-than", 0)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 0, result.stderr
     assert result.stdout == "0 files, 0.0 MB, that nothing refers to were deleted\n"
     assert artifacts(settings) == before
 
@@ -78,7 +97,7 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
     first, second = made
     before = artifacts(settings)
     result = run(settings, "rm", f"{first}:v1")
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 0, result.stderr
     assert "with 1 jobs" in result.stdout
     assert not (settings.store_root / "datasets" / first).exists()
     assert artifacts(settings) == before
@@ -142,7 +161,9 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
     away.rename(directory)
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
-    assert "1 versions found again" in run(settings, "reindex").stderr
+    with opened(settings.data, durable=False) as database:
+        found = reindex(database, Store(settings.store_root))
+        assert sorted(version.is_new for version in found) == [False, True]
 
 
 def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[str]) -> None:
@@ -179,7 +200,7 @@ def test_what_does_not_exist_is_refused(
     settings: Settings, made: list[str], arguments: tuple[str, ...], message: str
 ) -> None:
     result = run(settings, *arguments)
-    assert (result.exit_code, message in result.stderr) == (1, True), result.output
+    assert (result.exit_code, message in result.stderr) == (1, True), result.stderr
 
 
 def test_a_running_service_and_a_missing_database_are_refused(
@@ -190,3 +211,11 @@ def test_a_running_service_and_a_missing_database_are_refused(
     assert (result.exit_code, "is in use by another" in result.stderr) == (1, True)
     empty = CliRunner().invoke(app, ["gc", "--data", str(tmp_path / "nothing")])
     assert (empty.exit_code, "does not exist" in empty.stderr) == (1, True)
+
+
+def test_the_commands_start_the_program(settings: Settings, made: list[str]) -> None:
+    data = ["--data", str(settings.data)]
+    removed = CliRunner().invoke(app, ["rm", f"{made[0]}:v1", *data])
+    assert (removed.exit_code, "is removed" in removed.stdout) == (0, True), removed.output
+    swept = CliRunner().invoke(app, ["gc", "--older-than", "0", "--delete", *data])
+    assert (swept.exit_code, "were deleted" in swept.stdout) == (0, True), swept.output
