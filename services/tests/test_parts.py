@@ -26,7 +26,7 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str,
         worker = PretendWorker(made.state.coordinator, made.state.coordinator.store, whole=True).register()
         ids = []
         for gamma in (GAMMAS, GAMMAS[:2]):
-            job = client.submit(rods(gamma=gamma, name=f"{len(gamma)} rods"))
+            job = client.submit(rods(gamma=gamma, name=f"{len(gamma)}-rods"))
             worker.work()
             reference = client.job(job.id).dataset
             assert reference is not None
@@ -112,7 +112,7 @@ def test_versions_are_compared(origin: tuple[str, str, str], tmp_path: Path) -> 
             for each in differences(client.manifest(large, 1)[0], client.manifest(small, 1)[0])
         }
     assert found["samples"] == ("8", "4")
-    assert found["spec name"] == ("4 rods", "2 rods")
+    assert found["spec name"] == ("4-rods", "2-rods")
     assert found["samples that only it has"] == ("4", "0")
     assert not [what for what in found if what.startswith(("build", "certificate", "array"))]
     done = run("datasets", "diff", f"{large}:v1", tmp_path / "small", "--url", url)

@@ -178,8 +178,10 @@ def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[
 
 
 def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: list[str]) -> None:
-    _, _, coordinator = look(settings)
+    _, datasets, coordinator = look(settings)
     PretendWorker(coordinator, coordinator.store).register()
+    (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
+    coordinator.store.path(version.manifest).unlink()  # so that a job makes it once more
     again = coordinator.submit(parsed(rods(gamma=(1.0, 2.0))), None)
     coordinator.close()
     result = run(settings, "rm", f"{made[0]}:v1")
