@@ -108,6 +108,8 @@ from datasets import load_dataset
 dataset = load_dataset("PATH OF THIS DIRECTORY").with_format("numpy")
 ```
 
+The format "numpy" of `datasets` rounds float64 to float32, unless you give it a `dtype`.
+
 | column | shape | type | meaning |
 |---|---|---|---|
 {arrays}
