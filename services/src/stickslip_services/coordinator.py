@@ -15,7 +15,7 @@ import socket
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -181,9 +181,16 @@ def main(arguments: list[str] | None = None) -> int:
         if is_reindexing:
             return reindex(settings)
         check_database(settings.database_path, settings.store_root)
+        # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
+        with locked(settings.data) if descriptor is None else nullcontext():
+            return _serve(settings, descriptor)
     except DatabaseRefusedError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
+
+
+def _serve(settings: Settings, descriptor: int | None) -> int:
+    """Answer requests until a signal comes; return the exit status."""
     try:
         listener = listen(settings.host, settings.port) if descriptor is None else socket.socket(fileno=descriptor)
     except OSError as error:

@@ -1,23 +1,45 @@
 """Datasets: listing, pulling and verifying them."""
 
+import os
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.selection import Selection
 
-from stickslip_services.addresses import DEFAULT_URL
+from stickslip_services.addresses import DEFAULT_URL, coordinator_url
 from stickslip_services.cli import wording
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client import pulling
+from stickslip_services.client.comparing import differences
 from stickslip_services.client.http import Client, ClientError
 
+ArraysOption = Annotated[
+    str | None, typer.Option(help="arrays to take, with commas between; labels always come; without, all")
+]
+SplitOption = Annotated[str | None, typer.Option(help="train, validation or test; without, all")]
+WhereOption = Annotated[
+    list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
+]
 
+app = typer.Typer(add_completion=False)
+
+
+@app.callback(invoke_without_command=True)
 @shows_errors
-def datasets(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+def datasets(context: typer.Context, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
     """List datasets and their versions, newest first."""
+    if context.invoked_subcommand is not None:
+        return None
     with Client(url) as client:
         found = list(client.datasets())
     if as_json:
@@ -41,10 +63,18 @@ def datasets(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
 def pull_dataset(
     dataset: Annotated[str, typer.Argument(metavar="DATASET[:vN]", help="without :vN, the newest version")],
     target: Annotated[Path, typer.Argument(metavar="DEST", help="directory to write to")],
+    arrays: ArraysOption = None,
+    split: SplitOption = None,
+    where: WhereOption = None,
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Download a dataset. Every file is checked, and files that are already there are not downloaded again."""
+    """Download a dataset, or a part of it. Every file is checked, and what is already there is not downloaded again.
+
+    A part has all labels. Of the other arrays it has the shards in which a chosen sample lies. The reader of
+    stickslip-training shows the chosen samples only; other readers show fill values for what is not there.
+    """
     screen = console()
+    selection = _selection(arrays, split, where)
     with Client(url) as client:
         name, version = _resolve(client, dataset)
         columns = (BarColumn(bar_width=32), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
@@ -55,6 +85,7 @@ def pull_dataset(
                 name,
                 version,
                 target,
+                selection=selection,
                 on_plan=lambda _files, count: bar.update(row, total=count),
                 on_bytes=lambda count: bar.advance(row, count),
             )
@@ -64,6 +95,95 @@ def pull_dataset(
         f"({wording.size(done.downloaded_bytes)}), {there} already there"
     )
     say(f"{target / 'README.md'} says what it holds and how to read it. To check it again: stickslip verify {target}")
+
+
+def _selection(arrays: str | None, split: str | None, where: list[str] | None) -> Selection:
+    names = None if arrays is None else tuple(filter(None, (name.strip() for name in arrays.split(","))))
+    try:
+        return Selection.model_validate({"arrays": names, "split": split, "where": tuple(where or ())})
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ClientError(f"{first['loc'][0]}: {first['msg']}, and is {first['input']!r}") from error
+
+
+@app.command("diff")
+@shows_errors
+def diff(
+    a: Annotated[str, typer.Argument(metavar="A", help="DATASET[:vN], or a directory")],
+    b: Annotated[str, typer.Argument(metavar="B", help="DATASET[:vN], or a directory")],
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Say what differs between two versions: spec, builds, labels, samples, files. Exit with 1 if anything does."""
+    with Client(url) as client:
+        found = differences(_manifest(client, a), _manifest(client, b))
+    if not found:
+        console().print("the two were made from the same spec by the same code, and hold the same files")
+        return
+    shown = table("what", a, b)
+    for difference in found:
+        shown.add_row(*map(escape, (difference.what, difference.a, difference.b)))
+    console().print(shown)
+    raise typer.Exit(1)
+
+
+def _manifest(client: Client, dataset: str) -> Manifest:
+    """Return the manifest of a version that is on disk, or at the coordinator."""
+    if _ID.match(dataset):
+        return client.manifest(*_resolve(client, dataset))[0]
+    path = Path(dataset) / MANIFEST_NAME
+    try:
+        return Manifest.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise ClientError(f"{path} is no manifest: {str(error).splitlines()[0]}") from error
+
+
+@shows_errors
+def export(
+    dataset: Annotated[str, typer.Argument(metavar="DATASET[:vN]", help="or a directory, or the URL of a version")],
+    hdf5: Annotated[Path | None, typer.Option(metavar="FILE", help="one HDF5 file")] = None,
+    webdataset: Annotated[Path | None, typer.Option(metavar="DIR", help="tar files for WebDataset")] = None,
+    huggingface: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Parquet files for Hugging Face datasets")
+    ] = None,
+    arrays: ArraysOption = None,
+    split: SplitOption = None,
+    where: WhereOption = None,
+    gzip: Annotated[int | None, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = None,
+    licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
+    url: UrlOption = DEFAULT_URL,
+) -> None:
+    """Write a dataset in a format that other libraries read, with Croissant metadata. Nothing is overwritten.
+
+    Needs the training package: pip install 'stickslip-training[export]'.
+    """
+    source = dataset
+    if _ID.match(dataset):
+        with Client(url) as client:
+            name, version = _resolve(client, dataset)
+        source = f"{coordinator_url(url)}/v1/datasets/{name}/versions/{version}"
+    options = {
+        "--hdf5": hdf5,
+        "--webdataset": webdataset,
+        "--huggingface": huggingface,
+        "--arrays": arrays,
+        "--split": split,
+        "--gzip": gzip,
+        "--license": licence,
+    }
+    given = [text for name, value in options.items() if value is not None for text in (name, str(value))]
+    given += [text for condition in where or () for text in ("--where", condition)]
+    if find_spec("stickslip_training") is None:
+        raise ClientError("`stickslip export` needs the training package: pip install 'stickslip-training[export]'")
+    key = os.environ.get("STICKSLIP_KEY")
+    ended = subprocess.run(
+        [sys.executable, "-m", "stickslip_training.cli", "export", source, *given],
+        env=os.environ | ({"STICKSLIP_API_KEY": key} if key else {}),
+        check=False,
+    )
+    raise typer.Exit(ended.returncode)
+
+
+_ID = re.compile(r"ds-[0-9a-f]{16}(:|$)")
 
 
 def _resolve(client: Client, dataset: str) -> tuple[str, int]:

@@ -7,11 +7,13 @@ import typer
 
 from stickslip_services import __version__
 from stickslip_services.cli.certificates import certificates, certify, register
-from stickslip_services.cli.datasets import datasets, pull_dataset, verify
+from stickslip_services.cli.datasets import app as datasets
+from stickslip_services.cli.datasets import export, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
 from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.up import up
+from stickslip_services.cli.upkeep import gc, rm
 from stickslip_services.cli.workers import workers
 
 app = typer.Typer(
@@ -42,9 +44,11 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "resume": resume,
     "priority": prioritise,
     "cancel": cancel,
-    "datasets": datasets,
     "pull": pull_dataset,
     "verify": verify,
+    "export": export,
+    "rm": rm,
+    "gc": gc,
     "reindex": reindex,
     "certify": certify,
     "register": register,
@@ -54,4 +58,5 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 for _name, _command in _COMMANDS.items():
     app.command(name=_name)(_command)
 
+app.add_typer(datasets, name="datasets")
 app.add_typer(keys, name="keys")

@@ -10,12 +10,14 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Any, Literal
 
 import httpx
+import numpy as np
+import numpy.typing as npt
 from pydantic import ValidationError
 from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from stickslip_schemas.chunks import CorruptChunkError, decode_chunk
@@ -30,6 +32,7 @@ from stickslip_schemas.manifest import (
     Manifest,
     check_seal,
 )
+from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_schemas.store import write_durably
 from stickslip_schemas.tasks import FileEntry
 
@@ -39,6 +42,7 @@ from stickslip_services.client.http import Client
 CONNECTIONS = 4
 TRIES = 5
 PART = ".part"
+EVERYTHING = Selection()
 
 
 class UnsafePathError(ClientError):
@@ -51,6 +55,10 @@ class ForeignFilesError(ClientError):
 
 class DamagedError(ClientError):
     """What arrived is not what the manifest promises."""
+
+
+class SelectionError(ClientError):
+    """The dataset has no such array or label."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +75,7 @@ class Fault:
     """What is wrong with a file of a dataset on disk."""
 
     path: str
-    fault: Literal["missing", "size", "sha256", "extra", "manifest", "seal", "sample_key"]
+    fault: Literal["missing", "size", "sha256", "extra", "manifest", "seal", "sample_key", "selection"]
     detail: str
 
 
@@ -77,25 +85,55 @@ def pull(
     version: int,
     target: Path,
     *,
+    selection: Selection = EVERYTHING,
     on_bytes: Callable[[int], None] = lambda _: None,
     on_plan: Callable[[int, int], None] = lambda _files, _bytes: None,
 ) -> Pulled:
-    """Download a version to `target`; files that are there and right are left alone.
+    """Download a version, or the part that `selection` chooses, to `target`; what is there and right is left alone.
 
     `on_plan` hears how many files and bytes are to come, `on_bytes` of each piece that arrives. The manifest is written
     last: where it is, the dataset is whole. Raise ForeignFilesError, and write nothing, where `target` holds files of
-    something else: mixed with them, the dataset would not be what its manifest says.
+    something else: mixed with them, the dataset would not be what its manifest says. Raise SelectionError where the
+    selection makes no sense for this dataset.
+
+    A part has all labels, and of the other arrays the shards in which a chosen sample lies. `selection.json` says so.
     """
     manifest, sealed = _fetch_sealed(client, dataset, version)
     files = [(file, safe_path(target, file.path)) for file in manifest.files]
     refuse_foreign_files(target, {file.path for file in manifest.files}, f"{dataset}:v{version}")
+    refuse_other_part(target, selection)
+    with _told():
+        selection.choose_arrays(layout(manifest.spec))
     target.mkdir(parents=True, exist_ok=True)
+    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    labels_done = (0, 0)
+    if not selection.is_everything:
+        first = part_files(manifest, selection, None)
+        labels = [(file, path) for file, path in files if file.path in first and not _is_whole(path, file)]
+        _download_all(client, root, labels, lambda _: None)
+        labels_done = (len(labels), sum(file.size for file, _ in labels))
+        with _told():
+            wanted = part_files(manifest, selection, lambda name: _label(target, manifest, name))
+        files = [(file, path) for file, path in files if file.path in wanted]
+        document = PartDocument(manifest=sha256(sealed[MANIFEST_NAME]), selection=selection)
+        write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
     missing = [(file, path) for file, path in files if not _is_whole(path, file)]
     changed = {name: content for name, content in sealed.items() if _content(target / name) != content}
     count = len(missing) + len(changed)
     size = sum(file.size for file, _ in missing) + sum(map(len, changed.values()))
     on_plan(count, size)
-    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    _download_all(client, root, missing, on_bytes)
+    for name, content in changed.items():
+        write_durably(target / name, content)
+        on_bytes(len(content))
+    if selection.is_everything:
+        (target / SELECTION_NAME).unlink(missing_ok=True)
+    return Pulled(len(files) + len(sealed), count + labels_done[0], size + labels_done[1])
+
+
+def _download_all(
+    client: Client, root: str, missing: list[tuple[FileEntry, Path]], on_bytes: Callable[[int], None]
+) -> None:
     stop = threading.Event()
     with ThreadPoolExecutor(CONNECTIONS) as pool:
         downloads = [pool.submit(_download, client, root, file, path, on_bytes, stop) for file, path in missing]
@@ -106,10 +144,42 @@ def pull(
             stop.set()
             pool.shutdown(cancel_futures=True)
             raise
-    for name, content in changed.items():
-        write_durably(target / name, content)
-        on_bytes(len(content))
-    return Pulled(len(files) + len(sealed), count, size)
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Turn what a selection may be wrong about into a SelectionError."""
+    try:
+        yield
+    except ValueError as error:
+        raise SelectionError(str(error)) from error
+
+
+def refuse_other_part(target: Path, selection: Selection) -> None:
+    """Raise ForeignFilesError where `target` holds another part of a version; all of it may always be pulled."""
+    with suppress(FileNotFoundError):
+        there = read_part(target).selection
+        if not selection.is_everything and there != selection:
+            raise ForeignFilesError(
+                f"{target} holds another part of the dataset, {there.model_dump_json()}: pull all of it, or pull into "
+                "a new directory"
+            )
+
+
+def read_part(target: Path) -> PartDocument:
+    """Return which part of a version a directory holds; raise FileNotFoundError where it holds all of it."""
+    try:
+        return PartDocument.model_validate_json((target / SELECTION_NAME).read_bytes())
+    except ValidationError as error:
+        raise DamagedError(f"{target / SELECTION_NAME} is damaged: {str(error).splitlines()[0]}") from error
+
+
+def _label(target: Path, manifest: Manifest, name: str) -> npt.NDArray[Any]:
+    """Return a label of all slots from the files of a directory, which have been checked."""
+    array = next(array for array in layout(manifest.spec) if array.name == name)
+    shards = range(-(-manifest.sample_count // manifest.spec.samples_per_shard))
+    content = b"".join(bytes(decode_chunk((target / array.shard_path(shard)).read_bytes())) for shard in shards)
+    return np.frombuffer(content, dtype=array.dtype).reshape(-1, *array.shape)[: manifest.sample_count]
 
 
 def refuse_foreign_files(target: Path, own: set[str], name: str) -> None:
@@ -117,7 +187,7 @@ def refuse_foreign_files(target: Path, own: set[str], name: str) -> None:
 
     A directory that holds this very version may have files of yours beside it: pulling mends it.
     """
-    own = own | set(SEALED_NAMES)
+    own = own | {*SEALED_NAMES, SELECTION_NAME}
     foreign = [path for path in _files_below(target) if path.removesuffix(PART) not in own]
     there = ""
     with suppress(OSError, ValidationError):
@@ -173,7 +243,7 @@ def safe_path(target: Path, path: str) -> Path:
     whole = target.joinpath(*parts)
     if not whole.resolve().is_relative_to(target.resolve()):
         raise UnsafePathError(f"the file {path!r} would be written outside {target}; nothing was written")
-    if path in SEALED_NAMES or path.endswith(PART):
+    if path in (*SEALED_NAMES, SELECTION_NAME) or path.endswith(PART):
         raise UnsafePathError(f"the manifest names the file {path!r}, a name that is not its to give")
     return whole
 
@@ -195,15 +265,35 @@ def verify(target: Path) -> list[Fault]:
         return [Fault(MANIFEST_NAME, "manifest", str(error).splitlines()[0])]
     except BrokenSealError as error:
         return [Fault(SEAL_NAME, "seal", str(error))]
-    named = {file.path: file for file in manifest.files}
-    with ThreadPoolExecutor(CONNECTIONS) as pool:
-        faults = [fault for fault in pool.map(lambda file: _fault(target, file), manifest.files) if fault is not None]
-    for path in _files_below(target):
-        if path not in named and path not in SEALED_NAMES:
+    named = frozenset(file.path for file in manifest.files)
+    wanted = named
+    try:
+        part = read_part(target)
+        if part.manifest != sha256(sealed[MANIFEST_NAME]):
+            return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {part.manifest}")]
+        needed = part_files(manifest, part.selection, None)
+        faults = _faults(target, [file for file in manifest.files if file.path in needed])
+        if faults:  # the labels tell what else belongs to the part
+            return sorted(faults, key=lambda fault: fault.path)
+        wanted = part_files(manifest, part.selection, lambda name: _label(target, manifest, name))
+    except FileNotFoundError:
+        pass  # all of it
+    except (DamagedError, ValueError) as error:
+        return [Fault(SELECTION_NAME, "selection", str(error))]
+    there = set(_files_below(target))
+    checked = [file for file in manifest.files if file.path in wanted or file.path in there]
+    faults = _faults(target, checked)
+    for path in there:
+        if path not in named and path not in (*SEALED_NAMES, SELECTION_NAME):
             faults.append(Fault(path, "extra", "not in the manifest"))
     if not faults:
         faults = _sample_key_faults(target, manifest)
     return sorted(faults, key=lambda fault: fault.path)
+
+
+def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        return [fault for fault in pool.map(lambda file: _fault(target, file), files) if fault is not None]
 
 
 def _sample_key_faults(target: Path, manifest: Manifest) -> list[Fault]:

@@ -91,7 +91,7 @@ def locked(data: Path) -> Iterator[int]:
                 holder = path.read_text(encoding="utf-8").strip()
                 # If the holder was killed, its coordinator is about to follow it.
                 if _is_alive(holder) or time.monotonic() > deadline:
-                    message = f"{path.parent} is in use by another `stickslip up` (pid {holder})"
+                    message = f"{path.parent} is in use by another `stickslip up` or coordinator (pid {holder})"
                     raise DatabaseRefusedError(message) from None
                 time.sleep(0.1)
         file.truncate(0)

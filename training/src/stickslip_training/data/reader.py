@@ -27,6 +27,7 @@ from stickslip_schemas.keys import sha256
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.samples import SPLITS
+from stickslip_schemas.selection import part_files
 from stickslip_schemas.tasks import FileEntry
 
 from stickslip_training.arrays import Array
@@ -37,7 +38,7 @@ from stickslip_training.data.errors import (
     RejectedSampleError,
 )
 from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
-from stickslip_training.data.seal import read_sealed
+from stickslip_training.data.seal import read_sealed, read_selection
 from stickslip_training.data.sources import open_source
 
 Split = Literal["train", "validation", "test"]
@@ -75,7 +76,10 @@ class DatasetReader:
     def _open(self, cache_bytes: int, verify: bool) -> None:
         self.manifest_digest, self._group, manifest = read_sealed(self.source)
         self.manifest = _parse_manifest(manifest)
-        self.arrays: dict[str, ArrayLayout] = {array.name: array for array in layout(self.spec)}
+        self.selection = read_selection(self.source, self.manifest_digest)
+        arrays = self.selection.choose_arrays(layout(self.spec))
+        self.arrays: dict[str, ArrayLayout] = {array.name: array for array in arrays}
+        self._chosen: Array | None = None
         self._files = {file.path: file for file in self.manifest.files}
         self._shard_size = self.spec.samples_per_shard
         self._indexes: dict[tuple[str, int], Array] = {}
@@ -104,6 +108,13 @@ class DatasetReader:
         """True where there is a sample, bool (slots,)."""
         return self.label("valid")
 
+    @property
+    def chosen(self) -> Array:
+        """True where there is a sample and it is in the part of the version that the source holds, bool (slots,)."""
+        if self._chosen is None:
+            self._chosen = self.selection.choose_samples(self.arrays.values(), self.label)
+        return self._chosen
+
     def __len__(self) -> int:
         """Return the number of slots, those of rejected samples included."""
         return self.manifest.sample_count
@@ -130,10 +141,11 @@ class DatasetReader:
     def slots(self, split: Split | None = None, *, rejected: bool = False) -> npt.NDArray[np.int64]:
         """Return the slots of `split`, or of all splits, in increasing order.
 
-        Rejected samples are left out. With `rejected` they are in; they have their parameters as labels, and reading
-        anything else of them raises.
+        Rejected samples are left out, and those that are not in the part of the version that the source holds. With
+        `rejected` all slots are in; rejected samples have their parameters as labels, and reading anything else of
+        them raises.
         """
-        chosen = np.ones(len(self), dtype=bool) if rejected else self.valid.copy()
+        chosen = np.ones(len(self), dtype=bool) if rejected else self.chosen.copy()
         if split is not None:
             if split not in SPLITS:
                 raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {split!r}")
@@ -190,7 +202,10 @@ class DatasetReader:
 
     def verify(self) -> None:
         """Check the size and the SHA-256 of every file of the manifest; the others were checked when it was opened."""
+        part = part_files(self.manifest, self.selection, self.label)
         for file in self.manifest.files:
+            if file.path not in part:
+                continue
             if ".." in file.path.split("/"):
                 raise InvalidDatasetError(f"the manifest names {file.path}, which is not inside the dataset")
             self._check_digest(file, self.source.read(file))
@@ -267,6 +282,11 @@ class DatasetReader:
         if not self.valid[slot]:
             reasons = [item for item in self.manifest.rejections if item.slot == slot]
             raise RejectedSampleError(f"sample {slot} was rejected: {reasons[0].reason}, {reasons[0].message}")
+        if not self.chosen[slot]:
+            raise MissingFileError(
+                f"sample {slot} is not in the part of the dataset that {self.source} holds: "
+                f"{self.selection.model_dump_json()}"
+            )
 
     # --- checks at open ---------------------------------------------------------------------------------------
 

@@ -7,11 +7,13 @@ of the three shows.
 
 from typing import Any
 
+from pydantic import ValidationError
 from stickslip_schemas.manifest import SEAL_NAME, BrokenSealError, check_seal
+from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection
 
 from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError
 from stickslip_training.data.metadata import GROUP_METADATA, parse_metadata
-from stickslip_training.data.sources import Source
+from stickslip_training.data.sources import DirectorySource, Source
 
 
 def read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
@@ -30,3 +32,20 @@ def read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
     except BrokenSealError as error:
         raise CorruptDataError(f"{source}/{error}") from None
     return digest, parse_metadata(group, f"{source}/{GROUP_METADATA}"), manifest
+
+
+def read_selection(source: Source, manifest: str) -> Selection:
+    """Return the part of the version with this manifest that the source holds, which may be all of it."""
+    if not isinstance(source, DirectorySource):
+        return Selection()  # servers have whole versions
+    try:
+        data = source.read_unlisted(SELECTION_NAME)
+    except MissingFileError:
+        return Selection()
+    try:
+        part = PartDocument.model_validate_json(data)
+    except ValidationError as error:
+        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is damaged: {error}") from None
+    if part.manifest != manifest:
+        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is of another version, whose manifest is {part.manifest}")
+    return part.selection

@@ -1,0 +1,29 @@
+# The coordinator: no Ray, no Blender, no PyTorch, no compiler.
+#   docker build --file deploy/images/coordinator.Dockerfile --tag stickslip-coordinator .
+FROM python:3.11-slim-bookworm AS build
+WORKDIR /src
+COPY constraints.txt ./
+COPY schemas schemas
+COPY services services
+# The constraints fix the version of every package.
+RUN python -m venv /opt/stickslip/.venv \
+ && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt "./schemas[sobol]" "./services[server]"
+
+FROM python:3.11-slim-bookworm
+ARG REVISION=unknown
+LABEL org.opencontainers.image.title="stickslip-coordinator" \
+      org.opencontainers.image.description="The coordinator of stickslip: REST, queue and catalogue." \
+      org.opencontainers.image.licenses="Apache-2.0" \
+      org.opencontainers.image.revision="${REVISION}"
+COPY --from=build /opt/stickslip /opt/stickslip
+COPY LICENSE /usr/share/doc/stickslip/LICENSE
+ENV PATH=/opt/stickslip/.venv/bin:$PATH \
+    PYTHONDONTWRITEBYTECODE=1
+RUN useradd --uid 10001 --create-home stickslip && install --directory --owner=stickslip /data
+USER 10001
+VOLUME /data
+EXPOSE 8765
+HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
+  CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8765/livez', timeout=2)"]
+ENTRYPOINT ["python", "-m", "stickslip_services.coordinator", "--data", "/data"]
+CMD ["--port", "8765"]

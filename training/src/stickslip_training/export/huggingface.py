@@ -1,0 +1,116 @@
+"""Parquet files for Hugging Face `datasets`: `data/train-00000-of-00002.parquet` and so on, and a card.
+
+Each file carries the features, so `datasets.load_dataset(DIR)` gives every array with its shape and type, and every
+categorical label with its names.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stickslip_schemas.arrays import ArrayLayout
+
+from stickslip_training.arrays import Array
+from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes
+
+GROUP_BYTES = 32 * 2**20
+"""Decoded samples that are written and read together [bytes]."""
+
+
+def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
+    """Write the directory."""
+    import pyarrow
+    from pyarrow import parquet
+
+    (directory / "data").mkdir(parents=True)
+    (directory / MANIFEST_COPY).write_bytes(content.manifest())
+    (directory / DESCRIPTION).write_bytes(content.description())
+    schema = _features(content).arrow_schema
+    rows = max(1, GROUP_BYTES // content.sample_bytes)
+    splits = []
+    for part in content.parts():
+        splits += [part.split] if part.number == 0 else []
+        path = directory / "data" / f"{part.split}-{part.number:05d}-of-{part.count:05d}.parquet"
+        with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
+            for first in range(0, len(part.slots), rows):
+                slots = part.slots[first : first + rows]
+                columns = [
+                    _column(content.read(array.name, slots), schema.field(array.name).type) for array in content.arrays
+                ]
+                writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
+                on_bytes(len(slots) * content.sample_bytes)
+    (directory / "README.md").write_text(_card(content, splits), encoding="utf-8")
+
+
+def _features(content: Content) -> Any:
+    import datasets
+
+    return datasets.Features({array.name: _feature(array) for array in content.arrays})
+
+
+def _feature(array: ArrayLayout) -> Any:
+    import datasets
+
+    if array.categories:
+        return datasets.ClassLabel(names=list(map(str, array.categories)))
+    if not array.shape:
+        return datasets.Value(array.dtype)
+    if len(array.shape) == 1:
+        return datasets.Sequence(datasets.Value(array.dtype), length=array.shape[0])
+    of_rank = {2: datasets.Array2D, 3: datasets.Array3D, 4: datasets.Array4D, 5: datasets.Array5D}
+    return of_rank[len(array.shape)](array.shape, array.dtype)
+
+
+def _column(values: Array, kind: Any) -> Any:
+    """Return values as an Arrow array of the type `kind`: plain numbers, or lists in lists for the further axes."""
+    import pyarrow
+
+    storage = kind.storage_type if isinstance(kind, pyarrow.ExtensionType) else kind
+    column = _nested(values, storage)
+    return pyarrow.ExtensionArray.from_storage(kind, column) if storage is not kind else column
+
+
+def _nested(values: Array, kind: Any) -> Any:
+    import pyarrow
+    import pyarrow.types
+
+    if values.ndim == 1:
+        return pyarrow.array(values).cast(kind)
+    inner = _nested(values.reshape(-1, *values.shape[2:]), kind.value_type)
+    if pyarrow.types.is_fixed_size_list(kind):
+        return pyarrow.FixedSizeListArray.from_arrays(inner, type=kind)
+    ends = np.arange(len(values) + 1, dtype=np.int64) * values.shape[1]
+    offsets = pyarrow.array(ends, type=pyarrow.int64() if pyarrow.types.is_large_list(kind) else pyarrow.int32())
+    return type(pyarrow.array([], kind)).from_arrays(offsets, inner, type=kind)
+
+
+def _card(content: Content, splits: list[str]) -> str:
+    files = "".join(f"  - split: {split}\n    path: data/{split}-*.parquet\n" for split in splits)
+    arrays = "\n".join(
+        f"| `{array.name}` | {' x '.join(map(str, array.shape)) or 'one value'} | {array.dtype} | {array.description} |"
+        for array in content.arrays
+    )
+    return f"""---
+configs:
+- config_name: default
+  data_files:
+{files}---
+
+# {content.title}
+
+This is an export of the dataset `{content.name}`, which stickslip made: {len(content.slots)} samples. The manifest of
+that version is `{MANIFEST_COPY}` here; its SHA-256 is `{content.reader.manifest_digest}`.
+`{DESCRIPTION}` describes the arrays for programs.
+
+```python
+from datasets import load_dataset
+
+dataset = load_dataset("PATH OF THIS DIRECTORY").with_format("numpy")
+```
+
+The format "numpy" of `datasets` rounds float64 to float32, unless you give it a `dtype`.
+
+| column | shape | type | meaning |
+|---|---|---|---|
+{arrays}
+"""

@@ -1,0 +1,71 @@
+"""An export is there whole or not at all, and overwrites nothing."""
+
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stickslip_training.export import croissant, hdf5
+from stickslip_training.export.content import Content, OnBytes
+
+
+def to_directory(
+    content: Content,
+    target: Path,
+    on_bytes: OnBytes,
+    write: Callable[[Content, Path, OnBytes], None],
+    *,
+    licence: str | None = None,
+) -> None:
+    """Let `write` make a directory, and add Croissant metadata to it."""
+    with made_whole(target) as scratch:
+        write(content, scratch, on_bytes)
+        files = {path.relative_to(scratch).as_posix(): path for path in scratch.rglob("*") if path.is_file()}
+        metadata = croissant.document(content, files, licence=licence)
+        (scratch / croissant.CROISSANT_NAME).write_bytes(metadata)
+
+
+def to_file(content: Content, target: Path, on_bytes: OnBytes, *, gzip: int = 0, licence: str | None = None) -> None:
+    """Write an HDF5 file, with Croissant metadata beside it: `NAME.croissant.json`."""
+    beside = target.with_name(f"{target.name}.{croissant.CROISSANT_NAME}")
+    with made_whole(target) as scratch, made_whole(beside) as metadata:
+        hdf5.write(content, scratch, on_bytes, gzip=gzip)
+        metadata.write_bytes(croissant.document(content, {target.name: scratch}, licence=licence))
+
+
+@contextmanager
+def made_whole(target: Path) -> Iterator[Path]:
+    """Give a path beside `target` to write to, which becomes `target` at the end, or vanishes after an error.
+
+    Raises FileExistsError, and overwrites nothing, where `target` exists.
+    """
+    _refuse_existing(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        yield scratch
+        for path in [scratch, *scratch.rglob("*")]:
+            _sync(path)
+        _refuse_existing(target)
+        scratch.rename(target)
+        _sync(target.parent)
+    finally:
+        if scratch.is_dir():
+            shutil.rmtree(scratch)
+        else:
+            scratch.unlink(missing_ok=True)
+
+
+def _refuse_existing(target: Path) -> None:
+    if os.path.lexists(target):
+        raise FileExistsError(f"{target} exists, and an export overwrites nothing: name another place")
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
