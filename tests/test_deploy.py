@@ -62,15 +62,17 @@ def stickslip_commands() -> list[tuple[str, list[str]]]:
         for block in re.findall(r"```sh\n(.*?)```", guide.read_text(), re.S):
             for line in block.splitlines():
                 words = shlex.split(line)
-                starts = [place for place, word in enumerate(words) if Path(word).name == "stickslip"]
-                if starts and len(words) > starts[0] + 1 and "/shared" not in words[starts[0]]:
-                    found.append((guide.name, words[starts[0] + 1 :]))
+                for place, word in enumerate(words[:-1]):
+                    is_first = word == "stickslip" and (place == 0 or words[place - 1] == "coordinator")
+                    if is_first or word.endswith("/bin/stickslip"):
+                        found.append((guide.name, words[place + 1 :]))
     return found
 
 
 @pytest.mark.parametrize(("place", "words"), stickslip_commands())
 def test_commands_of_the_guides_exist(place: str, words: list[str]) -> None:
-    verbs = words[:2] if words[0] == "keys" else words[:1]
+    verbs = words[:2] if words[0] in ("keys", "datasets") else words[:1]
+    verbs = [verb for verb in verbs if not verb.startswith("-")]
     known = set(_OPTION.findall(help_of(sys.executable, "-m", "stickslip_services.cli", *verbs)))
     given = {word.split("=")[0] for word in words if word.startswith("--")}
     assert given <= known, (place, given - known)
