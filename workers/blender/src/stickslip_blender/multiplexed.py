@@ -117,7 +117,7 @@ class Composer:
         seen = see(projected(camera, points), self._geometry.triangles, window)
         cover = np.zeros(light.shape[:2], dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        factor: Floats = 1.0 + (1.0 - cover[..., None]) * (floor - 1.0)
+        factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * (floor - 1.0), dtype=np.float32)
         return light * factor
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
@@ -149,8 +149,8 @@ class Composer:
         path = np.clip(around[..., 1] / np.maximum(around[..., 0], np.float32(1e-6)), 0.0, 1.0)
         # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower
         # across the plane of incidence than in it, by the sine of the angle at which the camera looks down.
-        down = path * np.float32(_LOBE * camera.fy * substrate.roughness**2)
-        across = down * np.float32(-np.asarray(camera.rotation)[2, 2])
+        down = np.asarray(path * np.float32(_LOBE * camera.fy * substrate.roughness**2), dtype=np.float32)
+        across = np.asarray(down * np.float32(-np.asarray(camera.rotation)[2, 2]), dtype=np.float32)
         flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
         blurred = _raster.blurred(np.concatenate([shown, flat], axis=2), down, across)
         share = blurred[..., :1]
