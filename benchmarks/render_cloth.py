@@ -206,7 +206,7 @@ def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> No
         spent[0] += time.process_time() - start
         return result
 
-    FrameReader._rendered = timed  # type: ignore[method-assign]
+    FrameReader._rendered = timed  # type: ignore[assignment, method-assign]
     look = ClothDragRender(
         rig="drag",
         rig_digest=rig_digest("drag"),

@@ -112,13 +112,11 @@ def main() -> None:
             found.append((level, cost))
             print(f"{peer.name}, {samples} samples: {cost:.2f} CPU s, {level:.1f} dB", flush=True)
         levels, costs = np.array(found).T
-        for quality, (level, cost) in own.items():
+        for name, (level, cost) in own.items():
             if levels.min() <= level <= levels.max():
                 order = np.argsort(levels)
                 equal = float(np.exp(np.interp(level, levels[order], np.log(costs[order]))))
-                print(
-                    f"{peer.name} at the {level:.1f} dB of our {quality}: {equal:.2f} CPU s, {equal / cost:.1f} x ours"
-                )
+                print(f"{peer.name} at the {level:.1f} dB of our {name}: {equal:.2f} CPU s, {equal / cost:.1f} x ours")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 from demo import console, run, service
+from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.manifest import Manifest
 from stickslip_services.client.http import Client
 from thesis_cloth_simulations import DATABASE
@@ -67,7 +68,8 @@ def report(dataset: Path, database: Path, job: str, wall: float) -> None:
         for stage, cached, seconds in rows:
             spent[stage, bool(cached)].append(seconds)
     manifest = Manifest.model_validate_json((dataset / "manifest.json").read_bytes())
-    length = manifest.spec.frames  # type: ignore[attr-defined]  # it is a spec of cloth
+    assert isinstance(manifest.spec, ClothDragSpec)
+    length = manifest.spec.frames
     frames = manifest.valid_count * length
     console.rule("cost")
     console.print(f"{manifest.valid_count} of {manifest.sample_count} clips, {frames} frames in {wall:.0f} s")

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 from rich.console import Console
@@ -11,7 +11,7 @@ from stickslip_schemas.samples import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.coco import export_coco
-from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.reader import DatasetReader, Split
 
 
 def info(
@@ -61,7 +61,7 @@ def coco(
     if split is not None and split not in SPLITS:
         raise typer.BadParameter(f"must be one of {', '.join(SPLITS)}; got {split!r}", param_hint="--split")
     with errors_told(), DatasetReader(dataset) as reader:
-        images, annotations = export_coco(reader, out, every=every, split=split)
+        images, annotations = export_coco(reader, out, every=every, split=cast(Split | None, split))
         Console().print(f"{images} images, {annotations} segments in {out}")
 
 

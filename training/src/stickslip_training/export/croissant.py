@@ -73,7 +73,7 @@ _CONTEXT: dict[str, Any] = {
 
 def document(content: Content, files: dict[str, Path], *, licence: str | None = None) -> bytes:
     """Return the metadata of an export that consists of `files`, by their paths in it."""
-    described = {
+    described: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
