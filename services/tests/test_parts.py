@@ -146,5 +146,5 @@ def test_both_commands_have_the_same_options() -> None:
         return {name for parameter in command.params for name in parameter.opts if name.startswith("--")}
 
     ours = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
-    theirs = typer.main.get_command(training.app).commands["export"]
+    theirs = typer.main.get_command(training.app).commands["export"]  # type: ignore[attr-defined]
     assert options(ours) == options(theirs) | {"--url"}

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.responses import JobDetail
 from stickslip_schemas.states import JobState
 from stickslip_schemas.store import Store
 from stickslip_services import upkeep
@@ -27,6 +28,13 @@ from typer.testing import CliRunner
 DAY = 24 * 3600.0
 
 
+def submitted(coordinator: Coordinator, gamma: tuple[float, ...]) -> JobDetail:
+    """Submit rods, and return the job."""
+    job = coordinator.submit(parsed(rods(gamma=gamma)), None)
+    assert isinstance(job, JobDetail)
+    return job
+
+
 @pytest.fixture
 def made(settings: Settings) -> list[str]:
     """Two datasets that share two of their four simulations each; return their ids. The coordinator has ended."""
@@ -35,9 +43,11 @@ def made(settings: Settings) -> list[str]:
     worker = PretendWorker(coordinator, coordinator.store).register()
     ids = []
     for gamma in ((1.0, 2.0), (2.0, 3.0)):
-        job = coordinator.submit(parsed(rods(gamma=gamma)), None)
+        job = submitted(coordinator, gamma)
         worker.work()
-        ids.append(show_job(coordinator, job.id).dataset.dataset)
+        dataset = show_job(coordinator, job.id).dataset
+        assert dataset is not None
+        ids.append(dataset.dataset)
     for file in unused(coordinator.database, coordinator.store, older_than=-1):
         file.path.unlink()  # a pretended worker leaves something behind
     coordinator.close()
@@ -124,7 +134,7 @@ def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) ->
     run(settings, "gc", "--delete", "--older-than", 0)
     _, _, coordinator = look(settings)
     worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.submit(parsed(rods(gamma=(1.0, 2.0))), None)
+    job = submitted(coordinator, (1.0, 2.0))
     worker.work()
     assert show_job(coordinator, job.id).state == JobState.succeeded
     simulated = [task for task in worker.ran if task.startswith("simulate")]
@@ -182,7 +192,7 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
     PretendWorker(coordinator, coordinator.store).register()
     (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
     coordinator.store.path(version.manifest).unlink()  # so that a job makes it once more
-    again = coordinator.submit(parsed(rods(gamma=(1.0, 2.0))), None)
+    again = submitted(coordinator, (1.0, 2.0))
     coordinator.close()
     result = run(settings, "rm", f"{made[0]}:v1")
     assert result.exit_code == 1
