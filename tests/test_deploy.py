@@ -119,13 +119,10 @@ def test_compose_holds_containers_tight() -> None:
 
 
 def test_compose_is_what_docker_takes() -> None:
-    if (
-        subprocess.run(["docker", "compose", "version"], capture_output=True).returncode
-        if shutil.which("docker")
-        else 1
-    ):
+    asked = ["docker", "compose", "version"]
+    if shutil.which("docker") is None or subprocess.run(asked, capture_output=True).returncode != 0:
         pytest.skip("docker compose is not installed")
-    command = ["docker", "compose", "--file", DEPLOY / "compose" / "compose.yaml", "config", "--quiet"]
+    command = ["docker", "compose", "--file", str(DEPLOY / "compose" / "compose.yaml"), "config", "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
