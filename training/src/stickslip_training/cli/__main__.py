@@ -2,4 +2,5 @@
 
 from stickslip_training.cli import app
 
-app(prog_name="stickslip-train")
+if __name__ == "__main__":
+    app(prog_name="stickslip-train")
