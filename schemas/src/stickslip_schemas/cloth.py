@@ -205,7 +205,7 @@ class ClothSpec(JobSpec):
     ground_truth: tuple[GroundTruth, ...] = Field(
         default=(),
         description="arrays of what is known of every pixel: depth, segmentation, normals, uv, flow",
-        json_schema_extra={"uniqueItems": True, "x-cost": "10 % more CPU time; all five take 5 to 10 MB a sample"},
+        json_schema_extra={"uniqueItems": True, "x-cost": "more CPU time and storage, not measured yet"},
     )
     creases: Float = Field(
         default=0.0,
