@@ -52,6 +52,18 @@ _ESSENTIAL = ("gcs/gcs_server", "raylet/raylet", "ray::DashboardAgent", "ray::Ru
 """Parts of the command lines of the processes without which a cluster does not work for long."""
 
 
+_QUIET = {
+    "RAY_prestart_worker_first_driver": "0",  # no process in reserve: ours are actors
+    "RAY_task_events_report_interval_ms": "0",  # no history of tasks: nobody reads it
+    "RAY_enable_metrics_collection": "0",
+    "RAY_event_stats": "0",
+    "RAY_raylet_report_resources_period_milliseconds": "1000",
+    "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
+    "RAY_memory_monitor_refresh_ms": "1000",
+}
+"""Settings of a cluster of ours. With Ray's own, its processes look around several times a second, which costs as much
+as small tasks do."""
+
 _UNNEEDED = ("ray/_private/log_monitor.py", "ray/autoscaler/_private/monitor.py")
 """Those of the processes that do nothing for us: output of workers stays in their files, and no node is to be added."""
 
@@ -81,7 +93,7 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
         _bury(directory)
         # Without a token, every user of the machine could run code as this one. The name of the variable is Ray's: with
         # 0 it takes the loopback address for the node's, and all its processes listen there and nowhere else.
-        os.environ |= {
+        os.environ |= _QUIET | {
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
