@@ -166,8 +166,9 @@ def predict(
             with DatasetReader(dataset) as reader:
                 clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
             slots = found.tolist()
-        answers = predictions(friction.estimate(clips), slots)
-        for answer, far in zip(answers, friction.strangeness(clips).tolist(), strict=True):
+        posterior, strangeness = friction.look(clips)
+        answers = predictions(posterior, slots)
+        for answer, far in zip(answers, strangeness.tolist(), strict=True):
             answer["strangeness"] = round(far, 3)
     if as_json:
         typer.echo(json.dumps(answers, indent=1))

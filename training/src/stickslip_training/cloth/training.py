@@ -117,15 +117,19 @@ class FrictionModel:
 
     def estimate(self, clips: Clips) -> Posterior:
         """Return the posterior of every clip: the mean over the networks."""
-        answers = [answer(net, clips) for net in self.nets]
-        return Posterior.mean([_posterior(*each, self.materials, self.bins, self.temperature) for each in answers])
+        return self.look(clips)[0]
 
     def strangeness(self, clips: Clips) -> Floats:
         """Return how far every clip is from what was trained on, over the limit: more than 1 is unfamiliar."""
-        far = [
-            own.distance(features(net, clips)) / own.limit for net, own in zip(self.nets, self.familiarity, strict=True)
-        ]
-        return np.asarray(np.mean(far, axis=0))
+        return self.look(clips)[1]
+
+    def look(self, clips: Clips) -> tuple[Posterior, Floats]:
+        """Return the posterior of every clip, and its strangeness; each network sees the clips once."""
+        seen = [features(net, clips) for net in self.nets]
+        answers = [answer(net, own) for net, own in zip(self.nets, seen, strict=True)]
+        posteriors = [_posterior(*each, self.materials, self.bins, self.temperature) for each in answers]
+        far = [known.distance(own) / known.limit for known, own in zip(self.familiarity, seen, strict=True)]
+        return Posterior.mean(posteriors), np.asarray(np.mean(far, axis=0))
 
 
 def train_friction(
@@ -167,9 +171,10 @@ def train_friction(
         net = fitted.net.cpu()
         assert isinstance(net, PosteriorNet)
         seen = learner.validation
-        temperature = calibrated(*answer(net, seen), seen.material, seen.mu, MU_BINS)
+        found = features(net, seen)
+        temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
         known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
-        familiarity = Familiarity.of(features(net, known), known.material, features(net, seen), len(train.materials))
+        familiarity = Familiarity.of(features(net, known), known.material, found, len(train.materials))
     card = {
         "settings": asdict(settings),
         "training_runs": len(train),
@@ -347,17 +352,17 @@ class _FrictionLearner(Learner):
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
-        posterior = _posterior(*answer(net, self.validation), self.train.materials, MU_BINS, (1.0, 1.0))
+        posterior = _posterior(*answer(net, features(net, self.validation)), self.train.materials, MU_BINS, (1.0, 1.0))
         return -float(posterior.log_likelihood(self.validation.material, self.validation.mu).mean())
 
 
 # --- answers --------------------------------------------------------------------------------------------------
 
 
-def answer(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, SingleFloats]:
-    """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K)."""
+def answer(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, SingleFloats]:
+    """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K), of features, (clips, n)."""
     with torch.inference_mode():
-        material, mu = net.read(torch.from_numpy(features(net, clips)).to(next(net.parameters()).device))
+        material, mu = net.read(torch.from_numpy(seen).to(next(net.parameters()).device))
     return material.cpu().numpy(), mu.cpu().numpy()
 
 
