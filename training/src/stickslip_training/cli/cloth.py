@@ -20,7 +20,7 @@ cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of
 RunsArgument = Annotated[
     str, typer.Argument(metavar="RUNS", help="a dataset that stores positions, or a packed file of simulations (.npz)")
 ]
-ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.pt of `cloth train`")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.safetensors of `cloth train`")]
 
 _SHARES = (0.12, 0.25)
 """Of the simulations of a packed file, for validation and test; a dataset has splits of its own."""
@@ -55,9 +55,9 @@ def train(
             parts["train"], parts["validation"], settings, out=out, identity=source, resume=resume, on_epoch=tell
         )
         model.card.update(source)
-        save_friction(out / "friction.pt", model)
+        save_friction(out / "friction.safetensors", model)
         (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")
-    console.print(f"{out}: friction.pt, report.json, checkpoint.pt", soft_wrap=True)
+    console.print(f"{out}: friction.safetensors, report.json, checkpoint.pt", soft_wrap=True)
 
 
 @cloth.command()
@@ -147,7 +147,9 @@ def import_(
 @cloth.command()
 def predict(
     dataset: Annotated[str, typer.Argument(metavar="DATASET_OR_CLIP", help="a dataset, or what `cloth import` wrote")],
-    model: Annotated[Path, typer.Option(help="friction.pt of `cloth train`")],
+    model: Annotated[
+        Path | None, typer.Option(help="friction.safetensors of `cloth train`; that of the package if not given")
+    ] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
@@ -155,11 +157,11 @@ def predict(
     with 80 %."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
-    from stickslip_training.cloth.training import load_friction
+    from stickslip_training.cloth.training import WEIGHTS, load_friction
     from stickslip_training.cloth.video import load_clip
 
     with errors_told():
-        friction = load_friction(model)
+        friction = load_friction(model or WEIGHTS)
         if dataset.endswith(".npz"):
             clips, slots = load_clip(dataset), [0]
         else:
