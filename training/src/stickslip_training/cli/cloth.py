@@ -22,7 +22,7 @@ RunsArgument = Annotated[
 ]
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.safetensors of `cloth train`")]
 
-_SHARES = (0.12, 0.25)
+SHARES = (0.12, 0.25)
 """Of the simulations of a packed file, for validation and test; a dataset has splits of its own."""
 
 
@@ -162,12 +162,16 @@ def predict(
 
     with errors_told():
         friction = load_friction(model or WEIGHTS)
+        true: list[str] = []
         if dataset.endswith(".npz"):
             clips, slots = load_clip(dataset), [0]
         else:
             with DatasetReader(dataset) as reader:
                 clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
+                names = reader.categories("material")
+                fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
+            true = [f"{fabric}, {mu:.2f}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
         posterior, strangeness = friction.look(clips)
         answers = predictions(posterior, slots)
         for answer, far in zip(answers, strangeness.tolist(), strict=True):
@@ -176,13 +180,14 @@ def predict(
         typer.echo(json.dumps(answers, indent=1))
         return
     table = Table()
-    for title in ("slot", "material", "mu", "80 %", ""):
-        table.add_column(title, justify="left" if title in ("material", "") else "right")
-    for answer in answers:
+    for title in ("slot", "material", "mu", "80 %", *(["truth"] if true else []), ""):
+        table.add_column(title, justify="right" if title in ("slot", "mu", "80 %") else "left")
+    for place, answer in enumerate(answers):
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
         told = f"{mu['low']:.2f} to {mu['high']:.2f}"
-        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told, _warning(answer))
+        cells = [str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told]
+        table.add_row(*cells, *true[place : place + 1], _warning(answer))
     Console().print(table)
 
 
@@ -224,7 +229,7 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
     from stickslip_training.cloth.training import INSTANTS
 
     if source.endswith(".npz"):
-        parts = split_runs(load_runs(source), _SHARES, seed)
+        parts = split_runs(load_runs(source), SHARES, seed)
         named: dict[str, Any] = {"runs": sha256(Path(source).read_bytes())}
         return named, dict(zip(("train", "validation", "test"), parts, strict=True))
     with DatasetReader(source) as reader:

@@ -227,8 +227,8 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             net = PosteriorNet(**about["sizes"])
             net.load_state_dict({name: tensors[f"nets.{i}.{name}"] for name in net.state_dict()})
             nets.append(net.eval())
-            parts = (tensors[f"familiarity.{i}.{name}"].double().numpy() for name in ("means", "precision"))
-            known.append(Familiarity(*parts, about["limits"][i]))
+            means, precision = (tensors[f"familiarity.{i}.{name}"].numpy() for name in ("means", "precision"))
+            known.append(Familiarity(means, precision, about["limits"][i]))
     except (safetensors.SafetensorError, KeyError, RuntimeError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} must be a model of `stickslip-train cloth train`, and is none: {error}") from error
     first, second = about["temperature"]
