@@ -44,8 +44,8 @@ from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig, rig_digest
-from stickslip_schemas.chunks import decode_chunk
 from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.codecs import decode_clip
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.store import Store
@@ -237,7 +237,7 @@ def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> No
         shape = (len(TEXTURES), len(look.instants), 224, 224, 3)
         clips = np.empty(shape, dtype=np.uint8)
         for clip, where in zip(clips, result.output.clips.values(), strict=True):
-            decode_chunk(store.read(where.digest, offset=where.offset, length=where.length), clip)
+            decode_clip(store.read(where.digest, offset=where.offset, length=where.length), clip)
         actor.close()
     np.save(out, clips)
     blender, every = spent

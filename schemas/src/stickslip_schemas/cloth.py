@@ -94,6 +94,10 @@ class PresetName(StrEnum):
     thesis_low_big_dt = "thesis-low-big-dt"
 
 
+PICTURE_DECIBELS = {Quality.preview: 34.8, Quality.draft: 39.7, Quality.standard: 41.8, Quality.high: 0.0}
+"""PSNR of the cloth's pixels by quality [dB]: `benchmarks/render_cloth.py` measures it."""
+
+
 class ClothAxes(Document):
     """What the material of a cloth and its friction may be."""
 
@@ -250,6 +254,10 @@ class ClothSpec(JobSpec):
         """Return the cameras of the viewpoints, by name."""
         return load_rig(self.rig)
 
+    def picture_decibels(self) -> float | None:
+        """Return the PSNR of the pictures of this quality, as measured [dB]."""
+        return PICTURE_DECIBELS[self.quality]
+
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
         if stage is Stage.render:
@@ -313,6 +321,7 @@ class ClothSpec(JobSpec):
                 ("frame", "y", "x", "rgb"),
                 "sRGB clip",
                 per_sample=True,
+                is_clip=True,
                 attributes={"instants": list(self.shown_instants)},
             ),
             *self._ground_truth_arrays(),
