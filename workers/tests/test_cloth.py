@@ -11,6 +11,7 @@ import pytest
 import tensorstore
 import xarray
 import zarr
+from PIL import Image
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.chunks import encode_trajectory
@@ -215,6 +216,7 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
                 if name in arrays:
                     arrays[name][i] = values[0]
             arrays["video"][i] = rng.integers(0, 4, arrays["video"].shape[1:])
+            arrays["video"][i, 1] += 100
             chunk = encode_clip(arrays["video"][i])
             where = ChunkRef(digest=store.publish(chunk), offset=0, length=len(chunk))
             slots.append(
@@ -291,6 +293,8 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
         direct_slots=(1,),
     )
     assert "rendered directly instead: 1." in (directory / "README.md").read_text()
+    with Image.open(directory / "preview.webp") as picture:
+        assert (picture.format, picture.n_frames) == ("WEBP", 2)
     assert manifest.cameras == load_rig("drag")
     assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
 

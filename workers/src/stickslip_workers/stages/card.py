@@ -8,6 +8,8 @@ from stickslip_schemas.axes import AnyAxis, ListAxis
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest
 
+from stickslip_workers.stages.preview import PREVIEW_NAME
+
 CARD_NAME = "README.md"
 
 SHOWN_VALUES = 12
@@ -22,6 +24,11 @@ def card(manifest: Manifest) -> bytes:
         f"# {spec.name or manifest.dataset}",
         f"{(type(spec).__doc__ or spec.kind).strip().splitlines()[0]}",
         f"Dataset `{name}`, made by stickslip: {manifest.sample_count} samples, {manifest.valid_count} of them valid.",
+        *(
+            [f"![Some of the samples]({PREVIEW_NAME})"]
+            if PREVIEW_NAME in {file.path for file in manifest.files}
+            else []
+        ),
         "## Parameters",
         f"The samples are the {_COMBINED[spec.combine]} of these axes.",
         _table(("axis", "values", "unit and meaning"), [_axis_row(spec, *item) for item in spec.named_axes.items()]),

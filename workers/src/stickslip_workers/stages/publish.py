@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.chunks import decode_chunk
+from stickslip_schemas.chunks import decode_chunk, decode_shard_index, shard_index_size
 from stickslip_schemas.keys import canonical_json
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import (
@@ -23,6 +23,7 @@ from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskR
 
 from stickslip_workers.stages.card import CARD_NAME, card
 from stickslip_workers.stages.metadata import metadata_files
+from stickslip_workers.stages.preview import PREVIEW_NAME, pictured, preview
 
 
 def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:
@@ -54,6 +55,9 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         sample_keys=task.sample_keys,
         files=tuple(files),
     )
+    if (picture := _preview(task, store)) is not None:
+        files.append(FileEntry(path=PREVIEW_NAME, sha256=store.publish(picture), size=len(picture)))
+        manifest = manifest.model_copy(update={"files": tuple(files)})
     text = card(manifest)
     files.append(FileEntry(path=CARD_NAME, sha256=store.publish(text), size=len(text)))
     manifest = manifest.model_copy(update={"files": tuple(sorted(files, key=lambda file: file.path))})
@@ -115,6 +119,25 @@ def _pictures(task: PublishTask, store: Store) -> Pictures | None:
         gate_db=gate,
         direct_slots=tuple(direct.tolist()),
     )
+
+
+def _preview(task: PublishTask, store: Store) -> bytes | None:
+    """Return the picture of the version; None where nothing is rendered, or valid."""
+    array = pictured(task.spec)
+    if array is None:
+        return None
+    files = {file.path: file for file in task.files}
+    size = task.spec.samples_per_shard
+
+    def chunk(slot: int) -> bytes:
+        file = files[array.shard_path(slot // size)]
+        tail = shard_index_size(size)
+        index = decode_shard_index(store.read(file.sha256, offset=file.size - tail, length=tail), size)
+        offset, length = index[slot % size].tolist()
+        return store.read(file.sha256, offset=offset, length=length)
+
+    valid = np.flatnonzero(_column("valid", task, store)).tolist()
+    return preview(task.spec, array, valid, chunk)
 
 
 def _column(name: str, task: PublishTask, store: Store) -> npt.NDArray[Any]:
