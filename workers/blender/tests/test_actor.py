@@ -154,7 +154,7 @@ from stickslip_blender.actor import RenderActor
 from stickslip_blender import clips
 from stickslip_blender.clips import GATE
 from stickslip_blender.pixels import FrameReader
-FrameReader.read = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
+FrameReader.read_matte = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
 """
 
