@@ -12,6 +12,7 @@ import json
 import sqlite3
 import time
 from collections import defaultdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ def main() -> None:
     with service(args.out / "service") as url:
         if args.certificate is not None:
             run("stickslip", "register", args.certificate, "--url", url)
+        wait_for_worker(url)
         started = time.monotonic()
         path = args.out / f"{spec['name']}.yaml"
         path.write_text(yaml.safe_dump(spec))
@@ -54,6 +56,14 @@ def main() -> None:
         run("stickslip", "pull", job.dataset.dataset, dataset, "--url", url)
     run("stickslip", "verify", dataset)
     report(dataset, args.out / DATABASE, job.id, wall)
+
+
+def wait_for_worker(url: str) -> None:
+    """Wait until a worker of today is there: a job is planned for the builds of the newest that has registered."""
+    started = datetime.now(UTC)
+    with Client(url) as client:
+        while not any(worker.registered_at >= started for worker in client.workers()):
+            time.sleep(1.0)
 
 
 def report(dataset: Path, database: Path, job: str, wall: float) -> None:
