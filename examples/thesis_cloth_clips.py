@@ -39,10 +39,11 @@ def main() -> None:
         spec |= {"name": "small-cloth-clips", "preset": "fast", "mesh": 13, "frames": 6, "allow_uncertified": True}
         spec["axes"] |= {"material": ["gray-interlock"], "mu": [0.5]}
     args.out.mkdir(exist_ok=True)
+    begun = datetime.now(UTC)
     with service(args.out / "service") as url:
         if args.certificate is not None:
             run("stickslip", "register", args.certificate, "--url", url)
-        wait_for_worker(url)
+        wait_for_worker(url, begun)
         started = time.monotonic()
         path = args.out / f"{spec['name']}.yaml"
         path.write_text(yaml.safe_dump(spec))
@@ -58,11 +59,10 @@ def main() -> None:
     report(dataset, args.out / DATABASE, job.id, wall)
 
 
-def wait_for_worker(url: str) -> None:
-    """Wait until a worker of today is there: a job is planned for the builds of the newest that has registered."""
-    started = datetime.now(UTC)
+def wait_for_worker(url: str, since: datetime) -> None:
+    """Wait until a worker has registered since then: a job is planned for the builds of the newest one."""
     with Client(url) as client:
-        while not any(worker.registered_at >= started for worker in client.workers()):
+        while not any(worker.registered_at >= since for worker in client.workers()):
             time.sleep(1.0)
 
 
