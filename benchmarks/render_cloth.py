@@ -236,8 +236,8 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
     whole = np.array(pictures)
     of_trace, of_all = (100 * np.median(part / whole) for part in (np.array(known), np.add(known, written)))
     print(
-        f"ground truth: {1e3 * np.median(known):.0f} ms a frame, {of_trace:.1f} % of the {1e3 * np.median(whole):.0f} ms "
-        f"of a trace and its eight pictures; {of_all:.1f} % with writing it",
+        f"ground truth: {1e3 * np.median(known):.0f} ms a frame, {of_trace:.1f} % of the "
+        f"{1e3 * np.median(whole):.0f} ms of a trace and its eight pictures; {of_all:.1f} % with writing it",
         flush=True,
     )
 
