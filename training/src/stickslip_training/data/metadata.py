@@ -76,9 +76,10 @@ _CRC = {"name": "crc32c", "configuration": {}}
 
 
 def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
-    order = axes_order(array)
-    turned = [] if order is None else [{"name": "transpose", "configuration": {"order": list(order)}}]
-    chunk = [*turned, _LITTLE, {"name": "blosc" if array.is_trajectory else "zstd", "configuration": {}}, _CRC]
+    compressor = {"name": "blosc" if array.is_trajectory else "zstd", "configuration": {}}
+    chunk: list[dict[str, Any]] = [_LITTLE, compressor, _CRC]
+    if (order := axes_order(array)) is not None:
+        chunk.insert(0, {"name": "transpose", "configuration": {"order": list(order)}})
     if not array.per_sample:
         return chunk
     configuration = {
