@@ -76,7 +76,7 @@ _CRC = {"name": "crc32c", "configuration": {}}
 
 
 def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
-    compressor = {"name": "blosc" if array.is_trajectory else "zstd", "configuration": {}}
+    compressor: dict[str, Any] = {"name": "blosc" if array.is_trajectory else "zstd", "configuration": {}}
     chunk: list[dict[str, Any]] = [_LITTLE, compressor, _CRC]
     if (order := axes_order(array)) is not None:
         chunk.insert(0, {"name": "transpose", "configuration": {"order": list(order)}})

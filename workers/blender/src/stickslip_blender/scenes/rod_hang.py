@@ -147,7 +147,7 @@ class RodRenderer:
         """
         padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))
         rows, columns = coverage.shape
-        around = sum(padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3))
+        around = np.sum([padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3)], axis=0)
         hit = around[..., 3:] > 0.0
         help_ = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
         mean = (light + help_)[..., :3] / np.where(hit, (light + help_)[..., 3:], 1.0)
