@@ -13,6 +13,7 @@ import zarr
 from PIL import Image
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import sha256
+from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
 from stickslip_schemas.manifest import Manifest, Pictures, check_seal
 from stickslip_schemas.store import Store
 from stickslip_workers.stages import publish as publish_module
@@ -75,7 +76,7 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     assert sum(manifest.split_counts.values()) == 6
     assert [camera.name for camera in manifest.cameras]
     assert manifest.acceptance_rate == pytest.approx(6 / 7)
-    assert manifest.pictures == Pictures(quality=Quality.standard, psnr_db=30.3, gate_db=None, direct_slots=())
+    assert manifest.pictures == Pictures(quality=Quality.standard, psnr_db=PICTURE_DECIBELS[Quality.standard], gate_db=None, direct_slots=())
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 1)
 
