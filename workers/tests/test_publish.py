@@ -76,7 +76,8 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     assert sum(manifest.split_counts.values()) == 6
     assert [camera.name for camera in manifest.cameras]
     assert manifest.acceptance_rate == pytest.approx(6 / 7)
-    assert manifest.pictures == Pictures(quality=Quality.standard, psnr_db=PICTURE_DECIBELS[Quality.standard], gate_db=None, direct_slots=())
+    level = PICTURE_DECIBELS[Quality.standard]
+    assert manifest.pictures == Pictures(quality=Quality.standard, psnr_db=level, gate_db=None, direct_slots=())
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 1)
 

@@ -204,7 +204,9 @@ class ClothSpec(JobSpec):
     quality: Quality = Field(
         default=Quality.standard,
         description="of the pictures",
-        json_schema_extra={"x-cost": "CPU time of a frame and texture: preview 0.04 s, draft 0.07 s, standard 0.10 s, high 0.33 s"},
+        json_schema_extra={
+            "x-cost": "CPU time of a frame and texture: preview 0.04 s, draft 0.07 s, standard 0.10 s, high 0.33 s"
+        },
     )
     ground_truth: tuple[GroundTruth, ...] = Field(
         default=(),
