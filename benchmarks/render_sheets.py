@@ -91,7 +91,7 @@ def save(path: Path, tiles: Sequence[tuple[str, Clip]], columns: int) -> None:
     frames = [Image.fromarray(frame) for frame in pictures]
     file = io.BytesIO()
     frames[0].save(
-        file, format="WEBP", save_all=True, append_images=frames[1:], duration=300, loop=0, quality=50, method=4
+        file, format="WEBP", save_all=True, append_images=frames[1:], duration=300, loop=0, quality=40, method=4
     )
     path.write_bytes(file.getvalue())
     print(f"{path}: {len(file.getvalue()) / 1e3:.0f} kB, {frames[0].size[0]} x {frames[0].size[1]}", flush=True)

@@ -3,10 +3,12 @@
     .venv/bin/python tools/dataset_sheet.py DATASET OUT.webp --rows material --columns mu [--only texture=floral ...]
 
 It made docs/figures/cloth-friction.webp and cloth-textures.webp from what `examples/thesis_cloth_clips.py` makes.
+--only takes several values of a label, as in mu=0.1,0.5.
 """
 
 import argparse
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ def main() -> None:
     arguments.add_argument("out", type=Path)
     arguments.add_argument("--rows", required=True)
     arguments.add_argument("--columns", required=True)
-    arguments.add_argument("--only", nargs="*", default=[], metavar="LABEL=VALUE", help="which samples")
+    arguments.add_argument("--only", nargs="*", default=[], metavar="LABEL=VALUE,...", help="which samples")
     arguments.add_argument("--frames", type=int, default=15)
     arguments.add_argument("--side", type=int, default=112, help="of a picture [px]")
     arguments.add_argument("--quality", type=int, default=45, help="of the WebP, 1 to 100")
@@ -31,16 +33,16 @@ def main() -> None:
     with DatasetReader(options.dataset) as reader:
         chosen = reader.valid.copy()
         for name, _, value in (condition.partition("=") for condition in options.only):
-            chosen &= _named(reader, name) == value
+            chosen &= np.isin(_named(reader, name), value.split(","))
         rows, columns = _named(reader, options.rows), _named(reader, options.columns)
-        places = dict.fromkeys(zip(rows[chosen].tolist(), columns[chosen].tolist(), strict=True))
+        across = list(dict.fromkeys(columns[chosen].tolist()))
         tiles = []
-        for row, column in places:
+        for row, column in product(dict.fromkeys(rows[chosen].tolist()), across):
             slot = int(np.flatnonzero(chosen & (rows == row) & (columns == column))[0])
             (clip,) = reader.read("video", [slot])
             clip = clip[list(shown_frames(min(options.frames, len(clip)), len(clip)))]
             tiles.append(labelled(clip, text_of({"row": row, "column": column}), options.side))
-    data = moving(sheet(tiles, len(dict.fromkeys(column for _, column in places))), quality=options.quality)
+    data = moving(sheet(tiles, len(across)), quality=options.quality)
     options.out.write_bytes(data)
     sys.stdout.write(f"{options.out}: {len(tiles)} clips, {len(data) / 1e3:.0f} kB\n")
 

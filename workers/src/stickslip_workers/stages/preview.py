@@ -14,7 +14,7 @@ from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import grid
 
 PREVIEW_NAME = "preview.webp"
-SHOWN, FRAMES = 12, 30
+SHOWN, FRAMES = 12, 20
 """Samples and instants that the picture has at most."""
 _COLUMNS = 4
 _SIDE = 120  # of a picture [px]
@@ -70,7 +70,7 @@ def sheet(tiles: Sequence[Pictures], columns: int) -> Pictures:
     return np.concatenate(rows, axis=1)
 
 
-def moving(pictures: Pictures, *, milliseconds: int = 120, quality: int = 60) -> bytes:
+def moving(pictures: Pictures, *, milliseconds: int = 120, quality: int = 50) -> bytes:
     """Return a WebP of pictures (n, height, width, 3) that follow one another for ever."""
     frames = [Image.fromarray(picture) for picture in pictures]
     file = io.BytesIO()
