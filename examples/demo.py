@@ -45,6 +45,7 @@ def main() -> None:
         cloth = submit(CLOTH, url)
         run("stickslip", "pull", cloth, OUT / "cloth-dataset", "--url", url)
         look_at_cloth(OUT / "cloth-dataset")
+        run("stickslip-train", "cloth", "predict", OUT / "cloth-dataset")
         console.rule("2,500 more rods, without pictures, to learn from")
         more_rods = submit(MORE_RODS, url)
         run("stickslip", "pull", more_rods, OUT / "training-dataset", "--url", url)

@@ -242,9 +242,13 @@ def kill_some(service: Service, victim: str) -> None:
         kill(random.choice(pids))
 
 
+KILLS = int(os.environ.get("STICKSLIP_KILLS", "10"))
+
+
 @pytest.mark.slow
+@pytest.mark.timeout(300 + 60 * KILLS)
 def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
-    count, seed = int(os.environ.get("STICKSLIP_KILLS", "10")), int(os.environ.get("STICKSLIP_SEED", "0"))
+    count, seed = KILLS, int(os.environ.get("STICKSLIP_SEED", "0"))
     random.seed(seed)
     watch = Watch(service)
     watch.wait_for_progress()

@@ -157,6 +157,28 @@ def test_a_render_process_that_is_killed_costs_one_try(start: Start, double: Coo
     assert double.results["again"].outcome == double.results["other"].outcome == "succeeded"
 
 
+def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
+    start: Start, double: CoordinatorDouble, store: Store
+) -> None:
+    start(slots=1)
+    double.offer(first=_render(fake_renderer.FINE))
+    double.until(lambda: "first" in double.results)
+    others = {f"fine-{i}": _render(fake_renderer.FINE) for i in range(3)}
+    double.offer(**others, crash=_render(HANG), bug=_render(fake_renderer.BUG))
+    together = _wait_for_pid(double, store, HANG)
+    assert set(double.results) == {"first"}  # those before it in the call have no answer of their own
+    (store.root / f"pid-{HANG}").unlink()
+    os.kill(together, signal.SIGKILL)
+    alone = _wait_for_pid(double, store, HANG)
+    assert alone != together
+    os.kill(alone, signal.SIGKILL)
+    double.until(lambda: len(double.results) == 6)
+    assert {name: result.reason for name, result in double.results.items() if result.outcome == "failed"} == {
+        "crash": Reason.renderer_crash,
+        "bug": Reason.internal_error,
+    }
+
+
 def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: Store) -> None:
     start(exec_seconds={**Settings(url="", store=store.root, name="x").exec_seconds, Stage.render: 0.5})
     double.offer(slow=_render(HANG))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.base import Document
@@ -46,6 +46,16 @@ class Selection(Document):
     where: tuple[str, ...] = Field(
         default=(), description="conditions that all hold: a label, one of < <= > >= == !=, and a value"
     )
+
+    @classmethod
+    def of_options(cls, arrays: str | None, split: str | None, where: Iterable[str] | None) -> "Selection":
+        """Return the part that options of a command choose, `arrays` being names with commas; raise ValueError."""
+        names = None if arrays is None else tuple(filter(None, (name.strip() for name in arrays.split(","))))
+        try:
+            return cls.model_validate({"arrays": names, "split": split, "where": tuple(where or ())})
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            raise ValueError(f"{first['loc'][0]}: {first['msg']}, and is {first['input']!r}") from None
 
     @property
     def is_everything(self) -> bool:

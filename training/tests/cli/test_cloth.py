@@ -23,7 +23,7 @@ def packed(request):
 @pytest.fixture(scope="module")
 def model(packed, tmp_path_factory):
     """A network after two steps: its answers have a form, and no worth."""
-    path = tmp_path_factory.mktemp("model") / "friction.pt"
+    path = tmp_path_factory.mktemp("model") / "friction.safetensors"
     runs = load_runs(packed)
     some = [runs[np.arange(*bounds)] for bounds in ((0, 6), (6, 8))]
     save_friction(path, train_friction(*some, ClothTraining(steps=2, batch_size=2, width=16), epoch=2))
@@ -48,7 +48,7 @@ def test_train_and_evaluate(packed, tmp_path):
     assert again.exit_code == 1
     assert "seed must be that of the run that is resumed, 0, and is 1" in again.stderr
     out = tmp_path / "report"
-    model = str(tmp_path / "run" / "friction.pt")
+    model = str(tmp_path / "run" / "friction.safetensors")
     judged = runner.invoke(app, ["cloth", "evaluate", model, str(packed), "--out", str(out), "--renders", "1"])
     assert judged.exit_code == 0, judged.output
     assert "material not known" in judged.output

@@ -46,8 +46,8 @@ def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, t
 
 def test_saved_and_loaded(few, tmp_path):
     model = train_friction(*few[:2], SMALL, epoch=6)
-    save_friction(tmp_path / "friction.pt", model)
-    again = load_friction(tmp_path / "friction.pt")
+    save_friction(tmp_path / "friction.safetensors", model)
+    again = load_friction(tmp_path / "friction.safetensors")
     clips = render_clips(few[2], 2, 0)
     assert np.array_equal(again.estimate(clips).joint, model.estimate(clips).joint)
     assert np.array_equal(again.strangeness(clips), model.strangeness(clips))

@@ -11,6 +11,7 @@ one, with another cluster.
 
 import contextlib
 import logging
+import math
 import os
 import secrets
 import shutil
@@ -19,11 +20,10 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from stickslip_schemas.keys import sha256
 
@@ -39,6 +39,12 @@ OWNER = "STICKSLIP_RAY_OWNER"
 WATCH_SECONDS = 0.5
 """Time between two looks at the processes of a cluster of our own [s]."""
 
+START_WATCH_SECONDS = 0.2
+"""The same while it starts [s]."""
+
+LATE_SECONDS = 5.0
+"""How long after the start processes are still looked for: agents are the last to take their names [s]."""
+
 ASK_SECONDS = 2.0
 """Time between two questions to the GCS of a cluster that was there already [s]."""
 
@@ -52,6 +58,18 @@ _ESSENTIAL = ("gcs/gcs_server", "raylet/raylet", "ray::DashboardAgent", "ray::Ru
 """Parts of the command lines of the processes without which a cluster does not work for long."""
 
 
+_QUIET = {
+    "RAY_prestart_worker_first_driver": "0",  # no process in reserve: ours are actors
+    "RAY_task_events_report_interval_ms": "0",  # no history of tasks: nobody reads it
+    "RAY_enable_metrics_collection": "0",
+    "RAY_event_stats": "0",
+    "RAY_raylet_report_resources_period_milliseconds": "1000",
+    "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
+    "RAY_memory_monitor_refresh_ms": "1000",
+}
+"""Settings of a cluster of ours. With Ray's own, its processes look around several times a second, which costs as much
+as small tasks do."""
+
 _UNNEEDED = ("ray/_private/log_monitor.py", "ray/autoscaler/_private/monitor.py")
 """Those of the processes that do nothing for us: output of workers stays in their files, and no node is to be added."""
 
@@ -64,7 +82,9 @@ class ClusterLostError(RuntimeError):
 class Cluster:
     """A Ray cluster."""
 
-    cpus: int
+    cpus: int = 0
+    is_up: threading.Event = field(default_factory=threading.Event)
+    """Set when it has started."""
     lost: str = ""
     """What of it is gone; empty while all is there."""
     closing: bool = False
@@ -81,7 +101,7 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
         _bury(directory)
         # Without a token, every user of the machine could run code as this one. The name of the variable is Ray's: with
         # 0 it takes the loopback address for the node's, and all its processes listen there and nowhere else.
-        os.environ |= {
+        os.environ |= _QUIET | {
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
@@ -99,20 +119,22 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
 
     import ray  # after the environment is set
 
+    cluster = Cluster()
+    if address is None:
+        threading.Thread(target=_watch, args=(cluster,), name="watch", daemon=True).start()
     try:
         ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
     except ConnectionError as error:
         raise ClusterLostError(f"no Ray cluster answers at {address}: {error}") from error
-    cluster = Cluster(int(ray.cluster_resources().get("CPU", 0)))
+    cluster.cpus = int(ray.cluster_resources().get("CPU", 0))
     if address is None:
         for pid in _processes(_UNNEEDED):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGTERM)
-        watch: Callable[[Cluster, Any], None] = _watch
-        watched: Any = _processes(_ESSENTIAL)
     else:
-        watch, watched = _ask, ray.get_runtime_context().gcs_address
-    threading.Thread(target=watch, args=(cluster, watched), name="watch", daemon=True).start()
+        gcs = ray.get_runtime_context().gcs_address
+        threading.Thread(target=_ask, args=(cluster, gcs), name="watch", daemon=True).start()
+    cluster.is_up.set()
     try:
         yield cluster
     finally:
@@ -122,12 +144,24 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
         ray.shutdown()
 
 
-def _watch(cluster: Cluster, processes: dict[int, str]) -> None:
-    """Wait until a process of the cluster is gone, and see that this one ends soon after."""
+def _watch(cluster: Cluster) -> None:
+    """Wait until a process of the cluster is gone, and see that this one ends: at once while the cluster starts, for
+    Ray would wait for it for 30 s, and soon when it is up.
+    """
+    processes: dict[int, str] = {}
+    looking_until = math.inf
     while not (gone := [name for pid, name in processes.items() if _parent_of(pid) is None]):
-        time.sleep(WATCH_SECONDS)
-    if not cluster.closing:
-        _lose(cluster, gone[0])
+        if time.monotonic() < looking_until:
+            processes |= _processes(_ESSENTIAL)
+        if cluster.is_up.is_set():
+            looking_until = min(looking_until, time.monotonic() + LATE_SECONDS)
+        time.sleep(WATCH_SECONDS if cluster.is_up.is_set() else START_WATCH_SECONDS)
+    if cluster.closing:
+        return
+    if not cluster.is_up.is_set():
+        log.error("%s died while the Ray cluster started: this dispatcher ends", gone[0])
+        _end()
+    _lose(cluster, gone[0])
 
 
 def _ask(cluster: Cluster, gcs: str) -> None:

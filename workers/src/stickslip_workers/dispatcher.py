@@ -8,8 +8,9 @@ import contextlib
 import logging
 import time
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -55,16 +56,20 @@ FRAMES_SECONDS = 2.0
 WARM_UP_SECONDS = 10.0
 """The first call of a process is gone by only where it took longer [s]."""
 
-REPORT_SECONDS = 0.5
+REPORT_SECONDS = 1.0
 """How long a result waits for others to be reported with, while there is other work to go on with."""
 
 AHEAD_SECONDS = 2.0
 MOST_AHEAD = 16
-"""Tasks that wait here, for each slot: enough for so long, but one at least and not more than so many. A request costs
+"""Calls that wait here, for each slot: enough for so long, but one at least and not more than so many. A request costs
 the coordinator about 10 ms whatever it asks for."""
 
 RENDERS_TOGETHER = 12
 """Renders of one trace that one call makes at most; so many are leased ahead, for they cost little more than one."""
+
+SHORT_SECONDS = 0.5
+"""Renders that share no trace are given to a process several at once, if they take so long together [s]: a call costs
+the dispatcher, Ray and the process some milliseconds."""
 
 LARGEST_BATCH = max(kind(name).batch for name in kind_names())
 """How many simulations to ask for at once: one call takes them all."""
@@ -82,9 +87,10 @@ _results = TypeAdapter(list[TaskResult])
 
 @dataclass(eq=False)
 class Assignment:
-    """Work that a process is at: one task, or a batch of simulations."""
+    """Work that a process is at: one task, a batch of simulations, or renders."""
 
-    leases: list[Lease]
+    parts: list[list[Lease]]
+    """Tasks that have one answer together: all simulations, or renders of one trace."""
     stage: Stage
     process: Process
     started_at: float
@@ -94,6 +100,11 @@ class Assignment:
     """Ray's reference to the frames that are done, while the process has not answered."""
     asked_at: float = 0.0
     unwanted_since: float | None = None
+
+    @property
+    def leases(self) -> list[Lease]:
+        """All tasks."""
+        return list(chain.from_iterable(self.parts))
 
 
 class Dispatcher:
@@ -141,8 +152,11 @@ class Dispatcher:
         self._running: dict[Any, Assignment] = {}
         self._reports: deque[Report] = deque()
         self._reports_due = 0.0
-        self._task_seconds: dict[Stage, float] = {}
+        self._part_seconds: dict[Stage, float] = {}
+        """How long one part of a call takes, lately."""
         self._simulation_seconds: float | None = None
+        self._alone: set[str] = set()
+        """Tasks that were in a call that failed: they are not put together with others again."""
         self._renders_share = False
         """Whether the last renders that were leased share traces."""
         self._next_lease = 0.0
@@ -236,22 +250,26 @@ class Dispatcher:
         pool = self._pool(assignment.stage)
         seconds = time.monotonic() - assignment.started_at
         # The first call of a process warms it up: how long it took says little of the others, unless it was long.
-        call_seconds = seconds if assignment.process.tasks or seconds > WARM_UP_SECONDS else None
+        each = seconds / len(assignment.parts)
+        call_seconds = each if assignment.process.tasks or seconds > WARM_UP_SECONDS else None
         try:
-            answer, resident = ray.get(ref)
+            answers, resident = ray.get(ref)
         except ray.exceptions.RayError as error:
             if isinstance(error, ray.exceptions.RayTaskError):
-                pool.give_back(assignment.process, 0)
+                pool.give_back(assignment.process, 0, len(assignment.parts))
             else:
                 log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
                 pool.note_death(assignment.process)
+            if self._has_queued_alone(assignment):
+                return
             result = process_failure(error, renders=assignment.stage is Stage.render)
             results = [with_damaged_inputs(result, lease.task, self._store) for lease in assignment.leases]
         else:
-            pool.give_back(assignment.process, resident)
-            results = _read_results(answer, assignment.leases)
+            pool.give_back(assignment.process, resident, len(assignment.parts))
+            parts = zip(answers, assignment.parts, strict=True)
+            results = [result for answer, leases in parts for result in _read_results(answer, leases)]
         results = [result.model_copy(update={"call_seconds": call_seconds}) for result in results]
-        self._task_seconds[assignment.stage] = 0.8 * self._task_seconds.get(assignment.stage, seconds) + 0.2 * seconds
+        self._part_seconds[assignment.stage] = 0.8 * self._part_seconds.get(assignment.stage, each) + 0.2 * each
         if assignment.stage is Stage.simulate:
             each = seconds / len(assignment.leases)
             self._simulation_seconds = 0.8 * (self._simulation_seconds or each) + 0.2 * each
@@ -261,10 +279,25 @@ class Dispatcher:
         for lease, result in zip(assignment.leases, results, strict=True):
             if result.outcome == "failed":
                 log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
+            self._alone.discard(lease.task_id)
             if self._book.holds(lease):
                 if not self._reports:
                     self._reports_due = time.monotonic() + REPORT_SECONDS
                 self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
+
+    def _has_queued_alone(self, assignment: Assignment) -> bool:
+        """Queue the parts of a call that failed, to be done one by one; return False where there was only one.
+
+        A render that ends its process must not count as a failure of those that were given to the process with it.
+        """
+        if len(assignment.parts) == 1:
+            return False
+        log.warning("a call for %s failed; each is done again by itself", _names(assignment.leases))
+        for lease in reversed(assignment.leases):
+            if self._book.holds(lease):
+                self._alone.add(lease.task_id)
+                self._queues[assignment.stage].appendleft(lease)
+        return True
 
     def _enforce_limits(self) -> None:
         """Kill what has run too long, and what nobody wants any more."""
@@ -279,6 +312,8 @@ class Dispatcher:
                 continue
             del self._running[ref]
             self._pool(assignment.stage).end(assignment.process)
+            if self._has_queued_alone(assignment):
+                continue
             result = failed(
                 Reason.exec_timeout,
                 f"not done within {assignment.limit:.3g} s; process {assignment.process.pid} killed",
@@ -305,24 +340,54 @@ class Dispatcher:
             while queue and len(self._running) < self._open_slots():
                 process = pool.take()
                 if process is None:
-                    waiting[pool] += _batch_count(stage, queue)
+                    waiting[pool] += self._calls(stage)
                     break
-                self._assign(_next_batch(queue), stage, process)
+                self._assign(self._next_parts(queue), stage, process)
         for pool, count in waiting.items():
             pool.grow_if_worth(min(count, self._open_slots() - len(self._running)))
 
-    def _assign(self, leases: list[Lease], stage: Stage, process: Process) -> None:
+    def _next_parts(self, queue: deque[Lease]) -> list[list[Lease]]:
+        """Take what one call does from `queue`."""
+        parts = [_next_batch(queue)]
+        if self._may_share_a_call(parts[0][0]):
+            while queue and len(parts) < self._renders_at_once() and self._may_share_a_call(queue[0]):
+                parts.append([queue.popleft()])
+        return parts
+
+    def _may_share_a_call(self, lease: Lease) -> bool:
+        """Tell whether a task is a render that shares no trace, and has not been in a call that failed."""
+        return isinstance(lease.task, RenderTask) and trace_of(lease.task) is None and lease.task_id not in self._alone
+
+    def _renders_at_once(self) -> int:
+        """Return how many renders that share no trace are short enough to be one call."""
+        each = max(self._part_seconds.get(Stage.render, SHORT_SECONDS), 1e-3)
+        return min(max(int(SHORT_SECONDS / each), 1), MOST_AHEAD)
+
+    def _calls(self, stage: Stage) -> int:
+        """Return about how many calls the queued tasks of a stage take."""
+        queue = self._queues[stage]
+        if stage is Stage.simulate:
+            return -(-len(queue) // LARGEST_BATCH)
         if stage is Stage.render:
-            ref = process.actor.call.remote("render", together(_renders(leases)).model_dump(mode="json"))
+            traces = [trace_of(task) for task in _renders(queue)]
+            return -(-traces.count(None) // self._renders_at_once()) + len(set(traces) - {None})
+        return len(queue)
+
+    def _assign(self, parts: list[list[Lease]], stage: Stage, process: Process) -> None:
+        if stage is Stage.render:
+            arguments: list[Any] = [together(_renders(leases)).model_dump(mode="json") for leases in parts]
+            ref = process.actor.call.remote("render", arguments)
         else:
-            tasks = _tasks.dump_json([lease.task for lease in leases]).decode()
-            ref = process.actor.call.remote("run", tasks)
-        limits = [lease.limit_seconds for lease in leases if lease.limit_seconds is not None]
+            arguments = [_tasks.dump_json([lease.task for lease in leases]).decode() for leases in parts]
+            ref = process.actor.call.remote("run", arguments)
+        limits = [[lease.limit_seconds for lease in leases if lease.limit_seconds is not None] for leases in parts]
         limit = self._settings.exec_seconds[stage]
-        if len(limits) == len(leases):  # they are put together because they are alike; the longest limit is that of all
-            limit = min(limit, max(limits))
-        self._running[ref] = Assignment(leases, stage, process, time.monotonic(), limit)
-        self._book.start(leases)
+        if sum(map(len, limits)) == sum(map(len, parts)):
+            # Tasks of a part are put together because they are alike: the longest limit is that of all of them.
+            limit = min(limit, sum(map(max, limits)))
+        assignment = Assignment(parts, stage, process, time.monotonic(), limit)
+        self._running[ref] = assignment
+        self._book.start(assignment.leases)
 
     def _open_slots(self) -> int:
         """Return how many calls may run now."""
@@ -432,7 +497,7 @@ class Dispatcher:
 
     def _wanted(self) -> dict[Stage, int]:
         """Return how many tasks to ask for: little more than what can run, so that a kill gives little back."""
-        queued = sum(_batch_count(stage, queue) for stage, queue in self._queues.items())
+        queued = sum(self._calls(stage) for stage in self._queues)
         if self._is_clogged():
             free = queued == 0 and len(self._running) < self._open_slots()
             return {stage: LARGEST_BATCH if stage is Stage.simulate else 1 for stage in Stage} if free else {}
@@ -443,17 +508,19 @@ class Dispatcher:
             ahead = self._ahead(stage)
             if idle > 0 or queued <= ahead // 2:  # not for one at a time
                 wanted[stage] = ahead + idle
-        if wanted.get(Stage.render, 0) > 0 and self._renders_share:
-            wanted[Stage.render] *= RENDERS_TOGETHER
+        if wanted.get(Stage.render, 0) > 0:
+            wanted[Stage.render] *= RENDERS_TOGETHER if self._renders_share else self._renders_at_once()
         if wanted and not self._queues[Stage.simulate]:
             short = self._simulation_seconds is not None and self._simulation_seconds <= LONG_SIMULATION
             wanted[Stage.simulate] = LARGEST_BATCH if short else self._slots
         return {stage: count for stage, count in wanted.items() if count > 0}
 
     def _ahead(self, stage: Stage) -> int:
-        """Return how many tasks of a stage to keep waiting."""
-        each = AHEAD_SECONDS / max(self._task_seconds.get(stage, AHEAD_SECONDS), 1e-3)
-        return self._slots * round(min(max(each, 1), MOST_AHEAD))
+        """Return how many calls of a stage to keep waiting."""
+        seconds = self._part_seconds.get(stage, AHEAD_SECONDS)
+        if stage is Stage.render:
+            seconds *= self._renders_at_once()
+        return self._slots * round(min(max(AHEAD_SECONDS / max(seconds, 1e-3), 1), MOST_AHEAD))
 
     # --- the end --------------------------------------------------------------------------------------------
 
@@ -533,18 +600,8 @@ def _read_results(answer: Any, leases: list[Lease]) -> list[TaskResult]:
         return [failure(error)] * len(leases)
 
 
-def _renders(leases: list[Lease]) -> list[RenderTask]:
+def _renders(leases: Iterable[Lease]) -> list[RenderTask]:
     return [lease.task for lease in leases if isinstance(lease.task, RenderTask)]
-
-
-def _batch_count(stage: Stage, queue: deque[Lease]) -> int:
-    """Return about how many calls the tasks of `queue` take."""
-    if stage is Stage.simulate:
-        return -(-len(queue) // LARGEST_BATCH)
-    if stage is Stage.render:
-        traces = [trace_of(task) for task in _renders(list(queue))]
-        return traces.count(None) + len(set(traces) - {None})
-    return len(queue)
 
 
 def _simulated_kind(lease: Lease) -> str | None:

@@ -27,8 +27,8 @@ class Host:
         """Return how far the object is, while `call` runs in another thread; None where it does not tell."""
         return self._inner.frames()
 
-    def call(self, method: str, argument: Any) -> tuple[Any, int]:
-        """Call a method, and return its answer and the resident memory after it [bytes]."""
-        answer = getattr(self._inner, method)(argument)
+    def call(self, method: str, arguments: list[Any]) -> tuple[list[Any], int]:
+        """Call a method with each of some arguments; return the answers, and the resident memory after them [bytes]."""
+        answers = [getattr(self._inner, method)(argument) for argument in arguments]
         pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return answer, pages * os.sysconf("SC_PAGE_SIZE")
+        return answers, pages * os.sysconf("SC_PAGE_SIZE")

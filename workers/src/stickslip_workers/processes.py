@@ -113,9 +113,9 @@ class Pool:
         self._busy.add(process)
         return process
 
-    def give_back(self, process: Process, resident: int) -> None:
-        """Return a process after a task; an old or fat one is replaced."""
-        process.tasks += 1
+    def give_back(self, process: Process, resident: int, tasks: int) -> None:
+        """Return a process after some tasks; an old or fat one is replaced."""
+        process.tasks += tasks
         if process.tasks >= self._settings.tasks_per_process or resident > self._settings.process_bytes:
             log.info("%s: process %d retires (%d bytes)", self._settings.sort, process.pid, resident)
             self.end(process)

@@ -74,7 +74,10 @@ def pull_dataset(
     stickslip-training shows the chosen samples only; other readers show fill values for what is not there.
     """
     screen = console()
-    selection = _selection(arrays, split, where)
+    try:
+        selection = Selection.of_options(arrays, split, where)
+    except ValueError as error:
+        raise ClientError(str(error)) from error
     with Client(url) as client:
         name, version = _resolve(client, dataset)
         columns = (BarColumn(bar_width=32), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
@@ -95,15 +98,6 @@ def pull_dataset(
         f"({wording.size(done.downloaded_bytes)}), {there} already there"
     )
     say(f"{target / 'README.md'} says what it holds and how to read it. To check it again: stickslip verify {target}")
-
-
-def _selection(arrays: str | None, split: str | None, where: list[str] | None) -> Selection:
-    names = None if arrays is None else tuple(filter(None, (name.strip() for name in arrays.split(","))))
-    try:
-        return Selection.model_validate({"arrays": names, "split": split, "where": tuple(where or ())})
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ClientError(f"{first['loc'][0]}: {first['msg']}, and is {first['input']!r}") from error
 
 
 @app.command("diff")

@@ -20,9 +20,9 @@ cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of
 RunsArgument = Annotated[
     str, typer.Argument(metavar="RUNS", help="a dataset that stores positions, or a packed file of simulations (.npz)")
 ]
-ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.pt of `cloth train`")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.safetensors of `cloth train`")]
 
-_SHARES = (0.12, 0.25)
+SHARES = (0.12, 0.25)
 """Of the simulations of a packed file, for validation and test; a dataset has splits of its own."""
 
 
@@ -55,9 +55,9 @@ def train(
             parts["train"], parts["validation"], settings, out=out, identity=source, resume=resume, on_epoch=tell
         )
         model.card.update(source)
-        save_friction(out / "friction.pt", model)
+        save_friction(out / "friction.safetensors", model)
         (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")
-    console.print(f"{out}: friction.pt, report.json, checkpoint.pt", soft_wrap=True)
+    console.print(f"{out}: friction.safetensors, report.json, checkpoint.pt", soft_wrap=True)
 
 
 @cloth.command()
@@ -147,7 +147,9 @@ def import_(
 @cloth.command()
 def predict(
     dataset: Annotated[str, typer.Argument(metavar="DATASET_OR_CLIP", help="a dataset, or what `cloth import` wrote")],
-    model: Annotated[Path, typer.Option(help="friction.pt of `cloth train`")],
+    model: Annotated[
+        Path | None, typer.Option(help="friction.safetensors of `cloth train`; that of the package if not given")
+    ] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
@@ -155,31 +157,37 @@ def predict(
     with 80 %."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
-    from stickslip_training.cloth.training import load_friction
+    from stickslip_training.cloth.training import WEIGHTS, load_friction
     from stickslip_training.cloth.video import load_clip
 
     with errors_told():
-        friction = load_friction(model)
+        friction = load_friction(model or WEIGHTS)
+        true: list[str] = []
         if dataset.endswith(".npz"):
             clips, slots = load_clip(dataset), [0]
         else:
             with DatasetReader(dataset) as reader:
                 clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
+                names = reader.categories("material")
+                fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
-        answers = predictions(friction.estimate(clips), slots)
-        for answer, far in zip(answers, friction.strangeness(clips).tolist(), strict=True):
+            true = [f"{fabric}, {mu:.2f}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
+        posterior, strangeness = friction.look(clips)
+        answers = predictions(posterior, slots)
+        for answer, far in zip(answers, strangeness.tolist(), strict=True):
             answer["strangeness"] = round(far, 3)
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
         return
     table = Table()
-    for title in ("slot", "material", "mu", "80 %", ""):
-        table.add_column(title, justify="left" if title in ("material", "") else "right")
-    for answer in answers:
+    for title in ("slot", "material", "mu", "80 %", *(["truth"] if true else []), ""):
+        table.add_column(title, justify="right" if title in ("slot", "mu", "80 %") else "left")
+    for place, answer in enumerate(answers):
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
         told = f"{mu['low']:.2f} to {mu['high']:.2f}"
-        table.add_row(str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told, _warning(answer))
+        cells = [str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told]
+        table.add_row(*cells, *true[place : place + 1], _warning(answer))
     Console().print(table)
 
 
@@ -221,7 +229,7 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
     from stickslip_training.cloth.training import INSTANTS
 
     if source.endswith(".npz"):
-        parts = split_runs(load_runs(source), _SHARES, seed)
+        parts = split_runs(load_runs(source), SHARES, seed)
         named: dict[str, Any] = {"runs": sha256(Path(source).read_bytes())}
         return named, dict(zip(("train", "validation", "test"), parts, strict=True))
     with DatasetReader(source) as reader:

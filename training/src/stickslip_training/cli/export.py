@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 from stickslip_schemas.selection import Selection
@@ -44,7 +43,7 @@ def export(
         if gzip and option != "--hdf5":
             raise ValueError("--gzip is for --hdf5 only")
         _require({"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"]}.get(option, []), option)
-        selection = read_selection(arrays, split, where)
+        selection = Selection.of_options(arrays, split, where)
         with DatasetReader(dataset) as reader:
             content = Content(reader, selection)
             with _progress(content) as on_bytes:
@@ -59,16 +58,6 @@ def export(
             + (f"; {skipped} rejected or not chosen" if skipped else ""),
             markup=False,
         )
-
-
-def read_selection(arrays: str | None, split: str | None, where: list[str] | None) -> Selection:
-    """Return the part of a version that options choose; raise ValueError."""
-    names = None if arrays is None else tuple(filter(None, (name.strip() for name in arrays.split(","))))
-    try:
-        return Selection.model_validate({"arrays": names, "split": split, "where": tuple(where or ())})
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ValueError(f"{first['loc'][0]}: {first['msg']}, and is {first['input']!r}") from None
 
 
 def _require(packages: list[str], option: str) -> None:

@@ -1,5 +1,6 @@
 """Train `PosteriorNet` on pictures of simulations that are rendered while it trains."""
 
+import json
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -7,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors
+import safetensors.torch
 import torch
 from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.store import write_durably
 from torch import nn
 
 from stickslip_training.arrays import Floats, Integers, SingleFloats
@@ -19,7 +23,6 @@ from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
 from stickslip_training.cloth.render import Style, draw_style, render_crops, turned
 from stickslip_training.cloth.runs import Runs, between
-from stickslip_training.engine.files import load_tensors, save_tensors
 from stickslip_training.engine.fit import (
     EpochReport,
     FitSettings,
@@ -117,15 +120,19 @@ class FrictionModel:
 
     def estimate(self, clips: Clips) -> Posterior:
         """Return the posterior of every clip: the mean over the networks."""
-        answers = [answer(net, clips) for net in self.nets]
-        return Posterior.mean([_posterior(*each, self.materials, self.bins, self.temperature) for each in answers])
+        return self.look(clips)[0]
 
     def strangeness(self, clips: Clips) -> Floats:
         """Return how far every clip is from what was trained on, over the limit: more than 1 is unfamiliar."""
-        far = [
-            own.distance(features(net, clips)) / own.limit for net, own in zip(self.nets, self.familiarity, strict=True)
-        ]
-        return np.asarray(np.mean(far, axis=0))
+        return self.look(clips)[1]
+
+    def look(self, clips: Clips) -> tuple[Posterior, Floats]:
+        """Return the posterior of every clip, and its strangeness; each network sees the clips once."""
+        seen = [features(net, clips) for net in self.nets]
+        answers = [answer(net, own) for net, own in zip(self.nets, seen, strict=True)]
+        posteriors = [_posterior(*each, self.materials, self.bins, self.temperature) for each in answers]
+        far = [known.distance(own) / known.limit for known, own in zip(self.familiarity, seen, strict=True)]
+        return Posterior.mean(posteriors), np.asarray(np.mean(far, axis=0))
 
 
 def train_friction(
@@ -167,9 +174,10 @@ def train_friction(
         net = fitted.net.cpu()
         assert isinstance(net, PosteriorNet)
         seen = learner.validation
-        temperature = calibrated(*answer(net, seen), seen.material, seen.mu, MU_BINS)
+        found = features(net, seen)
+        temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
         known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
-        familiarity = Familiarity.of(features(net, known), known.material, features(net, seen), len(train.materials))
+        familiarity = Familiarity.of(features(net, known), known.material, found, len(train.materials))
     card = {
         "settings": asdict(settings),
         "training_runs": len(train),
@@ -184,43 +192,54 @@ def train_friction(
     return FrictionModel((net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card)
 
 
+WEIGHTS = Path(__file__).with_name("friction.safetensors")
+"""A trained model that comes with the package; its card says of what, and how good it is."""
+
+
 def save_friction(path: Path, model: FrictionModel) -> None:
-    """Write the model; `load_friction` reads it."""
-    content = {
+    """Write the model as safetensors, with its card; `load_friction` reads it."""
+    tensors = {f"nets.{i}.{name}": t for i, net in enumerate(model.nets) for name, t in net.state_dict().items()}
+    for i, own in enumerate(model.familiarity):
+        tensors[f"familiarity.{i}.means"] = torch.from_numpy(own.means)
+        tensors[f"familiarity.{i}.precision"] = torch.from_numpy(own.precision)
+    about = {
         "sizes": model.nets[0].sizes,
-        "nets": [net.state_dict() for net in model.nets],
-        "materials": list(model.materials),
-        "instants": list(model.instants),
+        "nets": len(model.nets),
+        "materials": model.materials,
+        "instants": model.instants,
         "bins": asdict(model.bins),
-        "temperature": list(model.temperature),
-        "familiarity": [
-            {"means": torch.from_numpy(own.means), "precision": torch.from_numpy(own.precision), "limit": own.limit}
-            for own in model.familiarity
-        ],
+        "temperature": model.temperature,
+        "limits": [own.limit for own in model.familiarity],
         "card": model.card,
     }
-    save_tensors(path, content)
+    tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    write_durably(path, safetensors.torch.save(tensors, {"friction": json.dumps(about)}))
 
 
-def load_friction(path: str | Path) -> FrictionModel:
-    """Return the model of a file."""
-    content = load_tensors(path)
-    nets = []
-    for state in content["nets"]:
-        net = PosteriorNet(**content["sizes"])
-        net.load_state_dict(state)
-        nets.append(net.eval())
-    first, second = content["temperature"]
+def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
+    """Return the model of a file; raise ValueError where it holds none."""
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            about = json.loads((file.metadata() or {})["friction"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        nets, known = [], []
+        for i in range(about["nets"]):
+            net = PosteriorNet(**about["sizes"])
+            net.load_state_dict({name: tensors[f"nets.{i}.{name}"] for name in net.state_dict()})
+            nets.append(net.eval())
+            means, precision = (tensors[f"familiarity.{i}.{name}"].numpy() for name in ("means", "precision"))
+            known.append(Familiarity(means, precision, about["limits"][i]))
+    except (safetensors.SafetensorError, KeyError, RuntimeError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} must be a model of `stickslip-train cloth train`, and is none: {error}") from error
+    first, second = about["temperature"]
     return FrictionModel(
         tuple(nets),
-        tuple(content["materials"]),
-        tuple(content["instants"]),
-        Bins(**content["bins"]),
+        tuple(about["materials"]),
+        tuple(about["instants"]),
+        Bins(**about["bins"]),
         (first, second),
-        tuple(
-            Familiarity(own["means"].numpy(), own["precision"].numpy(), own["limit"]) for own in content["familiarity"]
-        ),
-        content["card"],
+        tuple(known),
+        about["card"],
     )
 
 
@@ -347,17 +366,20 @@ class _FrictionLearner(Learner):
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
-        posterior = _posterior(*answer(net, self.validation), self.train.materials, MU_BINS, (1.0, 1.0))
-        return -float(posterior.log_likelihood(self.validation.material, self.validation.mu).mean())
+        seen, answers = self.validation, answer(net, features(net, self.validation))
+        # A network that is too sure is not worse for it: temperatures mend that in the end.
+        temperature = calibrated(*answers, seen.material, seen.mu, MU_BINS)
+        posterior = _posterior(*answers, self.train.materials, MU_BINS, temperature)
+        return -float(posterior.log_likelihood(seen.material, seen.mu).mean())
 
 
 # --- answers --------------------------------------------------------------------------------------------------
 
 
-def answer(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, SingleFloats]:
-    """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K)."""
+def answer(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, SingleFloats]:
+    """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K), of features, (clips, n)."""
     with torch.inference_mode():
-        material, mu = net.read(torch.from_numpy(features(net, clips)).to(next(net.parameters()).device))
+        material, mu = net.read(torch.from_numpy(seen).to(next(net.parameters()).device))
     return material.cpu().numpy(), mu.cpu().numpy()
 
 

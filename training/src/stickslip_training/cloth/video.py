@@ -10,6 +10,7 @@ gives the start t0 of the path and o; what both holders do alike besides, w(t), 
 are taken out of every frame. What the two do differently is the residual.
 """
 
+import io
 import json
 import math
 import tomllib
@@ -151,13 +152,8 @@ def import_video(
     of the two held patches in the first frame, that with the smaller y first [px]; without it, the calibration's. The
     video must begin before the stage starts. Raises VideoError where it cannot be measured.
     """
-    times, tracks, size = _follow(path, calibration, holders)
+    times, tracks = _follow(path, calibration, holders)
     camera = calibration.camera
-    if size != (camera.width, camera.height):
-        raise VideoError(
-            f"frames must have the size of the calibration, {camera.width} x {camera.height}, and have "
-            f"{size[0]} x {size[1]}"
-        )
     last = frames_at(tuple(range(ALL_INSTANTS)))[1][-1] / RATE
     if times[-1] - times[0] < last:
         raise VideoError(f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.0f} s")
@@ -173,8 +169,6 @@ def save_clip(
     path: Path, crops: torch.Tensor, instants: tuple[int, ...], calibration: Calibration, registration: Registration
 ) -> None:
     """Write what `import_video` returned; `load_clip` reads it."""
-    import io
-
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -239,8 +233,8 @@ def holder_points(instants: Array) -> Floats:
 
 def _follow(
     path: str | Path, calibration: Calibration, holders: tuple[float, float, float, float] | None
-) -> tuple[Floats, Floats, tuple[int, int]]:
-    """Return times (N,), places (N, 2, 2) of the held patches without distortion [px], and the size of the frames."""
+) -> tuple[Floats, Floats]:
+    """Return times (N,), and places (N, 2, 2) of the held patches without distortion [px]."""
     try:
         import cv2
     except ModuleNotFoundError as error:
@@ -259,18 +253,21 @@ def _follow(
     precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
     times: list[float] = []
     places: list[Any] = []
-    before, size = None, (0, 0)
+    before = None
     place = seen.astype(np.float32)[:, None]
     for time, picture in _frames(path):
+        height, width = picture.shape
+        if (width, height) != (camera.width, camera.height):
+            raise VideoError(
+                f"frames must have the size of the calibration, {camera.width} x {camera.height}, and have "
+                f"{width} x {height}"
+            )
         if before is not None:
-            if picture.shape != before.shape:
-                raise VideoError(f"frames must have one size, and have {before.shape} and {picture.shape}")
             place, found, _ = cv2.calcOpticalFlowPyrLK(
                 before, picture, place, None, winSize=(window, window), maxLevel=2, criteria=precise
             )
             if not found.all():
                 raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
-        size = picture.shape[1], picture.shape[0]
         times.append(time)
         places.append(place.reshape(2, 2).copy())
         before = picture
@@ -278,7 +275,7 @@ def _follow(
         raise VideoError(f"{path} must have frames, and has {len(times)}")
     raw = np.array(places, dtype=np.float64)
     flat = cv2.undistortPoints(raw.reshape(-1, 1, 2), matrix, distortion, P=matrix)
-    return np.array(times), np.asarray(flat, dtype=np.float64).reshape(raw.shape), size
+    return np.array(times), np.asarray(flat, dtype=np.float64).reshape(raw.shape)
 
 
 def _intrinsics(camera: Camera) -> Floats:
