@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.cloth import SEGMENTS
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.manifest import Manifest
@@ -109,12 +110,12 @@ def test_what_is_known_of_every_pixel_reaches_the_reader(service: Service, tmp_p
     arrays = read_arrays(target)
     with DatasetReader(target) as reader:
         known = {name: reader.read(name, [0, 1]) for name in names}
-        segments, instants = reader.categories("segmentation"), shown_frames(3, 300)
+        instants = shown_frames(3, 300)
         camera = {camera.name: camera for camera in reader.manifest.cameras}["left"]
     for name, values in known.items():
         assert np.array_equal(values, arrays[name], equal_nan=True)
         assert np.array_equal(values[0], values[1], equal_nan=True)  # textures share it
-    cloth = known["segmentation"][0] == segments.index("cloth")
+    cloth = known["segmentation"][0] == SEGMENTS.index("cloth")
     assert (cloth == np.isfinite(known["uv"][0]).all(axis=-1)).all()
     for frame, instant in enumerate(instants):
         vertices = arrays["positions"][0, instant] @ np.asarray(camera.rotation).T + np.asarray(camera.translation)
