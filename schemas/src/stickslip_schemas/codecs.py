@@ -9,7 +9,7 @@ import numpy as np
 from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.chunks import ZSTD_LEVEL, decode_chunk, decode_trajectory, encode_chunk, encode_trajectory
 
-CLIP_LEVEL = 9
+CLIP_LEVEL = 11
 """Of zstd, for clips: written once, read many times, and reading is as fast as at level 3."""
 
 _ROWS_FIRST = (1, 0, 2, 3)

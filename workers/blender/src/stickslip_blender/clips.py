@@ -25,7 +25,7 @@ from stickslip_blender.geometry import FLOOR, Geometry, Set
 from stickslip_blender.ground_truth import ground_truth
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import Look, grained, look_of
-from stickslip_blender.multiplexed import Sight, encode
+from stickslip_blender.multiplexed import Sight, settled
 from stickslip_blender.preview import moving
 from stickslip_blender.raster import Textures
 from stickslip_blender.stage import ClothStage, Shot
@@ -176,7 +176,7 @@ class ClipRenderer:
             )
 
     def _finished(self, light: npt.NDArray[np.float16], shot: Shot) -> Clip:
-        return encode(self.stage.composer.on_floor(light, shot.points, self.camera, self.floor))
+        return settled(self.stage.composer.on_floor(light, shot.points, self.camera, self.floor))
 
 
 def block_decibels(one: Clip, other: Clip) -> float:
