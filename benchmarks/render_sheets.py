@@ -18,6 +18,7 @@ from PIL import Image
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.preview import sheet
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.jobs import Quality
@@ -74,7 +75,7 @@ class Studio:
         (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
         clip = self._renderer.clip(document, camera, track[list(document.instants)])
         trace = clip.trace()
-        videos, _ = clip.clips(trace, textures)
+        videos, _ = clip.clips(trace, [texture_image(texture) for texture in textures])
         small = [
             np.stack([np.asarray(Image.fromarray(frame).resize((SIDE, SIDE), Image.Resampling.BOX)) for frame in video])
             for video in videos

@@ -13,6 +13,7 @@ import pytest
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.raster import projected, see, window_about
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import Texture
@@ -42,7 +43,7 @@ def _render(renderer: ClothRenderer, sheet: Any, *textures: Texture, **look: Any
     document = ClothDragRender.model_validate(LOOK | look)
     (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
     clip = renderer.clip(document, camera, sheet.track[list(document.instants)])
-    return clip.clips(clip.trace(), textures or (Texture.gingham,))[0]
+    return clip.clips(clip.trace(), [texture_image(texture) for texture in textures or (Texture.gingham,)])[0]
 
 
 def test_a_repeat_has_the_same_bytes(renderer: ClothRenderer, sheet: Any) -> None:
@@ -61,6 +62,7 @@ import numpy as np
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import Texture
@@ -69,7 +71,7 @@ look = ClothDragRender.model_validate_json(sys.argv[2])
 renderer = ClothRenderer(sheet["triangles"], sheet["rest"], Holders)
 import_bpy().context.scene.render.threads = 2
 clip = renderer.clip(look, load_rig("drag")[0], sheet["track"][[0, 3]])
-video, _ = clip.clips(clip.trace(), (Texture.gingham,))
+video, _ = clip.clips(clip.trace(), [texture_image(Texture.gingham)])
 print(hashlib.sha256(video.tobytes()).hexdigest())
 """
 

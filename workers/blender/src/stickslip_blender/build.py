@@ -11,7 +11,7 @@ from stickslip_schemas.sources import LIST_OF_KINDS, digests, sources
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.raster._raster import BUILD_HASH
 
-_LIBRARIES = ("numcodecs", "google-crc32c", "numpy")
+_LIBRARIES = ("numcodecs", "google-crc32c", "numpy", "pillow")
 
 
 def blender_version() -> dict[str, str]:

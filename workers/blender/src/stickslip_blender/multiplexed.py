@@ -12,8 +12,9 @@ A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture i
 in linear light, for each of the texture's colours. Off the cloth D is light that the cloth threw there: A is m, or what
 a floor that mirrors shows of the cloth, blurred as much as its roughness does.
 
-Pictures of clips are not rounded to the nearest levels. Each level is within TOLERANCE of the exact value, and chosen so
-that neighbours are equal where they may be: pixels in a row, and the colours of grey. Clips are a sixth smaller for it.
+Pictures of clips are not rounded to the nearest levels. Each level is within TOLERANCE of the exact value, and chosen
+so that neighbours are equal where they may be: pixels in a row, and the colours of grey. Clips are a sixth smaller for
+it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ ALBEDOS = (0.0, 0.5, 0.9)
 """The cloth's base colour in a trace."""
 
 TOLERANCE: int = _raster.TOLERANCE
-"""8-bit levels that a pixel of a clip may be away from its exact value; raster/composition.hpp says how it is chosen."""
+"""How far the pixels of a clip may be from their exact values [8-bit levels]; raster/composition.hpp chooses them."""
 
 _MIRROR_GRID = 8
 _LOBE = 1.9  # radius of a box, twice applied, over the width of the lobe that it stands for; compared with Cycles
@@ -62,7 +63,7 @@ def encode(light: Floats) -> npt.NDArray[np.uint8]:
 
 
 def settled(light: Floats) -> npt.NDArray[np.uint8]:
-    """Return linear light (height, width, 3) as the 8-bit sRGB of a clip: within `TOLERANCE`, with few different pixels.
+    """Return linear light (height, width, 3) as the 8-bit sRGB of a clip: within `TOLERANCE`, with pixels alike.
 
     It depends on nothing but this picture.
     """
