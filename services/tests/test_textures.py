@@ -86,6 +86,8 @@ def test_a_spec_with_an_unknown_texture_is_refused(client: Client, shared_server
     [
         (_png(height=70), "image/png", 422, "square, of 64 to 4096 pixels a side, and it has 64 x 70"),
         (b"not a picture", "image/jpeg", 422, "whole PNG or JPEG"),
+        (b"\xff\xd8\xff and no more", "image/jpeg", 422, "whole PNG or JPEG"),
+        (_png(), "image/jpeg", 422, "of its Content-Type, image/jpeg"),
         (_png(), "application/json", 415, "Content-Type must be image/png or image/jpeg"),
         (bytes(17 * 2**20), "image/png", 413, "at most"),
     ],

@@ -3,9 +3,9 @@
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 
-from stickslip_schemas.base import Document, Float, Int
+from stickslip_schemas.base import WHOLE, Document, Float
 from stickslip_schemas.cameras import Camera
 
 CLIP_SIZE = 224
@@ -24,6 +24,7 @@ Power = Annotated[Float, Field(ge=0.05, le=10)]
 Share = Annotated[Float, Field(ge=0, le=1)]
 Roughness = Annotated[Float, Field(ge=0.01, le=1)]
 Tint = Annotated[Float, Field(ge=0.05, le=1)]
+Pixels = Annotated[int, Strict(), Field(ge=16, le=16384), WHOLE]
 Row = tuple[Float, Float, Float]
 
 
@@ -40,38 +41,48 @@ class _Ranges(Document):
 
 
 class LampNumbers(_Ranges):
-    """A lamp of your own: ranges `[low, high]` that it is drawn from for each view of each simulation."""
+    """A lamp of your own.
+
+    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation.
+    """
 
     azimuth: tuple[Azimuth, Azimuth] = Field(
-        description="direction of the lamp, seen from the cloth, from +x towards +y [degree]"
+        description="direction of the lamp, seen from the cloth, from +x towards +y [degree], from -180 to 180"
     )
-    elevation: tuple[Elevation, Elevation] = Field(description="direction of the lamp above the floor [degree]")
-    power: tuple[Power, Power] = Field(description="power over the nominal; the built-in `drawn` has 0.8 to 1.25")
+    elevation: tuple[Elevation, Elevation] = Field(
+        description="direction of the lamp above the floor [degree], from 5 to 90"
+    )
+    power: tuple[Power, Power] = Field(description="power over the nominal, from 0.05 to 10; `drawn` has 0.8 to 1.25")
 
 
 class FloorNumbers(_Ranges):
-    """A floor of your own: the finish that it has, or ranges `[low, high]` that it is drawn from."""
+    """A floor of your own.
 
-    albedo: tuple[Share, Share] = Field(description="share of the light that it scatters, or that a metal reflects")
-    roughness: tuple[Roughness, Roughness] = Field(description="of its gloss; 0.02 is a mirror")
+    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation. The image gate says how
+    well a floor can be composed, and clips are rendered directly where it cannot.
+    """
+
+    albedo: tuple[Share, Share] = Field(
+        description="share of the light that it scatters, or that a metal reflects, 0 to 1"
+    )
+    roughness: tuple[Roughness, Roughness] = Field(description="of its gloss, from 0.01 to 1; 0.02 is a mirror")
     metallic: Share = Field(default=0.0, description="1 for a metal")
     specular: Share = Field(default=0.5, description="gloss of what is no metal; 0.5 has an index of refraction of 1.5")
     grain: Share = Field(default=0.1, description="contrast of its marks; without any, motion over it does not show")
     tint: tuple[Tint, Tint, Tint] = Field(
-        default=(1.0, 1.0, 1.0), description="its colour, linear red, green and blue; only their ratios count"
+        default=(1.0, 1.0, 1.0),
+        description="its colour, linear red, green and blue, from 0.05 to 1; only their ratios count",
     )
 
 
 class Calibration(Document):
     """A camera of your own, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
 
-    The world's z axis points up from the floor, which is z = 0; the cloth falls about x = 0 and is dragged along x. A
-    clip shows the largest square in the middle of the image, scaled to 224 x 224 pixels.
+    The world's z axis points up from the floor, which is z = 0. A dragged cloth stays within x = -0.1 to 0.4, y = -0.1
+    to 0.1 and z = 0 to 0.25 m. A clip shows the largest square in the middle of the image, scaled to 224 x 224 pixels.
     """
 
-    image_size: tuple[Annotated[Int, Field(ge=16, le=16384)], Annotated[Int, Field(ge=16, le=16384)]] = Field(
-        description="width and height of the calibrated image [px]"
-    )
+    image_size: tuple[Pixels, Pixels] = Field(description="width and height of the calibrated image [px]")
     camera_matrix: tuple[Row, Row, Row] = Field(description="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px]")
     distortion: tuple[Float, ...] = Field(
         default=(), max_length=14, description="distortion coefficients: all 0, for pictures have no lens distortion"

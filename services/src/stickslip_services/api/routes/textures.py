@@ -16,7 +16,8 @@ from stickslip_services.queue.coordinator import Coordinator
 
 router = APIRouter(tags=["textures"])
 
-MEDIA_TYPES = ("image/png", "image/jpeg")
+MEDIA_TYPES = {"image/png": b"\x89PNG", "image/jpeg": b"\xff\xd8\xff"}
+"""What may be sent, and how such files begin."""
 
 _PICTURE: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 _BODY = {"requestBody": {"required": True, "content": dict.fromkeys(MEDIA_TYPES, _PICTURE)}}
@@ -37,6 +38,10 @@ async def post_texture(request: Request, coordinator: Annotated[Coordinator, Dep
     except ClientDisconnect as error:
         raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
     try:
+        if not data.startswith(MEDIA_TYPES[media_type]):
+            raise UnfitPictureError(
+                f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}"
+            )
         return await run_in_threadpool(store_texture, coordinator.store, data)
     except UnfitPictureError as error:
         field = FieldError(pointer="", rule=str(error), value=f'"{len(data)} bytes"')
