@@ -1,5 +1,6 @@
 """Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from stickslip_schemas.samples import SPLITS, dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskResult
 
+from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, card
 from stickslip_workers.stages.metadata import metadata_files
 from stickslip_workers.stages.preview import PREVIEW_NAME, pictured, preview
@@ -117,6 +119,7 @@ def _pictures(task: PublishTask, store: Store) -> Pictures | None:
         quality=task.spec.quality,
         psnr_db=measured,
         gate_db=gate,
+        device=os.environ.get(RENDER_DEVICE) or CPU,  # all workers of this version's builds have the same
         direct_slots=tuple(direct.tolist()),
     )
 
