@@ -109,16 +109,18 @@ def _pictures(task: PublishTask, store: Store) -> Pictures | None:
     measured = task.spec.picture_decibels()
     if measured is None:
         return None
-    gate, direct = None, np.empty(0, dtype=int)
+    gate, share, direct = None, None, np.empty(0, dtype=int)
     if any(array.name == "gate_db" for array in layout(task.spec)):
         valid = _column("valid", task, store)
-        found = _column("gate_db", task, store)[valid]
-        gate = round(float(found.min()), 2) if found.size else None
+        if valid.any():
+            gate = round(float(_column("gate_db", task, store)[valid].min()), 2)
+            share = round(float(_column("frame_share", task, store)[valid].mean()), 4)
         direct = np.flatnonzero(valid & ~_column("composed", task, store))
     return Pictures(
         quality=task.spec.quality,
         psnr_db=measured,
         gate_db=gate,
+        frame_share=share,
         device=os.environ.get(RENDER_DEVICE) or CPU,  # all workers of this version's builds have the same
         direct_slots=tuple(direct.tolist()),
     )
