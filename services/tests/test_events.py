@@ -14,6 +14,8 @@ from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, failure, rods, serving
 
+pytestmark = pytest.mark.databases
+
 
 @pytest.fixture
 def app(settings: Settings, clock: ManualClock) -> FastAPI:

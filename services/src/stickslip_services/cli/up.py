@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
-from stickslip_services.cli.common import console
+from stickslip_services.cli.common import DatabaseOption, console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 
@@ -23,6 +23,7 @@ def up(
     host: Annotated[
         str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
     ] = "127.0.0.1",
+    database: DatabaseOption = None,
     slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
     allow_host: Annotated[
         list[str] | None, typer.Option(help="name that the coordinator may be asked by; repeatable")
@@ -47,9 +48,9 @@ def up(
         "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
-    given = {name: value for name, value in doors.items() if value}
+    given = {name: value for name, value in (doors | {"database": database}).items() if value}
     status = supervisor.run(
-        supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher, doors=given),
+        supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher, chosen=given),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"

@@ -1,4 +1,4 @@
-"""Opening the database of a data directory, or refusing it in one sentence that says what to do."""
+"""Opening a coordinator's database, or refusing it in one sentence that says what to do."""
 
 import fcntl
 import os
@@ -6,26 +6,43 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 from alembic.script import ScriptDirectory
+from sqlalchemy import create_engine, inspect, text
+from sqlalchemy.exc import OperationalError
 
 from stickslip_services.database import migrate
-from stickslip_services.database.database import Database
+from stickslip_services.database.database import Database, Role
+from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.settings import Settings
 
-DATABASE_NAME = "coordinator.sqlite3"
+
+def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
+    """Return the database of a coordinator, as it is. Raise DatabaseRefusedError where its driver is missing."""
+    url = settings.database_url
+    if url is None:
+        return SqliteDatabase(settings.database_path, durable=settings.durable)
+    if find_spec("psycopg") is None:
+        raise DatabaseRefusedError(
+            f"the database {url} needs psycopg, which is not installed: "
+            "pip install 'stickslip-services[server,postgresql]'"
+        )
+    from stickslip_services.database.postgresql import PostgresqlDatabase
+
+    return PostgresqlDatabase(url, durable=settings.durable, role=role)
 
 
 @contextmanager
-def opened(data: Path, *, durable: bool = True) -> Iterator[Database]:
-    """Open the database of a data directory, brought up to date; make it where there is none.
+def opened(settings: Settings, role: Role) -> Iterator[Database]:
+    """Open the database of a coordinator, brought up to date; make it where there is none.
 
-    Raise DatabaseRefusedError where it is damaged or was made by a newer version.
+    Raise DatabaseRefusedError where it is damaged, was made by a newer version, or cannot be had in this role.
     """
-    path = data / DATABASE_NAME
-    check(path)
-    database = Database(path, durable=durable)
+    check(settings, role)
+    database = connect(settings, role)
     try:
         with database.write() as connection:
             migrate.upgrade(connection)
@@ -34,19 +51,35 @@ def opened(data: Path, *, durable: bool = True) -> Iterator[Database]:
         database.close()
 
 
-def check(path: Path, store: Path | None = None) -> None:
-    """Raise DatabaseRefusedError where a database cannot be used.
+def check(settings: Settings, role: Role, *, with_store: bool = False) -> None:
+    """Raise DatabaseRefusedError where a database cannot be used in a role.
 
-    One that is not there can be made, unless there are datasets in the `store`: then it was lost.
+    One that is not there can be made, unless there are datasets in the store, `with_store`: then it was lost.
     """
-    if not path.exists():
-        if store is not None and next(store.glob("datasets/*/v*/manifest.json"), None) is not None:
+    if settings.database_url is None:
+        revision = _sqlite_revision(settings.database_path)
+    else:
+        revision = _postgresql_revision(settings, role)
+    name = settings.database_name
+    if revision is None and with_store:
+        if next(settings.store_root.glob("datasets/*/v*/manifest.json"), None) is not None:
             raise DatabaseRefusedError(
-                f"{store} holds datasets, and the database {path} is gone: run `stickslip reindex --data "
-                f"{path.parent}` to find them again"
+                f"{settings.store_root} holds datasets, and the database {name} is gone: run `stickslip reindex "
+                f"--data {settings.data}` to find them again"
             )
-        return
-    revision = ""
+    known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
+    if revision is not None and revision not in known:
+        raise DatabaseRefusedError(
+            f"{name} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
+            f"install that version again, or name another {settings.database_option}"
+        )
+
+
+def _sqlite_revision(path: Path) -> str | None:
+    """Return the last migration that a file has had; None where there is no file, or an empty one."""
+    if not path.exists():
+        return None
+    revision = None
     try:
         with closing(sqlite3.connect(path, timeout=30)) as connection:
             (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
@@ -60,17 +93,38 @@ def check(path: Path, store: Path | None = None) -> None:
         ) from error
     except sqlite3.DatabaseError as error:
         found = str(error)
-    if found not in ("ok", "") and not revision:
+    if found != "ok":
         raise DatabaseRefusedError(
             f"{path} is damaged ({found.splitlines()[-1]}): move it away and run "
             f"`stickslip reindex --data {path.parent}`, which finds the datasets in the store again"
         )
-    known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
-    if revision and revision not in known:
-        raise DatabaseRefusedError(
-            f"{path} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
-            "install that version again, or name another --data"
-        )
+    return revision
+
+
+def _postgresql_revision(settings: Settings, role: Role) -> str | None:
+    """Return the last migration that a database has had; None where it is empty."""
+    database = connect(settings, role)
+    name = settings.database_name
+    try:
+        with database.write() as connection:  # which is refused where others have the database for themselves
+            tables = inspect(connection).get_table_names()
+            encoding = connection.scalar(text("SHOW server_encoding"))
+            if encoding != "UTF8":
+                raise DatabaseRefusedError(
+                    f"the encoding of the database {name} must be UTF8, and is {encoding}: "
+                    "make another one with `createdb --encoding UTF8 --template template0`"
+                )
+            if not tables:
+                return None
+            if "alembic_version" not in tables or "task_counts" not in tables:
+                raise DatabaseRefusedError(
+                    f"{name} is not a database of stickslip: give it one of its own, which is empty, with --database"
+                )
+            return str(connection.scalar(text("SELECT version_num FROM alembic_version")))
+    except OperationalError as error:
+        raise DatabaseRefusedError(f"{name} cannot be opened: {str(error.orig).splitlines()[0]}") from error
+    finally:
+        database.close()
 
 
 @contextmanager

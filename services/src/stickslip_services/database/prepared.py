@@ -72,7 +72,10 @@ class Prepared:
         names, defaults = compiled.names, compiled.defaults
         rows = [[row[name] if name in row else defaults[name] for name in names] for row in values]
         with _translated(connection, compiled.sql):
-            _driver(connection).executemany(compiled.sql, rows)
+            if len(rows) == 1:  # psycopg sends many as a pipeline, which costs more
+                _driver(connection).execute(compiled.sql, rows[0])
+            else:
+                _driver(connection).executemany(compiled.sql, rows)
 
     def _filled(self, connection: Connection, values: Values) -> tuple[str, list[Any]]:
         compiled = self._compile(connection.dialect)

@@ -21,9 +21,10 @@ from types import FrameType
 from typing import IO, Any
 
 import httpx
-from pydantic import ValidationError
 from stickslip_schemas.store import write_durably
 
+from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, locked
 from stickslip_services.errors import SupervisorError
 from stickslip_services.local.sockets import listen
@@ -50,8 +51,8 @@ class LocalService:
     slots: int | None = None
     dispatcher: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
-    doors: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the coordinator that say who may come in, by name."""
+    chosen: Mapping[str, Any] = field(default_factory=dict)
+    """Other settings of the coordinator by name: its database, and who may come in."""
 
 
 @dataclass(slots=True)
@@ -60,6 +61,8 @@ class _Child:
     command: list[str]
     log: Path
     inherited: tuple[int, ...] = ()
+    database: str | None = None
+    """URL of the database, with its password: only the environment of the process has it."""
     process: subprocess.Popen[bytes] | None = None
     started_at: float = 0.0
     failed_starts: int = 0
@@ -67,6 +70,9 @@ class _Child:
 
     def start(self) -> None:
         """Start in a session of its own: Ctrl-C is for the supervisor, which then stops children in order."""
+        environment = {name: value for name, value in os.environ.items() if name != DATABASE_VARIABLE}
+        if self.database is not None:
+            environment[DATABASE_VARIABLE] = self.database
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 self.command,
@@ -76,6 +82,7 @@ class _Child:
                 start_new_session=True,
                 preexec_fn=_die_with_parent,
                 pass_fds=self.inherited,
+                env=environment,
             )
         self.started_at = time.monotonic()
 
@@ -137,11 +144,11 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
     """Run until a signal to stop; return the exit status. Raise SupervisorError."""
     say = say or (lambda message: print_line(sys.stderr, message))
     data = service.data.absolute()
-    settings = _settings(service, data)
+    settings = Settings.chosen(data=data, host=service.host, port=service.port, **service.chosen)
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         lock = stack.enter_context(locked(data))
-        check(settings.database_path, settings.store_root)
+        check(settings, Role.coordinator, with_store=True)
         signals = stack.enter_context(_stop_signals())
         # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
         listener = _listen(service.host, service.port)
@@ -152,6 +159,7 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
             _coordinator_command(settings, listener.fileno()),
             data / "logs" / "coordinator.log",
             (lock, listener.fileno()),
+            None if settings.database is None else settings.database.get_secret_value(),
         )
         dispatcher = _Child("dispatcher", _dispatcher_command(service, settings), data / "logs" / "dispatcher.log")
         children = [coordinator, dispatcher]
@@ -177,15 +185,6 @@ def print_line(stream: IO[str], message: str) -> None:
     """Write a line at once."""
     stream.write(f"{time.strftime('%H:%M:%S')} {message}\n")
     stream.flush()
-
-
-def _settings(service: LocalService, data: Path) -> Settings:
-    try:
-        return Settings(data=data, host=service.host, port=service.port, **service.doors)
-    except ValidationError as error:
-        raise SupervisorError(
-            "; ".join(item["msg"].removeprefix("Value error, ") for item in error.errors())
-        ) from error
 
 
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:
