@@ -1,6 +1,6 @@
 """A coordinator on a temporary directory: in the process with a clock of its own, or as a server.
 
-Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL only if slow tests do.
+Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL only as slow tests.
 """
 
 import os
@@ -51,7 +51,7 @@ def database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     chosen: str = getattr(request, "param", "sqlite")
     if chosen == "postgresql":
         server: PostgresqlServer = request.getfixturevalue("postgresql")
-        monkeypatch.setenv(DATABASE_VARIABLE, server.fresh())
+        monkeypatch.setenv(DATABASE_VARIABLE, server.clean())
     return chosen
 
 
@@ -61,7 +61,7 @@ def empty_database(database: str, tmp_path: Path, request: pytest.FixtureRequest
     made: list[Database] = []
 
     def make() -> Database:
-        url = None if database == "sqlite" else request.getfixturevalue("postgresql").fresh("template0")
+        url = None if database == "sqlite" else request.getfixturevalue("postgresql").empty()
         made.append(connect(Settings.chosen(data=tmp_path / str(len(made)), durable=False, database=url)))
         return made[-1]
 

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select, update
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RecordRef, RenderOutput, SimulateOutput, TaskResult
+from stickslip_schemas.tasks import PackOutput, RecordRef, RenderOutput, SimulateOutput, TaskResult
 from stickslip_services.client.pulling import verify
+from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
 from stickslip_services.testing import ManualClock, PretendWorker, parsed, rods, show_job
@@ -71,9 +73,7 @@ def test_only_what_is_damaged_is_made_again(
 ) -> None:
     finish(coordinator, worker, clock, submit(coordinator))
     with coordinator.database.read() as connection:
-        output = connection.scalar(
-            select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1)
-        )
+        output = connection.scalar(select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1))
     worker.store.path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(b"x")
     worker.ran.clear()
     job = submit(coordinator)

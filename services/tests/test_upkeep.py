@@ -16,6 +16,7 @@ from stickslip_schemas.store import Store
 from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
+from stickslip_services.database.database import Role
 from stickslip_services.database.opening import locked, opened
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
@@ -171,7 +172,7 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
     away.rename(directory)
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
-    with opened(settings.data, durable=False) as database:
+    with opened(settings, Role.upkeep) as database:
         found = reindex(database, Store(settings.store_root))
         assert sorted(version.is_new for version in found) == [False, True]
 

@@ -1,6 +1,5 @@
 """Settings of the coordinator, from the environment (`STICKSLIP_...`) or the command line."""
 
-import re
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,7 +18,7 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="STICKSLIP_", frozen=True, extra="forbid")
 
     data: Path = Path("stickslip-data")
-    """Directory of the database and the store, unless `database` and `store_path` say otherwise, and of the worker key."""
+    """Directory of the worker key; also of database and store, unless `database` and `store_path` say otherwise."""
     store_path: Path | None = None
     """Root of the store; null is `data/store`."""
     database: SecretStr | None = None
@@ -78,15 +77,17 @@ class Settings(BaseSettings):
         if database is not None:
             value = database.get_secret_value()
             try:
-                is_known = make_url(value).drivername == "postgresql" and make_url(value).database
+                url = make_url(value)
             except (ArgumentError, ValueError):
-                is_known = False
-            if not is_known:
-                # What may be a password is not shown, nor what may hold one.
-                shown = re.sub(r"^([a-z0-9+.-]*://)?.*@", r"\1***@", value.partition("?")[0], flags=re.S | re.I)
-                raise ValueError(
-                    f"database must be a URL of the form postgresql://USER@HOST/NAME, and is {shown[:200]!r}"
-                )
+                url = None
+            if url is None or url.drivername != "postgresql" or not url.database:
+                if url is not None:
+                    shown = repr(url.set(query={}).render_as_string(hide_password=True))
+                elif {"@", "?"} & set(value):
+                    shown = "something else, which is not shown because it may hold a password"
+                else:
+                    shown = repr(value[:100])
+                raise ValueError(f"database must be a URL of the form postgresql://USER@HOST/NAME, and is {shown}")
         return database
 
     @model_validator(mode="after")

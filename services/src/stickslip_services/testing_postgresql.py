@@ -15,8 +15,9 @@ from pathlib import Path
 
 import psycopg
 
-from stickslip_services.database import migrate
-from stickslip_services.database.opening import connect
+from stickslip_services.database.database import Role
+from stickslip_services.database.opening import opened
+from stickslip_services.database.tables import metadata
 from stickslip_services.settings import Settings
 
 _PR_SET_PDEATHSIG = 1
@@ -25,6 +26,14 @@ _OPTIONS = (
     *("wal_level=minimal", "max_wal_senders=0", "autovacuum=off"),
 )
 """No TCP; and no test cuts the power."""
+_INITIAL = (
+    "--username=stickslip",
+    "--auth=trust",
+    "--encoding=UTF8",
+    "--locale=C.UTF-8",
+    "--no-sync",
+    "--no-instructions",
+)
 
 
 def find_programs() -> Path | None:
@@ -46,12 +55,22 @@ class PostgresqlServer:
         """Return the URL of a database."""
         return f"postgresql://stickslip@/{database}?host={self._directory}"
 
-    def fresh(self, template: str | None = None) -> str:
-        """Make a database and return its URL; with the template `template0` it is empty, without one migrated."""
-        template = template or self._migrated
+    def empty(self) -> str:
+        """Make a database and return its URL."""
         name = f"test{next(self._numbers)}"
-        self.execute(f"CREATE DATABASE {name} TEMPLATE {template} STRATEGY file_copy")
+        self.execute(f"CREATE DATABASE {name} TEMPLATE template0 STRATEGY file_copy")
         return self.url(name)
+
+    def clean(self) -> str:
+        """Return the URL of a migrated database without rows, always the same one; who still uses it is thrown out."""
+        deletions = [f"DELETE FROM {table.name}" for table in reversed(metadata.sorted_tables)]
+        with psycopg.connect(self._migrated, autocommit=True) as connection:
+            connection.execute(
+                "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+                "WHERE datname = current_database() AND pid != pg_backend_pid()"
+            )
+            connection.execute("; ".join(deletions))
+        return self._migrated
 
     def execute(self, statement: str, database: str = "postgres") -> None:
         """Execute a statement outside any transaction."""
@@ -60,12 +79,9 @@ class PostgresqlServer:
 
     @cached_property
     def _migrated(self) -> str:
-        url = self.fresh("template0")
-        database = connect(Settings.chosen(database=url))
-        with database.write() as connection:
-            migrate.upgrade(connection)
-        database.close()
-        return url.partition("?")[0].rpartition("/")[2]
+        url = self.empty()
+        with opened(Settings.chosen(database=url), Role.visitor):
+            return url
 
 
 @contextmanager
@@ -78,8 +94,7 @@ def postgresql_server(programs: Path) -> Iterator[PostgresqlServer]:
             shutil.chown(directory, user)
         data = directory / "data"
         subprocess.run(
-            [programs / "initdb", "--pgdata", data, "--username=stickslip", "--auth=trust", "--encoding=UTF8"]
-            + ["--locale=C.UTF-8", "--no-sync", "--no-instructions"],
+            [programs / "initdb", "--pgdata", data, *_INITIAL],
             user=user,
             cwd=directory,
             check=True,

@@ -58,7 +58,7 @@ def create(
 
 @app.command("list")
 @shows_errors
-def list_(data: DataOption = DEFAULT_DATA) -> None:
+def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
     with _writing(data, database) as connection:
         from stickslip_services.keys import list_keys

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from alembic.script import ScriptDirectory
-from sqlalchemy import create_engine, inspect, text
+from sqlalchemy import inspect, text
 from sqlalchemy.exc import OperationalError
 
 from stickslip_services.database import migrate
@@ -27,7 +27,7 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
         return SqliteDatabase(settings.database_path, durable=settings.durable)
     if find_spec("psycopg") is None:
         raise DatabaseRefusedError(
-            f"the database {url} needs psycopg, which is not installed: "
+            f"the database {settings.database_name} needs psycopg, which is not installed: "
             "pip install 'stickslip-services[server,postgresql]'"
         )
     from stickslip_services.database.postgresql import PostgresqlDatabase
@@ -61,12 +61,12 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> None:
     else:
         revision = _postgresql_revision(settings, role)
     name = settings.database_name
-    if revision is None and with_store:
-        if next(settings.store_root.glob("datasets/*/v*/manifest.json"), None) is not None:
-            raise DatabaseRefusedError(
-                f"{settings.store_root} holds datasets, and the database {name} is gone: run `stickslip reindex "
-                f"--data {settings.data}` to find them again"
-            )
+    datasets = settings.store_root.glob("datasets/*/v*/manifest.json") if with_store else iter(())
+    if revision is None and next(datasets, None) is not None:
+        raise DatabaseRefusedError(
+            f"{settings.store_root} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
+            f"{settings.data}` to find them again"
+        )
     known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
     if revision is not None and revision not in known:
         raise DatabaseRefusedError(

@@ -75,7 +75,7 @@ class PostgresqlDatabase(Database):
     """
 
     def __init__(self, url: URL, *, durable: bool = True, role: Role = Role.coordinator) -> None:
-        self._name = str(url)  # without the password
+        self._name = url.set(drivername="postgresql", query={}).render_as_string(hide_password=True)
         self._token = secrets.token_hex(8)
         """Tells this process's announcements from those of others."""
         self._role = role

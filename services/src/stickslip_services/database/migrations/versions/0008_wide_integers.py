@@ -25,7 +25,10 @@ _COLUMNS = {
     "job_groups": ("job",),
     "dataset_versions": ("publish_task", "bytes"),
 }
-_COUNTED = (*((name, "seq") for name in ("jobs", "tasks", "workers", "datasets", "certificates", "api_keys")), ("events", "id"))
+_COUNTED = (
+    *((name, "seq") for name in ("jobs", "tasks", "workers", "datasets", "certificates", "api_keys")),
+    ("events", "id"),
+)
 
 
 def upgrade() -> None:
