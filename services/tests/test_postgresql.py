@@ -106,7 +106,7 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
     for thread in threads:
         thread.start()
     try:
-        wait_until(lambda: len(jobs) == 2 * len(specs) and states() == {"succeeded"}, seconds=120)
+        wait_until(lambda: len(jobs) == 2 * len(specs) and states() == {"succeeded"}, seconds=240)
     finally:
         is_over.set()
         for thread in threads:

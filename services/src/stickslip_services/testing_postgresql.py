@@ -66,7 +66,7 @@ class PostgresqlServer:
         deletions = [f"DELETE FROM {table.name}" for table in reversed(metadata.sorted_tables)]
         with psycopg.connect(self._migrated, autocommit=True) as connection:
             connection.execute(
-                "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+                "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity "
                 "WHERE datname = current_database() AND pid != pg_backend_pid()"
             )
             connection.execute("; ".join(deletions))
