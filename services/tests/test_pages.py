@@ -54,7 +54,9 @@ def test_empty_pages_say_what_to_do(client: httpx.Client) -> None:
     assert "No worker is connected" in read(client, "/")
     assert "There are no datasets yet" in read(client, "/datasets")
     assert "stickslip certify" in read(client, "/certificates")
-    assert "stickslip up" in read(client, "/workers")
+    workers = read(client, "/workers")
+    assert "stickslip up" in workers
+    assert re.search(r"This machine has [\d.]+ [MG]B of its [\d.]+ GB of memory free", workers)
     assert "/v1/jobs:validate" in read(client, "/docs")
 
 

@@ -1,5 +1,6 @@
 """The OpenAPI document."""
 
+import re
 from typing import Any
 
 from fastapi import FastAPI
@@ -45,12 +46,22 @@ def describe(app: FastAPI) -> dict[str, Any]:
         components.update(body_components(_DOCUMENTS))
         _drop_foreign_errors(document)
         _name_by_title(document)
+        _summarise(document)
         _drop_null_parameters(document)
         _require_tags(document, components)
         for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
             components.pop(unused, None)
         app.openapi_schema = document
     return app.openapi_schema
+
+
+def _summarise(document: dict[str, Any]) -> None:
+    """Take the first sentence of an operation's description as its summary, in place of its function's name."""
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            if "description" in operation:
+                sentence = re.split(r"(?<=[.;:]) |\n", operation["description"], maxsplit=1)[0]
+                operation["summary"] = sentence.rstrip(".;:")
 
 
 def _drop_null_parameters(document: dict[str, Any]) -> None:

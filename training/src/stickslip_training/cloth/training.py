@@ -366,8 +366,11 @@ class _FrictionLearner(Learner):
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
-        posterior = _posterior(*answer(net, features(net, self.validation)), self.train.materials, MU_BINS, (1.0, 1.0))
-        return -float(posterior.log_likelihood(self.validation.material, self.validation.mu).mean())
+        seen, answers = self.validation, answer(net, features(net, self.validation))
+        # A network that is too sure is not worse for it: temperatures mend that in the end.
+        temperature = calibrated(*answers, seen.material, seen.mu, MU_BINS)
+        posterior = _posterior(*answers, self.train.materials, MU_BINS, temperature)
+        return -float(posterior.log_likelihood(seen.material, seen.mu).mean())
 
 
 # --- answers --------------------------------------------------------------------------------------------------

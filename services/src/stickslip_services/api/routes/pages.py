@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import pathlib
 import shutil
 from collections.abc import AsyncIterator, Iterator, Mapping
 from functools import lru_cache
@@ -494,7 +495,17 @@ def _workers(coordinator: Coordinator) -> dict[str, Any]:
     root = coordinator.store.root
     disk = shutil.disk_usage(root if root.exists() else coordinator.settings.data)
     now = as_datetime(coordinator.clock())
-    return {"workers": workers, "certified": certified, "disk": disk, "now": now}
+    return {"workers": workers, "certified": certified, "disk": disk, "memory": _memory(), "now": now}
+
+
+def _memory() -> dict[str, int] | None:
+    """Return bytes of memory of this machine, `MemTotal` and `MemAvailable`; None where Linux does not tell."""
+    try:
+        lines = [line.split() for line in pathlib.Path("/proc/meminfo").read_text().splitlines()]
+    except OSError:
+        return None
+    told = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
+    return told if {"MemTotal", "MemAvailable"} <= told.keys() else None
 
 
 @router.get("/docs")
