@@ -38,9 +38,10 @@ from stickslip_services.api.sse import Feeds
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
-from stickslip_services.database.opening import locked, opened
+from stickslip_services.database.opening import opened
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.keys import KeyRing, local_worker_key
+from stickslip_services.local.locking import locked
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
 from stickslip_services.pages.rendering import STATIC

@@ -38,19 +38,25 @@ def up(
 ) -> None:
     """Run a coordinator and a dispatcher with their workers on this machine, until Ctrl-C."""
     require_server("up")
-    from stickslip_services.local import supervisor  # it starts a server, and its settings need the server's packages
+    from stickslip_services.database.database import Role  # the server's packages may be missing
+    from stickslip_services.database.opening import check
+    from stickslip_services.local import supervisor
+    from stickslip_services.settings import Settings
 
     screen = console()
-    doors = {
+    chosen = {
+        "database": database,
         "allowed_hosts": tuple(allow_host or ()),
         "require_keys": require_keys,
         "behind_proxy": behind_proxy,
         "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
-    given = {name: value for name, value in (doors | {"database": database}).items() if value}
+    given = {name: value for name, value in chosen.items() if value}
+    settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
+    check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
-        supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher, chosen=given),
+        supervisor.LocalService(settings, slots=slots, dispatcher=dispatcher),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"

@@ -5,6 +5,7 @@ its end that somebody else was faster, so nothing has to be tried again.
 """
 
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -13,8 +14,6 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Engine, Table
-
-from stickslip_services.clock import Clock, steady_clock
 
 T = TypeVar("T")
 
@@ -39,8 +38,14 @@ class Database(ABC):
         self._writer = writer
         # The database's own waiting is unfair, or takes a connection; threads of this process queue up here.
         self._writing = threading.Lock()
-        self.clock: Clock = steady_clock()
-        """What all coordinators on this database call now."""
+        self._ahead = time.time() - time.monotonic()
+
+    def clock(self) -> float:
+        """Return what all coordinators on this database call now, in seconds since 1970 [s].
+
+        When somebody sets this machine's clock, leases neither expire at once nor live for ever.
+        """
+        return self._ahead + time.monotonic()
 
     @contextmanager
     def read(self) -> Iterator[Connection]:

@@ -89,8 +89,6 @@ class PostgresqlDatabase(Database):
         event.listen(writer, "connect", self._prepare_writer)
         event.listen(writer, "close", _leave)
         super().__init__(reader, writer)
-        self._ahead = time.time() - time.monotonic()
-        self.clock = self._now
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
@@ -119,9 +117,6 @@ class PostgresqlDatabase(Database):
             except psycopg.Error as error:
                 logger.warning("no news of other coordinators from %s: %s", self._name, error)
                 await asyncio.sleep(1.0)
-
-    def _now(self) -> float:
-        return self._ahead + time.monotonic()
 
     def _prepare_writer(self, connection: Any, _record: Any) -> None:
         _prepare(connection)

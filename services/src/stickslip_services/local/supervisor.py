@@ -13,20 +13,19 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any
+from typing import IO
 
 import httpx
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.addresses import DATABASE_VARIABLE
-from stickslip_services.database.database import Role
-from stickslip_services.database.opening import check, locked
 from stickslip_services.errors import SupervisorError
+from stickslip_services.local.locking import locked
 from stickslip_services.local.sockets import listen
 from stickslip_services.settings import Settings
 
@@ -45,14 +44,11 @@ _PR_SET_PDEATHSIG = 1
 class LocalService:
     """What `stickslip up` runs."""
 
-    data: Path
-    host: str
-    port: int
+    settings: Settings
+    """Of the coordinator. `data` is an absolute path."""
     slots: int | None = None
     dispatcher: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
-    chosen: Mapping[str, Any] = field(default_factory=dict)
-    """Other settings of the coordinator by name: its database, and who may come in."""
 
 
 @dataclass(slots=True)
@@ -143,15 +139,14 @@ class _Child:
 def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable[[str], None] | None = None) -> int:
     """Run until a signal to stop; return the exit status. Raise SupervisorError."""
     say = say or (lambda message: print_line(sys.stderr, message))
-    data = service.data.absolute()
-    settings = Settings.chosen(data=data, host=service.host, port=service.port, **service.chosen)
+    settings = service.settings
+    data = settings.data
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         lock = stack.enter_context(locked(data))
-        check(settings, Role.coordinator, with_store=True)
         signals = stack.enter_context(_stop_signals())
         # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
-        listener = _listen(service.host, service.port)
+        listener = _listen(settings.host, settings.port)
         stack.callback(listener.close)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         coordinator = _Child(
