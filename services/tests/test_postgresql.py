@@ -63,14 +63,15 @@ class Pair:
 
     settings: Settings
     servers: tuple[RunningServer, RunningServer]
+    client: httpx.Client
 
     def worker(self, which: int, name: str) -> PretendWorker:
         server = self.servers[which]
-        api = HttpApi(server.url, (server.data / "worker-key").read_text().strip())
+        api = HttpApi(server.url, (server.data / "worker-key").read_text().strip(), self.client.post)
         return PretendWorker(api, Store(self.settings.store_root), name=name).register()
 
     def submit(self, which: int, **spec: object) -> str:
-        response = httpx.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec), timeout=60)  # type: ignore[arg-type]
+        response = self.client.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec))  # type: ignore[arg-type]
         response.raise_for_status()
         return str(response.json()["id"])
 
@@ -79,7 +80,8 @@ class Pair:
 def pair(settings: Settings) -> Iterator[Pair]:
     options = ("--store", str(settings.store_root))
     servers = [start_server(settings.data.parent / name, options=options) for name in ("a", "b")]
-    yield Pair(settings, (servers[0], servers[1]))
+    with httpx.Client(trust_env=False, timeout=60) as client:
+        yield Pair(settings, (servers[0], servers[1]), client)
     for server in servers:
         server.stop()
 
@@ -94,12 +96,12 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
         jobs.extend(pair.submit(which, **spec) for spec in specs)
 
     def work(worker: PretendWorker) -> None:
-        while not is_over.wait(0.02):
+        while not is_over.wait(0.1):
             if leases := worker.lease(simulate=3, render=3, pack=1, publish=1):
                 worker.finish(*leases)
 
     def states() -> set[str]:
-        return {job["state"] for job in httpx.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]}
+        return {job["state"] for job in pair.client.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]}
 
     threads = [threading.Thread(target=submit_all, args=(which,)) for which in range(2)]
     threads += [threading.Thread(target=work, args=(worker,)) for worker in workers]
@@ -121,7 +123,7 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
     assert (len(ran), set(ran.values()), attempts) == (count, {1}, {1})
     assert sum(bool(worker.ran) for worker in workers) > 1
     for server in pair.servers:
-        listed = httpx.get(f"{server.url}/v1/jobs").json()["items"]
+        listed = pair.client.get(f"{server.url}/v1/jobs").json()["items"]
         assert {job["id"] for job in listed} == set(jobs)
         assert {job["state"] for job in listed} == {"succeeded"}
 
@@ -141,7 +143,7 @@ def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
             if len(heard) == 1:
                 time.sleep(2.5)  # now the stream waits for the bell: by itself it looks again after 15 s
                 asked = time.monotonic()
-                httpx.post(f"{one}/v1/jobs/{job}:cancel", timeout=20).raise_for_status()
+                pair.client.post(f"{one}/v1/jobs/{job}:cancel").raise_for_status()
     assert [state for state, _ in heard][-1] == "cancelled"
     assert heard[-1][1] - asked < 6.0
 
