@@ -15,7 +15,7 @@ from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
 from stickslip_services.testing import ManualClock, PretendWorker, parsed, rods, show_job
 
-pytestmark = pytest.mark.databases
+pytestmark = pytest.mark.databases(slow=True)
 
 
 def submit(coordinator: Coordinator, **spec: Any) -> str:

@@ -97,7 +97,7 @@ class Prepared:
             assert isinstance(made, SQLCompiler)
             names = tuple(made.positiontup or ())
             lists = {
-                name: made.visit_empty_set_expr([made.binds[name].type])
+                name: made.visit_empty_set_expr([made.binds[name].type])  # type: ignore[no-untyped-call]
                 for name in dict.fromkeys(names)
                 if made.binds[name].expanding
             }
