@@ -1,7 +1,7 @@
 """The queue against a small model of it, in any order of events, with an audit of the ledger after each."""
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -54,8 +54,8 @@ def _judge(task: Any) -> Any:
 class QueueMachine(RuleBasedStateMachine):
     """The model: who holds what until when, what was reported, what is settled."""
 
-    new_database: ClassVar[Callable[[], str] | None] = None
-    """Empties a PostgreSQL database and returns its URL; None: SQLite."""
+    server: ClassVar["PostgresqlServer | None"] = None
+    """Where the database is; None: SQLite."""
 
     jobs = Bundle("jobs")
     leases = Bundle("leases")
@@ -68,7 +68,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.settings = Settings.chosen(
             data=Path(self.directory.name),
             durable=False,
-            database=None if self.new_database is None else self.new_database(),
+            database=None if self.server is None else self.server.clean(),
         )
         self.coordinator = Coordinator(self.settings, self.clock)
         self.coordinator.start()
@@ -285,6 +285,6 @@ def test_the_queue_in_any_order() -> None:
 @pytest.mark.slow
 def test_the_queue_in_any_order_on_postgresql(postgresql: "PostgresqlServer") -> None:
     class Machine(QueueMachine):
-        new_database = staticmethod(postgresql.clean)
+        server = postgresql
 
     run_machine(Machine)
