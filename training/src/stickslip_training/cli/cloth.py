@@ -30,7 +30,7 @@ SHARES = (0.12, 0.25)
 def train(
     runs: RunsArgument,
     out: Annotated[Path, typer.Option(help="directory for the model, the checkpoint and the report")],
-    steps: Annotated[int, typer.Option(help="of training, with 8 clips each")] = 1500,
+    steps: Annotated[int, typer.Option(help="of training, with 16 clips each")] = 1500,
     seed: Annotated[int, typer.Option(help="of the weights and of all that is drawn")] = 0,
     split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
@@ -65,7 +65,7 @@ def evaluate(
     model: ModelArgument,
     runs: RunsArgument,
     out: Annotated[Path, typer.Option(help="directory for report.html, report.json and records.jsonl")],
-    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
+    split: Annotated[str, typer.Option(help="train, validation, test, or all clips of a dataset")] = "test",
     renders: Annotated[int, typer.Option(help="clips of each simulation of a packed file")] = 6,
     seed: Annotated[int, typer.Option(help="of the looks of clips of a packed file")] = 99,
     split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
@@ -80,14 +80,15 @@ def evaluate(
         friction = load_friction(model)
         if runs.endswith(".npz"):
             source, parts = _splits(runs, split_seed)
-            clips, slots = render_clips(parts[split], renders, seed), None
+            clips, slots = render_clips(parts[_split(split)], renders, seed), None
             notes = [
                 f"Pictures were rendered by the renderer that the network was trained with, {renders} a simulation."
             ]
         else:
             with DatasetReader(runs) as reader:
                 source = {"manifest": reader.manifest_digest}
-                clips, slots = read_clips(reader, _split(split), friction.materials)
+                chosen = None if split == "all" else _split(split)
+                clips, slots = read_clips(reader, chosen, friction.materials)
             notes = [f"Clips of the split {split} of dataset {source['manifest'][:12]}."]
         if (clips.material < 0).any():
             raise ValueError(

@@ -57,7 +57,7 @@ class ClothTraining:
     """How a network is trained. The same settings, runs, machine and threads give the same weights."""
 
     steps: int = 1500
-    batch_size: int = 8
+    batch_size: int = 16
     learning_rate: float = 2e-3
     """Of AdamW at its highest; it falls to nothing like half a cosine."""
     averaging: float = 0.99
