@@ -71,7 +71,7 @@ class Pair:
         return PretendWorker(api, Store(self.settings.store_root), name=name).register()
 
     def submit(self, which: int, **spec: object) -> str:
-        response = self.client.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec))  # type: ignore[arg-type]
+        response = self.client.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec))
         response.raise_for_status()
         return str(response.json()["id"])
 
