@@ -52,16 +52,22 @@ def zstd(level: int, order: str, *, delta: bool = False) -> Codec:
 def blosc_zstd(level: int, order: str, shuffle: int, *, delta: bool = False, block: int = 0) -> Codec:
     codec = blosc.Blosc("zstd", level, shuffle, blocksize=block)
     names = {blosc.NOSHUFFLE: "", blosc.BITSHUFFLE: ", bits shuffled"}
-    return Codec(order, delta, f"blosc zstd {level}{names[shuffle]}", codec.encode, codec.decode)
+
+    def encode(values: np.ndarray) -> bytes:
+        return bytes(codec.encode(values.ravel().view("V3")))  # bits of red, green and blue apart
+
+    return Codec(order, delta, f"blosc zstd {level}{names[shuffle]}", encode, codec.decode)
+
+
+_BLOSC = ((5, blosc.BITSHUFFLE), (6, blosc.BITSHUFFLE), (6, blosc.NOSHUFFLE))
 
 
 CODECS = [
     zstd(3, "tyxc"),  # of datasets before 2026-11-22
-    *(zstd(level, "tyxc") for level in (6, 9, 12)),
-    *(zstd(level, order) for order in ("ytxc", "tcyx", "ytcx", "cytx", "yxct", "cyxt") for level in (3, 6, 9)),
-    *(zstd(level, order, delta=True) for order in ("tcyx", "cytx", "yxct") for level in (3, 9)),
-    blosc_zstd(9, "cyxt", blosc.BITSHUFFLE, delta=True),
-    blosc_zstd(9, "cytx", blosc.BITSHUFFLE, delta=True),
+    *(zstd(level, "ytxc") for level in (3, 6, 9, 12)),  # 9 is that of datasets since
+    *(zstd(9, order) for order in ("tyxc", "ytcx", "tcyx", "cytx", "yxct", "cyxt")),
+    *(zstd(9, order, delta=True) for order in ("ytxc", "tcyx", "cytx")),
+    *(blosc_zstd(level, "ytxc", shuffle, block=1 << 20) for level, shuffle in _BLOSC),
 ]
 
 

@@ -33,7 +33,8 @@ import zarr
 from numpy.typing import NDArray
 from stickslip_schemas.arrays import ArrayLayout, describe
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.chunks import encode_chunk, encode_shard
+from stickslip_schemas.chunks import encode_shard
+from stickslip_schemas.codecs import axes_order, encode_sample, zstd_level
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
@@ -42,7 +43,7 @@ from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Man
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.tasks import FileEntry
 from stickslip_training.kinds.cloth_drag import ClipDataset
-from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+from zarr.codecs import BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
 Bytes = NDArray[np.uint8]
 FRAMES, SIDE = 30, 224
@@ -142,14 +143,16 @@ def _seal(root: Path) -> None:
 
 def _write_array(group: zarr.Group, root: Path, array: ArrayLayout, values: NDArray[Any], shard_size: int) -> None:
     shard = (shard_size, *array.shape)
+    order = axes_order(array)
     out = group.create_array(
         array.name,
         shape=values.shape,
         dtype=array.dtype,
         chunks=(1, *array.shape) if array.per_sample else shard,
         shards=shard if array.per_sample else None,
+        filters=[TransposeCodec(order=order)] if order else [],
         serializer=BytesCodec(),
-        compressors=[ZstdCodec(level=3), Crc32cCodec()],
+        compressors=[ZstdCodec(level=zstd_level(array)), Crc32cCodec()],
         fill_value=array.fill,
         dimension_names=("sample", *array.dimensions),
         attributes=describe(array),
@@ -159,7 +162,7 @@ def _write_array(group: zarr.Group, root: Path, array: ArrayLayout, values: NDAr
         out[:] = values
         return
     for first in range(0, len(values), shard_size):
-        chunks: list[bytes | None] = [encode_chunk(value) for value in values[first : first + shard_size]]
+        chunks: list[bytes | None] = [encode_sample(array, value) for value in values[first : first + shard_size]]
         chunks += [None] * (shard_size - len(chunks))
         path = root / array.shard_path(first // shard_size)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,9 @@ denoised, for gloss is still noisy at 256 samples. They take most of the time, a
 squared error of 8-bit sRGB over the pixels that the cloth covers by half or more, over frames, views and textures.
 CPU time is a median over frames, per frame and texture, with eight textures.
 
+--look says what hem, thickness, translucency and creases cost, and --ground-truth what all its arrays cost, written to
+a store too: both against a trace and its composition, in turns, so that other work on the machine slows both alike.
+
 --clip makes what a render process makes of a task, 8 clips of 30 frames in a store, says how much of its time is not
 Blender's, and writes the clips to a file.
 """
@@ -22,7 +25,7 @@ import platform
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,7 @@ from stickslip_blender.build import build_digest
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR
+from stickslip_blender.ground_truth import ground_truth
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import grained, look_of
 from stickslip_blender.multiplexed import encode
@@ -43,9 +47,10 @@ from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
+from stickslip_blender.workshop import Workshop
 from stickslip_schemas.cameras import load_rig, rig_digest
-from stickslip_schemas.chunks import decode_chunk
 from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.codecs import decode_clip
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.store import Store
@@ -193,6 +198,50 @@ def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Vi
     )
 
 
+def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
+    """Print what a trace and its composition cost with a plain sheet, and with all that makes it look like cloth."""
+    full, plain = bench.look, replace(bench.look, hem=0.0, translucency=0.0)
+    seconds: dict[str, list[float]] = {"plain": [], "full": []}
+    for _ in range(3):
+        for view in chosen:
+            for name, look, creases in (("plain", plain, 0.0), ("full", full, CREASES)):
+                bench.look = look
+                bench.geometry.surface.dress(hem=1e-3 * look.hem, creases=creases, seed=1)
+                _, light, other = bench.composed(view, CLOTH_SAMPLING[Quality.standard])
+                seconds[name].append(light + other)
+    ratio = np.median(np.array(seconds["full"]) / np.array(seconds["plain"])) - 1
+    print(
+        f"looks: {1e3 * np.median(seconds['plain']):.0f} ms plain, {1e3 * np.median(seconds['full']):.0f} ms with hem, "
+        f"thickness, translucency and creases: {100 * ratio:+.1f} % (median of {len(chosen) * 3} pairs)",
+        flush=True,
+    )
+
+
+def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
+    """Print what depth, segmentation, normals, texture coordinates and flow cost, besides a trace and its pictures."""
+    pictures, known, written = [], [], []
+    with tempfile.TemporaryDirectory() as folder:
+        workshop = Workshop(folder)
+        for view in chosen * 2:
+            _, light, other = bench.composed(view, CLOTH_SAMPLING[Quality.standard])
+            pictures.append(light + other)
+            now, then = (bench.geometry.points(bench.track[k], k) for k in (view.frame, view.frame - 5))
+            start = time.process_time()
+            truth = ground_truth(bench.geometry, now, then, bench.rig[view.view])
+            found = time.process_time()
+            for values in vars(truth).values():
+                workshop.chunk(values)
+            known.append(found - start)
+            written.append(time.process_time() - found)
+    whole = np.array(pictures)
+    of_trace, of_all = (100 * np.median(part / whole) for part in (np.array(known), np.add(known, written)))
+    print(
+        f"ground truth: {1e3 * np.median(known):.0f} ms a frame, {of_trace:.1f} % of the "
+        f"{1e3 * np.median(whole):.0f} ms of a trace and its eight pictures; {of_all:.1f} % with writing it",
+        flush=True,
+    )
+
+
 def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> None:
     """Make the clips of a task, all of it, and print where the time goes."""
     with np.load(trajectory) as file:
@@ -237,7 +286,7 @@ def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> No
         shape = (len(TEXTURES), len(look.instants), 224, 224, 3)
         clips = np.empty(shape, dtype=np.uint8)
         for clip, where in zip(clips, result.output.clips.values(), strict=True):
-            decode_chunk(store.read(where.digest, offset=where.offset, length=where.length), clip)
+            decode_clip(store.read(where.digest, offset=where.offset, length=where.length), clip)
         actor.close()
     np.save(out, clips)
     blender, every = spent
@@ -259,6 +308,8 @@ def main() -> None:
     arguments.add_argument("--quality", default="standard", help="of --clip")
     arguments.add_argument("--substrate", default="matt", help="of --clip")
     arguments.add_argument("--direct", action="store_true", help="direct renderings too")
+    arguments.add_argument("--look", action="store_true", help="only what the look of cloth costs")
+    arguments.add_argument("--ground-truth", action="store_true", help="only what ground truth costs")
     arguments.add_argument("--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings")
     options = arguments.parse_args()
     if options.clip is not None:
@@ -274,6 +325,12 @@ def main() -> None:
         qualities[pair] = ClothSampling(frame=frame, window=window)
     chosen = list(shots(bench.track, options.frames, ("matt",)))
     bench.composed(chosen[0], CLOTH_SAMPLING[Quality.draft])  # shaders are compiled once
+    if options.look or options.ground_truth:
+        if options.look:
+            cost_of_looks(bench, chosen)
+        if options.ground_truth:
+            cost_of_ground_truth(bench, chosen)
+        return
     for quality, sampling in qualities.items():
         compare(bench, quality, sampling, chosen)
     if options.direct:

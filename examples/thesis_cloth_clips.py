@@ -12,6 +12,7 @@ import json
 import sqlite3
 import time
 from collections import defaultdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,11 @@ def main() -> None:
         spec |= {"name": "small-cloth-clips", "preset": "fast", "mesh": 13, "frames": 6, "allow_uncertified": True}
         spec["axes"] |= {"material": ["gray-interlock"], "mu": [0.5]}
     args.out.mkdir(exist_ok=True)
+    begun = datetime.now(UTC)
     with service(args.out / "service") as url:
         if args.certificate is not None:
             run("stickslip", "register", args.certificate, "--url", url)
+        wait_for_worker(url, begun)
         started = time.monotonic()
         path = args.out / f"{spec['name']}.yaml"
         path.write_text(yaml.safe_dump(spec))
@@ -54,6 +57,13 @@ def main() -> None:
         run("stickslip", "pull", job.dataset.dataset, dataset, "--url", url)
     run("stickslip", "verify", dataset)
     report(dataset, args.out / DATABASE, job.id, wall)
+
+
+def wait_for_worker(url: str, since: datetime) -> None:
+    """Wait until a worker has registered since then: a job is planned for the builds of the newest one."""
+    with Client(url) as client:
+        while not any(worker.registered_at >= since for worker in client.workers()):
+            time.sleep(1.0)
 
 
 def report(dataset: Path, database: Path, job: str, wall: float) -> None:

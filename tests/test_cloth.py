@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import STICKSLIP, Service, read_arrays
+from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.cloth import SEGMENTS
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.manifest import Manifest
 from stickslip_sim_core import drop_and_drag
+from stickslip_training.data.reader import DatasetReader
 from stickslip_training.kinds.cloth_drag import ClipDataset
 
 SPEC: dict[str, Any] = {
@@ -94,3 +97,32 @@ def test_clips_show_the_cloth_of_their_sample(directory: Path) -> None:
             assert inside.mean() > 0.95
             centers.append(pixels.mean(axis=0))
         assert np.linalg.norm(centers[1] - centers[0]) > 20.0  # it has been dragged
+
+
+def test_what_is_known_of_every_pixel_reaches_the_reader(service: Service, tmp_path: Path) -> None:
+    names = ("depth", "segmentation", "normals", "uv", "flow")
+    spec = SPEC | {"ground_truth": list(names), "axes": SPEC["axes"] | {"viewpoint": "left"}}
+    job = service.finished(service.submit(spec))
+    assert job["progress"]["stages"]["simulate"]["cached"] == 1
+    target = tmp_path / "known"
+    command = [STICKSLIP, "pull", job["dataset"]["dataset"], target, "--url", service.url]
+    subprocess.run(command, check=True, capture_output=True)
+    arrays = read_arrays(target)
+    with DatasetReader(target) as reader:
+        known = {name: reader.read(name, [0, 1]) for name in names}
+        instants = shown_frames(3, 300)
+        camera = {camera.name: camera for camera in reader.manifest.cameras}["left"]
+    for name, values in known.items():
+        assert np.array_equal(values, arrays[name], equal_nan=True)
+        assert np.array_equal(values[0], values[1], equal_nan=True)  # textures share it
+    cloth = known["segmentation"][0] == SEGMENTS.index("cloth")
+    assert (cloth == np.isfinite(known["uv"][0]).all(axis=-1)).all()
+    for frame, instant in enumerate(instants):
+        vertices = arrays["positions"][0, instant] @ np.asarray(camera.rotation).T + np.asarray(camera.translation)
+        depth = known["depth"][0, frame][cloth[frame]]
+        assert vertices[:, 2].min() - 0.01 < depth.min() <= depth.max() < vertices[:, 2].max() + 0.01
+        pixels, _ = camera.project(arrays["positions"][0, instant])
+        rows, columns = np.nonzero(cloth[frame])
+        assert abs(columns.min() - pixels[:, 0].min()) < 2
+        assert abs(rows.max() - pixels[:, 1].max()) < 2
+    assert np.linalg.norm(known["flow"][0, 0][cloth[0]].astype(float), axis=-1).mean() > 10.0  # it is dragged

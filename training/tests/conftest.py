@@ -139,7 +139,7 @@ def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samp
         dtype=array.dtype,
         chunks=(1, *array.shape) if array.per_sample else shard,
         shards=shard if array.per_sample else None,
-        filters=[TransposeCodec(order=(0, 3, 2, 1))] if array.is_trajectory else [],
+        filters=_turned(array),
         serializer=BytesCodec(),
         compressors=[compressor or ZstdCodec(level=3), Crc32cCodec()],
         fill_value=array.fill,
@@ -149,6 +149,11 @@ def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samp
         config={"write_empty_chunks": not array.per_sample},
     )
     out[:] = values
+
+
+def _turned(array: ArrayLayout) -> list[TransposeCodec]:
+    order = (0, 2, 1, 3, 4) if array.is_clip else (0, 3, 2, 1) if array.is_trajectory else None
+    return [] if order is None else [TransposeCodec(order=order)]
 
 
 def cloth_spec(**changes: Any) -> ClothDragSpec:

@@ -11,12 +11,16 @@ import pytest
 import tensorstore
 import xarray
 import zarr
+from PIL import Image
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.chunks import encode_chunk, encode_trajectory
+from stickslip_schemas.chunks import encode_trajectory
+from stickslip_schemas.cloth import PICTURE_DECIBELS
+from stickslip_schemas.codecs import encode_clip
+from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec, Viewpoint
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Manifest, Pictures
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store
@@ -202,7 +206,7 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
             shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": (), "gate_db": ()}
             seen = {name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()}
-            seen |= {"light_seed": i, "composed": True, "lighting": "drawn", "substrate": "ceramic"}
+            seen |= {"light_seed": i, "composed": i != 1, "lighting": "drawn", "substrate": "ceramic"}
             labels = sample.labels | result.output.labels | seen
             arrays["valid"][i] = True
             codes = {"kernel": 0, "lighting": 0, "substrate": 3}
@@ -212,7 +216,8 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
                 if name in arrays:
                     arrays[name][i] = values[0]
             arrays["video"][i] = rng.integers(0, 4, arrays["video"].shape[1:])
-            chunk = encode_chunk(arrays["video"][i])
+            arrays["video"][i, 1] += 100
+            chunk = encode_clip(arrays["video"][i])
             where = ChunkRef(digest=store.publish(chunk), offset=0, length=len(chunk))
             slots.append(
                 PackSlot(
@@ -281,6 +286,15 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
         assert dataset["positions"].dims == ("sample", "instant", "vertex", "xyz")
     assert group["video"].attrs["instants"] == [0, 150]
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+    assert manifest.pictures == Pictures(
+        quality=Quality.standard,
+        psnr_db=PICTURE_DECIBELS[Quality.standard],
+        gate_db=round(float(made.arrays["gate_db"][made.arrays["valid"]].min()), 2),
+        direct_slots=(1,),
+    )
+    assert "rendered directly instead: 1." in (directory / "README.md").read_text()
+    with Image.open(directory / "preview.webp") as picture:
+        assert (picture.format, picture.n_frames) == ("WEBP", 2)
     assert manifest.cameras == load_rig("drag")
     assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
 

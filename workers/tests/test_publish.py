@@ -10,8 +10,11 @@ import pytest
 import tensorstore
 import xarray
 import zarr
+from PIL import Image
+from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import Manifest, check_seal
+from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
+from stickslip_schemas.manifest import Manifest, Pictures, check_seal
 from stickslip_schemas.store import Store
 from stickslip_workers.stages import publish as publish_module
 from stickslip_workers.stages.publish import publish
@@ -73,6 +76,17 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     assert sum(manifest.split_counts.values()) == 6
     assert [camera.name for camera in manifest.cameras]
     assert manifest.acceptance_rate == pytest.approx(6 / 7)
+    level = PICTURE_DECIBELS[Quality.standard]
+    assert manifest.pictures == Pictures(quality=Quality.standard, psnr_db=level, gate_db=None, direct_slots=())
+    with Image.open(directory / "preview.webp") as picture:
+        assert (picture.format, picture.n_frames) == ("WEBP", 1)
+
+
+def test_what_is_not_rendered_has_no_picture(make_dataset: Make) -> None:
+    made = make_dataset(views=False)
+    directory = made.publish()
+    assert not (directory / "preview.webp").exists()
+    assert Manifest.model_validate_json((directory / "manifest.json").read_bytes()).pictures is None
 
 
 def test_publishing_again_and_after_a_crash_gives_the_same(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:

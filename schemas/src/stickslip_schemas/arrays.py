@@ -1,8 +1,8 @@
 """What an array of a dataset is. The first dimension of every array is `sample`.
 
 Labels and curves are one chunk per shard group; pictures, clips and meshes are one chunk per sample, and the chunks of
-a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for those of trajectories:
-`transpose(sample axes reversed) -> bytes(little) -> blosc(zstd 5, shuffle) -> crc32c`.
+a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for those of clips and
+trajectories: see `stickslip_schemas.codecs`.
 """
 
 from dataclasses import dataclass, field, fields
@@ -36,6 +36,8 @@ class ArrayLayout:
     """Names of the codes 0, 1, ... of a categorical label."""
     is_trajectory: bool = False
     """True where the first dimension of a sample is time and the values change slowly: coded by `encode_trajectory`."""
+    is_clip: bool = False
+    """True of pictures (frame, y, x, rgb) that change slowly from frame to frame: coded by `encode_clip`."""
     attributes: dict[str, Any] = field(default_factory=dict, hash=False)
     """What else the Zarr array says of itself."""
 

@@ -13,6 +13,7 @@ from pydantic import Field
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import Camera
+from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import Sha256, sha256
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.tasks import FileEntry, Rejection
@@ -30,6 +31,22 @@ class BrokenSealError(ValueError):
     """The manifest, the root's metadata and the seal of a version do not fit each other."""
 
 
+class Pictures(Document):
+    """How good the pictures of a version are."""
+
+    quality: Quality
+    psnr_db: float = Field(
+        description="PSNR of the pixels of cloth or rod, against pictures of 256 samples with another noise, as "
+        "measured when the quality was set [dB]"
+    )
+    gate_db: float | None = Field(
+        description="least of what the image gate found in this version [dB]; null: it has no composed pictures"
+    )
+    direct_slots: tuple[int, ...] = Field(
+        description="slots whose pictures the image gate refused to compose: they were rendered directly"
+    )
+
+
 class Manifest(Document):
     """Everything about a version that is not in its arrays. A version exists when its manifest is committed."""
 
@@ -45,6 +62,7 @@ class Manifest(Document):
     cameras: tuple[Camera, ...] = Field(
         description="of the array `views`, in its order, or of the viewpoints, by name; empty where nothing is rendered"
     )
+    pictures: Pictures | None = Field(default=None, description="how good the pictures are; null: there are none")
     sample_count: int = Field(ge=1, description="slots, the rejected ones included")
     valid_count: int = Field(ge=0)
     split_counts: dict[str, int] = Field(description="valid samples by split")

@@ -20,7 +20,8 @@ from fastapi import FastAPI
 from pydantic import BaseModel
 from stickslip_schemas.arrays import SAMPLE_KEY_BYTES, ArrayLayout
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.chunks import encode_chunk, encode_shard, encode_trajectory
+from stickslip_schemas.chunks import encode_chunk, encode_shard
+from stickslip_schemas.codecs import encode_sample
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
@@ -277,10 +278,9 @@ def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
     if array.name == "sample_key":
         keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]
         values = keys
-    encode = encode_trajectory if array.is_trajectory else encode_chunk
     if array.per_sample:
         rows = iter(values)
-        chunks = [encode(next(rows)) if slot.valid else None for slot in task.slots]
+        chunks = [encode_sample(array, next(rows)) if slot.valid else None for slot in task.slots]
         return encode_shard([*chunks, *[None] * (size - len(chunks))])
     if array.name == "valid":
         values = [np.asarray(slot.valid) for slot in task.slots]

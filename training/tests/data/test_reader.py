@@ -367,7 +367,7 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
     ("old", "new", "message"),
     [
         ('"zstd"', '"gzip"', "array video: codecs must be"),
-        ('"order": [', '"order": [3, ', "array positions: codecs must be"),
+        ('"order": [', '"order": [3, ', "array video: codecs must be"),
         ('"data_type": "int16"', '"data_type": "int32"', "array texture: data_type must be"),
         ('"fill_value": -1', '"fill_value": 0', "array texture: fill_value must be -1, and is 0"),
         ('"separator": "/"', '"separator": "."', "array video: chunk_key_encoding must be"),

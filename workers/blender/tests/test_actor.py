@@ -27,6 +27,7 @@ from stickslip_blender.substrates import drawn_substrate
 from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import decode_chunk
 from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.codecs import decode_clip
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import is_sha256
 from stickslip_schemas.kinds import KINDS
@@ -153,7 +154,7 @@ from stickslip_blender.actor import RenderActor
 from stickslip_blender import clips
 from stickslip_blender.clips import GATE
 from stickslip_blender.pixels import FrameReader
-FrameReader.read = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
+FrameReader.read_matte = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
 """
 
@@ -220,8 +221,9 @@ def _clip(record: str, *, preview: bool = False, frames: int = 3, **look: Any) -
 
 
 def _video(store: Store, chunk: ChunkRef, frames: int) -> Any:
-    data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
-    return np.frombuffer(data, dtype=np.uint8).reshape(frames, 224, 224, 3)
+    video = np.empty((frames, 224, 224, 3), dtype=np.uint8)
+    decode_clip(store.read(chunk.digest, offset=chunk.offset, length=chunk.length), video)
+    return video
 
 
 def _output(result: dict[str, Any]) -> RenderOutput:

@@ -31,7 +31,7 @@ def test_a_ball_is_lit_from_where_the_soft_box_stands(
         ),
     )
     with FrameReader(scene, tmp_path) as reader:
-        frame = reader.read().astype(float).mean(axis=2)
+        frame = reader.read_light().astype(float).mean(axis=2)
     spots = {
         "left": frame[16, 6],
         "right": frame[16, 26],

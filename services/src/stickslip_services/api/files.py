@@ -15,7 +15,7 @@ from stickslip_services.errors import MissingArtifactError
 
 BLOCK = 1 << 18
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
-_MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".html": "text/html"}
+_MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".webp": "image/webp", ".html": "text/html"}
 
 OPENAPI_HEADERS = {
     name: {"description": description, "schema": {"type": "string"}}
@@ -26,6 +26,16 @@ OPENAPI_HEADERS = {
         "Cache-Control": "The file never changes",
     }.items()
 }
+
+
+def picture_format(path: Path) -> str:
+    """Return the format of a picture, png or webp, from its first bytes; of a file that cannot be read, png."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        return "png"
+    return "webp" if head[:4] == b"RIFF" and head[8:] == b"WEBP" else "png"
 
 
 def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Response:

@@ -10,9 +10,9 @@ from stickslip_schemas.chunks import (
     MISSING,
     decode_chunk,
     decode_shard_index,
-    decode_trajectory,
     shard_index_size,
 )
+from stickslip_schemas.codecs import decode_sample
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.store import Store
@@ -62,10 +62,7 @@ def _chunk(path: Path, array: ArrayLayout, position: int, slots: int) -> Array:
         file.seek(offset)
         chunk = file.read(length)
     out = np.empty(array.shape, dtype=array.dtype)
-    if array.is_trajectory:
-        decode_trajectory(chunk, out)
-    else:
-        decode_chunk(chunk, out)
+    decode_sample(array, chunk, out)
     return out
 
 

@@ -62,8 +62,9 @@ class ClothTraining:
     """Of AdamW at its highest; it falls to nothing like half a cosine."""
     averaging: float = 0.99
     """Decay of the running average over steps that is the model's weights."""
-    smoothing: float = 0.02
-    """Standard deviation of mu about the truth in what the network is told [1]: about a bin."""
+    smoothing: tuple[float, float] = (0.2, 0.02)
+    """Standard deviation of mu about the truth in what the network is told, at the first and at the last step [1]: first
+    the network learns an order, and in the end a bin."""
     gap: float = 0.3
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
@@ -74,7 +75,9 @@ class ClothTraining:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        check_positive(self, "steps", "batch_size", "learning_rate", "smoothing", "width", "threads")
+        check_positive(self, "steps", "batch_size", "learning_rate", "width", "threads")
+        if not all(0 < deviation < math.inf for deviation in self.smoothing):
+            raise ValueError(f"smoothing must be two numbers above 0 and finite, and is {self.smoothing}")
         for name in ("gap", "turn"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be 0 or more and finite, and is {getattr(self, name)}")
@@ -336,7 +339,9 @@ class _FrictionLearner(Learner):
 
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
         crops, direction, material, mu = self.batch(step)
-        target = torch.exp(-0.5 * ((self.centers - mu[:, None]) / self.settings.smoothing) ** 2)
+        first, last = self.settings.smoothing
+        deviation = first * (last / first) ** (step / self.settings.steps)
+        target = torch.exp(-0.5 * ((self.centers - mu[:, None]) / deviation) ** 2)
         target = target / target.sum(dim=1, keepdim=True)
         device = self.settings.device
         log_material, log_mu = net(crops.to(device), direction.to(device))

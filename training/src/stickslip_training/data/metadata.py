@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.codecs import axes_order
 
 from stickslip_training.data.errors import InvalidDatasetError
 
@@ -75,11 +76,10 @@ _CRC = {"name": "crc32c", "configuration": {}}
 
 
 def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
-    chunk = [_LITTLE, {"name": "zstd", "configuration": {}}, _CRC]
-    if array.is_trajectory:
-        order = [0, *range(len(array.shape), 0, -1)]
-        transpose = {"name": "transpose", "configuration": {"order": order}}
-        chunk = [transpose, _LITTLE, {"name": "blosc", "configuration": {}}, _CRC]
+    compressor: dict[str, Any] = {"name": "blosc" if array.is_trajectory else "zstd", "configuration": {}}
+    chunk: list[dict[str, Any]] = [_LITTLE, compressor, _CRC]
+    if (order := axes_order(array)) is not None:
+        chunk.insert(0, {"name": "transpose", "configuration": {"order": list(order)}})
     if not array.per_sample:
         return chunk
     configuration = {

@@ -7,7 +7,8 @@ be used before and after a fork, and it can be pickled. Zeros are never made up:
 
 import os
 from collections import Counter, OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import numpy as np
@@ -19,9 +20,9 @@ from stickslip_schemas.chunks import (
     CorruptChunkError,
     decode_chunk,
     decode_shard_index,
-    decode_trajectory,
     shard_index_size,
 )
+from stickslip_schemas.codecs import decode_sample
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.layout import layout
@@ -222,7 +223,8 @@ class DatasetReader:
                 f"array {array.name}, sample {slot}: its chunk reaches beyond the end of {self._at(file)}"
             )
         chunk = self.source.read(file, offset, length)
-        _decode(chunk, out, f"array {array.name}, sample {slot}, {self._at(file)}", trajectory=array.is_trajectory)
+        with _naming(f"array {array.name}, sample {slot}, {self._at(file)}"):
+            decode_sample(array, chunk, out)
 
     def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
         key = array.name, shard
@@ -258,7 +260,8 @@ class DatasetReader:
         out = np.empty((self._shard_size, *array.shape), dtype=array.dtype)
         data = self.source.read(file)
         self._check_digest(file, data)
-        _decode(data, out, f"array {array.name}, samples {first} to {end - 1}, {self._at(file)}")
+        with _naming(f"array {array.name}, samples {first} to {end - 1}, {self._at(file)}"):
+            decode_chunk(data, out)
         return out
 
     def _at(self, file: FileEntry) -> str:
@@ -359,12 +362,10 @@ def _parse_manifest(data: bytes) -> Manifest:
     return manifest
 
 
-def _decode(chunk: bytes, out: Array, what: str, *, trajectory: bool = False) -> None:
-    """Decode a chunk into all of `out`, or raise."""
+@contextmanager
+def _naming(what: str) -> Iterator[None]:
+    """Say of a chunk that cannot be decoded which one it is."""
     try:
-        if trajectory:
-            decode_trajectory(chunk, out)
-        else:
-            decode_chunk(chunk, out)
+        yield
     except (CorruptChunkError, RuntimeError, ValueError) as error:
         raise CorruptDataError(f"{what}: {error}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cache
 from importlib import metadata
 
@@ -29,16 +28,11 @@ def roots(kind: str) -> tuple[str, ...]:
 @cache
 def build_digest(kind: str) -> str:
     """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
-    files = sources(roots(kind), cut=LIST_OF_KINDS)
     content = {
         "kind": kind,
-        "sources": digests(files),
-        "raster": BUILD_HASH if _uses_raster(files) else None,
+        "sources": digests(sources(roots(kind), cut=LIST_OF_KINDS)),
+        "raster": BUILD_HASH,
         "libraries": {library: metadata.version(library) for library in _LIBRARIES},
         **blender_version(),
     }
     return content_key("build/render", content)
-
-
-def _uses_raster(files: Iterable[str]) -> bool:
-    return any(file.startswith("stickslip_blender/raster/") for file in files)

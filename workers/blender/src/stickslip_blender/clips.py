@@ -209,12 +209,12 @@ def render_clips(
     videos, labels = clip.clips(trace, wanted)
     if not task.textures:
         preview = workshop.store.publish(moving(videos[0])) if task.preview else None
-        chunks = {"video": workshop.chunk(videos[0]), **known}
+        chunks = {"video": workshop.clip(videos[0]), **known}
         return TaskResult(outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels))
     output = RenderOutput(
         chunks=known,
         labels=labels,
-        clips={texture: workshop.chunk(video) for texture, video in zip(wanted, videos, strict=True)},
+        clips={texture: workshop.clip(video) for texture, video in zip(wanted, videos, strict=True)},
         previews={texture: workshop.store.publish(moving(video)) for texture, video in zip(wanted, videos, strict=True)}
         if task.preview
         else {},

@@ -41,7 +41,7 @@ class ClothSampling:
 SAMPLING = {
     Quality.preview: Sampling(samples=4),
     Quality.draft: Sampling(samples=8),
-    Quality.standard: Sampling(samples=32),
+    Quality.standard: Sampling(samples=28),
     Quality.high: Sampling(samples=128),
 }
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.

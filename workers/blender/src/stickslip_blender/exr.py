@@ -16,8 +16,8 @@ _MULTI_PART_OR_DEEP_OR_TILED = 0x1A00
 _HALF = 1
 
 
-def read_exr(data: bytes) -> npt.NDArray[np.float16]:
-    """Return the linear light of an OpenEXR file's R, G and B, shape (height, width, 3), row 0 on top."""
+def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
+    """Return the wanted channels of an OpenEXR file, linear light, shape (height, width, channels), row 0 on top."""
     magic, version = struct.unpack_from("<ii", data)
     if magic != _MAGIC or version & _MULTI_PART_OR_DEEP_OR_TILED:
         raise ValueError("the frame must be an OpenEXR file of scan lines in one part")
@@ -31,7 +31,7 @@ def read_exr(data: bytes) -> npt.NDArray[np.float16]:
     first = int(struct.unpack_from("<Q", data, at)[0])  # lines follow one another in increasing order
     lines = np.frombuffer(data, dtype=line, count=height, offset=first)
     names = [name for name, _ in channels]
-    return np.stack([lines["values"][:, names.index(name)] for name in "RGB"], axis=-1).astype(np.float16, copy=False)
+    return np.stack([lines["values"][:, names.index(name)] for name in wanted], axis=-1).astype(np.float16, copy=False)
 
 
 def _attributes(data: bytes) -> tuple[dict[str, bytes], int]:

@@ -1,4 +1,4 @@
-"""Get a rendered frame out of Blender as bytes.
+"""Get a rendered frame out of Blender as linear light.
 
 Headless Blender does not give its pixels away in memory, so a frame goes through an uncompressed file: on Linux one
 that has no name and lies in memory, so that a killed process leaves nothing behind.
@@ -6,7 +6,6 @@ that has no name and lies in memory, so that a killed process leaves nothing beh
 
 from __future__ import annotations
 
-import io
 import os
 import sys
 import tempfile
@@ -19,7 +18,6 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.exr import read_exr
@@ -65,6 +63,9 @@ class FrameReader:
         self._scene = scene
         image, render = scene.render.image_settings, scene.render
         image.color_management = "FOLLOW_SCENE"
+        image.file_format = "OPEN_EXR"
+        image.color_depth = "16"
+        image.exr_codec = "NONE"
         render.use_stamp = False
         render.use_file_extension = False
         render.filepath = str(self._path)
@@ -85,26 +86,20 @@ class FrameReader:
             os.close(self._memory)
         self._memory = self._folder = None
 
-    def read(self, window: Window | None = None) -> npt.NDArray[np.uint8]:
-        """Render the scene as it stands, or a window of it: 8-bit sRGB, shape (height, width, 3).
-
-        A window has the very bytes that it would have in the whole frame.
-        """
-        with Image.open(io.BytesIO(self._rendered("BMP", window))) as image:
-            return np.asarray(image.convert("RGB"))
-
     def read_light(self, window: Window | None = None) -> npt.NDArray[np.float16]:
-        """Render as `read` does: linear light, not clipped, shape (height, width, 3)."""
-        return read_exr(self._rendered("OPEN_EXR", window))
+        """Render the scene as it stands, or a window of it: linear light, not clipped, shape (height, width, 3).
 
-    def _rendered(self, file_format: Literal["BMP", "OPEN_EXR"], window: Window | None) -> bytes:
-        settings = self._scene.render.image_settings
-        if settings.file_format != file_format:
-            settings.file_format = file_format
-            settings.color_mode = "RGB"
-            if file_format == "OPEN_EXR":
-                settings.color_depth = "16"
-                settings.exr_codec = "NONE"
+        A window has the very values that it would have in the whole frame.
+        """
+        return read_exr(self._rendered("RGB", window), "RGB")
+
+    def read_matte(self, window: Window | None = None) -> npt.NDArray[np.float16]:
+        """Render as `read_light` does, before nothing: light times coverage, and coverage, shape (height, width, 4)."""
+        return read_exr(self._rendered("RGBA", window), "RGBA")
+
+    def _rendered(self, channels: Literal["RGB", "RGBA"], window: Window | None) -> bytes:
+        self._scene.render.film_transparent = channels == "RGBA"
+        self._scene.render.image_settings.color_mode = channels
         _set_window(self._scene.render, window)
         self._path.write_bytes(b"")  # so that a frame is never an old one
         with _quiet():

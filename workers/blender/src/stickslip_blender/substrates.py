@@ -112,7 +112,7 @@ def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
         over = (thread[:, None] + thread[None, :]) % 2
         marks = np.where(over == 1, 0.5, -0.5) + 0.5 * _spots(random, 4.0)
     else:
-        marks = 0.6 * _spots(random, 5.0) + 0.4 * _spots(random, 16.0)
+        marks = 0.5 * _spots(random, 10.0) + 0.5 * _spots(random, 30.0)  # finer ones would be noise far away
     factor: npt.NDArray[np.float64] = np.clip(1.0 + substrate.grain * marks, 0.2, 1.8)
     return factor
 

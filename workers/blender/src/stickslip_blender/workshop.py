@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.codecs import encode_clip
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import Store, write_durably
 from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
@@ -123,9 +124,15 @@ class Workshop:
         )
         return TaskResult(outcome="succeeded", output=output)
 
-    def chunk(self, pictures: Array) -> ChunkRef:
-        """Publish the pictures (n, height, width, 3) of one sample as a chunk."""
-        chunk = encode_chunk(np.ascontiguousarray(pictures[None]))
+    def chunk(self, values: Array) -> ChunkRef:
+        """Publish the values of one sample as a chunk."""
+        return self._published(encode_chunk(np.ascontiguousarray(values)))
+
+    def clip(self, clip: Array) -> ChunkRef:
+        """Publish a clip (frames, height, width, 3) as a chunk."""
+        return self._published(encode_clip(clip))
+
+    def _published(self, chunk: bytes) -> ChunkRef:
         return ChunkRef(digest=self.store.publish(chunk), offset=0, length=len(chunk))
 
 

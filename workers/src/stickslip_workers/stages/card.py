@@ -8,6 +8,8 @@ from stickslip_schemas.axes import AnyAxis, ListAxis
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest
 
+from stickslip_workers.stages.preview import PREVIEW_NAME
+
 CARD_NAME = "README.md"
 
 SHOWN_VALUES = 12
@@ -22,6 +24,11 @@ def card(manifest: Manifest) -> bytes:
         f"# {spec.name or manifest.dataset}",
         f"{(type(spec).__doc__ or spec.kind).strip().splitlines()[0]}",
         f"Dataset `{name}`, made by stickslip: {manifest.sample_count} samples, {manifest.valid_count} of them valid.",
+        *(
+            [f"![Some of the samples]({PREVIEW_NAME})"]
+            if PREVIEW_NAME in {file.path for file in manifest.files}
+            else []
+        ),
         "## Parameters",
         f"The samples are the {_COMBINED[spec.combine]} of these axes.",
         _table(("axis", "values", "unit and meaning"), [_axis_row(spec, *item) for item in spec.named_axes.items()]),
@@ -36,6 +43,7 @@ def card(manifest: Manifest) -> bytes:
         "## How it was made",
         _table(("part", "build (SHA-256 of its code)"), list(manifest.builds.model_dump().items())),
         _certificate(manifest),
+        *_pictures(manifest),
         f"The spec, whose digest is `{manifest.spec_digest}`:",
         f"```json\n{json.dumps(document, indent=2)}\n```",
         "## How to read it",
@@ -89,6 +97,23 @@ def _certificate(manifest: Manifest) -> str:
         return "No certificate vouches for the physics of this build and preset."
     preset = manifest.spec.certified_preset
     return f"The certificate `{manifest.certificate}` vouches for this build and the preset `{preset}`."
+
+
+def _pictures(manifest: Manifest) -> list[str]:
+    """Return what is known of the quality of the pictures, if there are any."""
+    pictures = manifest.pictures
+    if pictures is None:
+        return []
+    text = (
+        f"The pictures have the quality `{pictures.quality}`: {pictures.psnr_db:g} dB over the pixels of what they "
+        "show, against pictures of 256 samples with another noise, as measured when the quality was set."
+    )
+    if pictures.gate_db is not None:
+        text += (
+            f" One trace serves all textures; the image gate found {pictures.gate_db:.1f} dB or more. "
+            f"Samples that it had rendered directly instead: {len(pictures.direct_slots)}."
+        )
+    return [text]
 
 
 def _telling_array(spec: Any) -> str:

@@ -4,7 +4,8 @@ import warnings
 
 import numpy as np
 from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
-from stickslip_schemas.chunks import BLOSC_LEVEL, ZSTD_LEVEL
+from stickslip_schemas.chunks import BLOSC_LEVEL
+from stickslip_schemas.codecs import axes_order, zstd_level
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.layout import layout
 
@@ -40,10 +41,9 @@ def create_array(group: object, array: ArrayLayout, *, sample_count: int, sample
     from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
     group_shape = (samples_per_shard, *array.shape)
-    filters: tuple[object, ...] = ()
-    compressor: object = ZstdCodec(level=ZSTD_LEVEL, checksum=False)
+    order = axes_order(array)
+    compressor: object = ZstdCodec(level=zstd_level(array), checksum=False)
     if array.is_trajectory:
-        filters = (TransposeCodec(order=(0, *range(len(array.shape), 0, -1))),)
         width = np.dtype(array.dtype).itemsize
         compressor = BloscCodec(typesize=width, cname="zstd", clevel=BLOSC_LEVEL, shuffle="shuffle", blocksize=0)
     return group.create_array(  # type: ignore[attr-defined]  # zarr.Group; zarr is imported late
@@ -52,7 +52,7 @@ def create_array(group: object, array: ArrayLayout, *, sample_count: int, sample
         dtype=array.dtype,
         chunks=(1, *array.shape) if array.per_sample else group_shape,
         shards=group_shape if array.per_sample else None,  # the index: crc32c, at the end, as zarr has it
-        filters=filters,
+        filters=() if order is None else (TransposeCodec(order=order),),
         serializer=BytesCodec(endian="little"),
         compressors=(compressor, Crc32cCodec()),
         fill_value=array.fill,

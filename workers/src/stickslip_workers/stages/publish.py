@@ -1,9 +1,11 @@
 """Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from stickslip_schemas.chunks import decode_chunk
+import numpy.typing as npt
+from stickslip_schemas.chunks import decode_chunk, decode_shard_index, shard_index_size
 from stickslip_schemas.keys import canonical_json
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import (
@@ -11,6 +13,7 @@ from stickslip_schemas.manifest import (
     MANIFEST_NAME,
     SEAL_NAME,
     Manifest,
+    Pictures,
     seal_text,
     with_manifest_digest,
 )
@@ -20,6 +23,7 @@ from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskR
 
 from stickslip_workers.stages.card import CARD_NAME, card
 from stickslip_workers.stages.metadata import metadata_files
+from stickslip_workers.stages.preview import PREVIEW_NAME, pictured, preview
 
 
 def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:
@@ -45,11 +49,15 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         cameras=task.spec.cameras(),
         sample_count=len(task.sample_keys),
         valid_count=len(task.sample_keys) - len(task.rejections),
+        pictures=_pictures(task, store),
         split_counts=_split_counts(task, store),
         rejections=task.rejections,
         sample_keys=task.sample_keys,
         files=tuple(files),
     )
+    if (picture := _preview(task, store)) is not None:
+        files.append(FileEntry(path=PREVIEW_NAME, sha256=store.publish(picture), size=len(picture)))
+        manifest = manifest.model_copy(update={"files": tuple(files)})
     text = card(manifest)
     files.append(FileEntry(path=CARD_NAME, sha256=store.publish(text), size=len(text)))
     manifest = manifest.model_copy(update={"files": tuple(sorted(files, key=lambda file: file.path))})
@@ -86,18 +94,57 @@ def _check_complete(task: PublishTask, store: Store) -> None:
 
 def _split_counts(task: PublishTask, store: Store) -> dict[str, int]:
     """Count the valid samples of each split from what the shards say, and check it against the rejections."""
-    digests = {file.path: file.sha256 for file in task.files}
-    arrays = {array.name: array for array in layout(task.spec)}
-    count = len(task.sample_keys)
-
-    def column(name: str) -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
-        shards = range(-(-count // task.spec.samples_per_shard))
-        chunks = [bytes(decode_chunk(store.read(digests[arrays[name].shard_path(shard)]))) for shard in shards]
-        return np.frombuffer(b"".join(chunks), dtype=np.uint8)[:count]
-
-    valid = column("valid").astype(bool)
+    valid = _column("valid", task, store)
     rejected = sorted(rejection.slot for rejection in task.rejections)
     if np.flatnonzero(~valid).tolist() != rejected:
         raise ValueError(f"rejections must be the slots that are not valid; got {rejected[:5]} and so on")
-    counts = np.bincount(column("split")[valid], minlength=len(SPLITS))
+    counts = np.bincount(_column("split", task, store)[valid], minlength=len(SPLITS))
     return {name: int(number) for name, number in zip(SPLITS, counts, strict=True)}
+
+
+def _pictures(task: PublishTask, store: Store) -> Pictures | None:
+    """Return how good the pictures are: what their quality is worth, and what the image gate said of each sample."""
+    measured = task.spec.picture_decibels()
+    if measured is None:
+        return None
+    gate, direct = None, np.empty(0, dtype=int)
+    if any(array.name == "gate_db" for array in layout(task.spec)):
+        valid = _column("valid", task, store)
+        found = _column("gate_db", task, store)[valid]
+        gate = round(float(found.min()), 2) if found.size else None
+        direct = np.flatnonzero(valid & ~_column("composed", task, store))
+    return Pictures(
+        quality=task.spec.quality,
+        psnr_db=measured,
+        gate_db=gate,
+        direct_slots=tuple(direct.tolist()),
+    )
+
+
+def _preview(task: PublishTask, store: Store) -> bytes | None:
+    """Return the picture of the version; None where nothing is rendered, or valid."""
+    array = pictured(task.spec)
+    if array is None:
+        return None
+    files = {file.path: file for file in task.files}
+    size = task.spec.samples_per_shard
+
+    def chunk(slot: int) -> bytes:
+        file = files[array.shard_path(slot // size)]
+        tail = shard_index_size(size)
+        index = decode_shard_index(store.read(file.sha256, offset=file.size - tail, length=tail), size)
+        offset, length = index[slot % size].tolist()
+        return store.read(file.sha256, offset=offset, length=length)
+
+    valid = np.flatnonzero(_column("valid", task, store)).tolist()
+    return preview(task.spec, array, valid, chunk)
+
+
+def _column(name: str, task: PublishTask, store: Store) -> npt.NDArray[Any]:
+    """Return the values of a label, by slot, from the shards."""
+    (array,) = (array for array in layout(task.spec) if array.name == name)
+    digests = {file.path: file.sha256 for file in task.files}
+    count = len(task.sample_keys)
+    shards = range(-(-count // task.spec.samples_per_shard))
+    chunks = [bytes(decode_chunk(store.read(digests[array.shard_path(shard)]))) for shard in shards]
+    return np.frombuffer(b"".join(chunks), dtype=array.dtype)[:count]

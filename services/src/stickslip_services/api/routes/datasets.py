@@ -11,7 +11,7 @@ from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.tasks import FileEntry
 
-from stickslip_services.api.files import OPENAPI_HEADERS, serve
+from stickslip_services.api.files import OPENAPI_HEADERS, picture_format, serve
 from stickslip_services.api.routes.common import PageDep, coordinator_of, problem_responses
 from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets
 from stickslip_services.errors import NotFoundError
@@ -27,7 +27,9 @@ Version = Annotated[int, Path(ge=1, lt=2**31)]
 
 _INERT = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
 
-_BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+_BINARY_SCHEMA = {"schema": {"type": "string", "format": "binary"}}
+_BINARY = {"application/octet-stream": _BINARY_SCHEMA}
+_PICTURE = {"image/png": _BINARY_SCHEMA, "image/webp": _BINARY_SCHEMA}
 
 
 def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
@@ -96,7 +98,7 @@ def get_file(dataset: str, version: Version, path: str, request: Request, coordi
 @router.get(
     "/v1/previews/{digest}",
     response_class=Response,
-    responses=_file_responses({"image/png": {"schema": {"type": "string", "format": "binary"}}}),
+    responses=_file_responses(_PICTURE),
     tags=["jobs"],
 )
 def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
@@ -104,7 +106,8 @@ def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> R
     with coordinator.database.read() as connection:
         if not (is_sha256(digest) and is_preview(connection, digest)):
             raise NotFoundError(f"there is no preview {digest[:100]!r}")
-    return serve(request, coordinator.store.path(digest), digest, name="preview.png")
+    path = coordinator.store.path(digest)
+    return serve(request, path, digest, name=f"preview.{picture_format(path)}")
 
 
 def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> FileEntry:

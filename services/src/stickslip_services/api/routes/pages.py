@@ -227,10 +227,16 @@ def get_version(request: Request, dataset: str, version: Version, coordinator: C
         sliders=_sliders(data.manifest.spec),
         histograms=_histograms(data),
         splits=SPLITS,
-        card=next((file.path for file in data.manifest.files if file.path == "README.md"), None),
+        card=_listed(data.manifest, "README.md"),
+        picture=_listed(data.manifest, "preview.webp"),
         url=coordinator.settings.url,
         **context,
     )
+
+
+def _listed(manifest: Manifest, path: str) -> str | None:
+    """Return the path of a file of a version, None where it has none of that name."""
+    return next((file.path for file in manifest.files if file.path == path), None)
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")

@@ -20,8 +20,10 @@ from stickslip_blender.blender import import_bpy
 from stickslip_blender.color import Color, silicone_color, to_linear
 from stickslip_blender.engine import SAMPLING, Sampling, new_scene, set_sampling
 from stickslip_blender.environment import SoftBox, panorama, set_environment
+from stickslip_blender.multiplexed import encode
 from stickslip_blender.pixels import FrameReader, Window
 from stickslip_blender.preview import side_by_side
+from stickslip_blender.raster import projected, see
 from stickslip_blender.tube import tube_faces, tube_vertices
 from stickslip_blender.view import new_view, set_view
 from stickslip_blender.workshop import Workshop, why_unfit
@@ -82,6 +84,7 @@ class RodRenderer:
         set_environment(self._scene, panorama(SOFT_BOXES, AMBIENT), GROUND)
         self._points = points
         self._mesh = _add_rod(self._scene, points)
+        self._triangles = _triangles(tube_faces(points))
         self._shader = _add_silicone(self._mesh)
         new_view(self._scene)
         self._reader = FrameReader(self._scene, scratch)
@@ -129,8 +132,32 @@ class RodRenderer:
         frame = np.full((camera.height, camera.width, 3), GROUND_LEVEL, dtype=np.uint8)
         window = _window_about(vertices, camera)
         if not window.is_empty:
-            frame[window.slices] = self._reader.read(window)
+            seen = see(projected(camera, vertices), self._triangles, window)
+            light = self._reader.read_matte(window).astype(np.float32)
+            frame[window.slices] = encode(self._before_ground(light, seen.share_below(len(self._triangles))))
         return frame
+
+    def _before_ground(
+        self, light: npt.NDArray[np.float32], coverage: npt.NDArray[np.float32]
+    ) -> npt.NDArray[np.float32]:
+        """Put the light of the rod, (h, w, 4) with the share of samples that hit it, before the ground.
+
+        What is noisy on a thin rod is how many samples hit it. So the mean light of those that did, helped by one
+        sample's worth of the pixels around, is given the coverage (h, w) that our rasteriser finds.
+        """
+        padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))
+        rows, columns = coverage.shape
+        around = np.sum([padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3)], axis=0)
+        hit = around[..., 3:] > 0.0
+        help_ = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
+        mean = (light + help_)[..., :3] / np.where(hit, (light + help_)[..., 3:], 1.0)
+        share = np.where(hit, coverage[..., None], 0.0)
+        return np.asarray(share * mean + (1.0 - share) * np.float32(GROUND), dtype=np.float32)
+
+
+def _triangles(faces: Sequence[Sequence[int]]) -> npt.NDArray[np.int32]:
+    fans = [(face[0], face[k], face[k + 1]) for face in faces for k in range(1, len(face) - 1)]
+    return np.array(fans, dtype=np.int32)
 
 
 def _window_about(vertices: npt.NDArray[np.float32], camera: Camera) -> Window:

@@ -1,0 +1,59 @@
+"""How the values of one sample are coded, by what they are: clips, trajectories, and all else.
+
+A clip is `transpose -> zstd(CLIP_LEVEL) -> crc32c`: the same row of all frames is together, for most of it is as it was
+in the frame before. The other two are in `stickslip_schemas.chunks`.
+"""
+
+import google_crc32c
+import numpy as np
+from numcodecs.zstd import Zstd
+
+from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.chunks import ZSTD_LEVEL, decode_chunk, decode_trajectory, encode_chunk, encode_trajectory
+
+CLIP_LEVEL = 9
+"""Of zstd, for clips: written once, read many times, and reading is as fast as at level 3."""
+
+_ROWS_FIRST = (1, 0, 2, 3)
+
+
+def encode_clip(clip: np.ndarray) -> bytes:
+    """Return the encoded chunk of a clip (frames, height, width, 3) of uint8."""
+    frame = bytes(Zstd(level=CLIP_LEVEL).encode(np.ascontiguousarray(clip.transpose(_ROWS_FIRST))))
+    return frame + int(google_crc32c.value(frame)).to_bytes(4, "little")
+
+
+def decode_clip(chunk: bytes, out: np.ndarray) -> None:
+    """Decode a chunk that `encode_clip` has made into all of `out`; raise CorruptChunkError."""
+    turned = np.empty([out.shape[axis] for axis in _ROWS_FIRST], dtype=out.dtype)
+    decode_chunk(chunk, turned)
+    out[...] = turned.transpose(_ROWS_FIRST)
+
+
+def encode_sample(array: ArrayLayout, values: np.ndarray) -> bytes:
+    """Return the encoded chunk of one sample's values of an array."""
+    if array.is_clip:
+        return encode_clip(values)
+    return encode_trajectory(values) if array.is_trajectory else encode_chunk(values)
+
+
+def decode_sample(array: ArrayLayout, chunk: bytes, out: np.ndarray) -> None:
+    """Decode the chunk of one sample of an array into all of `out`; raise CorruptChunkError."""
+    if array.is_clip:
+        decode_clip(chunk, out)
+    elif array.is_trajectory:
+        decode_trajectory(chunk, out)
+    else:
+        decode_chunk(chunk, out)
+
+
+def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
+    """Return how the axes (sample, ...) of an array are turned before its chunks are coded; None: not at all."""
+    if array.is_clip:
+        return (0, *(1 + axis for axis in _ROWS_FIRST))
+    return (0, *range(len(array.shape), 0, -1)) if array.is_trajectory else None
+
+
+def zstd_level(array: ArrayLayout) -> int:
+    """Return the level of zstd that an array's chunks are written with, where they are no trajectory."""
+    return CLIP_LEVEL if array.is_clip else ZSTD_LEVEL
