@@ -63,8 +63,8 @@ class ClothTraining:
     averaging: float = 0.99
     """Decay of the running average over steps that is the model's weights."""
     smoothing: tuple[float, float] = (0.2, 0.02)
-    """Standard deviation of mu about the truth in what the network is told, at the first and at the last step [1]: first
-    the network learns an order, and in the end a bin."""
+    """Standard deviation of mu about the truth in what the network is told, at the first and at the last step [1]: it
+    learns an order first, and at the end bins."""
     gap: float = 0.3
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
