@@ -6,6 +6,7 @@ import torch
 from stickslip_training.cloth.posterior import MU_BINS
 from stickslip_training.cloth.runs import split_runs
 from stickslip_training.cloth.training import (
+    WEIGHTS,
     ClothTraining,
     calibrated,
     load_friction,
@@ -53,6 +54,19 @@ def test_saved_and_loaded(few, tmp_path):
     assert np.array_equal(again.strangeness(clips), model.strangeness(clips))
     assert again.card["training_runs"] == 9
     assert (again.materials, again.instants) == (model.materials, model.instants)
+
+
+def test_the_weights_of_the_package_load_and_say_what_they_are():
+    model = load_friction()
+    assert len(model.materials) == 10
+    assert WEIGHTS.stat().st_size < 5e6
+    assert set(model.card) >= {"settings", "runs", "made_from", "certificate", "tested", "limits"}
+
+
+def test_what_is_no_model_is_refused(tmp_path):
+    (tmp_path / "none.safetensors").write_bytes(b"no")
+    with pytest.raises(ValueError, match="must be a model of `stickslip-train cloth train`, and is none"):
+        load_friction(tmp_path / "none.safetensors")
 
 
 def test_every_render_has_a_look_of_its_own_and_the_seed_repeats_it(few):

@@ -172,7 +172,7 @@ def predict(
                 names = reader.categories("material")
                 fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
-            true = [f"{fabric}, {mu:.2f}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
+            true = [f"{mu:.2f}, {fabric}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
         posterior, strangeness = friction.look(clips)
         answers = predictions(posterior, slots)
         for answer, far in zip(answers, strangeness.tolist(), strict=True):
