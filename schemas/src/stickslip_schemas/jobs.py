@@ -154,7 +154,7 @@ class JobSpec(Document):
 
     def picture_decibels(self) -> float | None:
         """Return the PSNR of the pictures of this quality, as measured [dB]; None where there are none."""
-        return None
+        raise NotImplementedError
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         """Return a text that is the same for samples whose `stage` costs about the same; of simulate or render."""
