@@ -3,7 +3,6 @@
 Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL only as slow tests.
 """
 
-import os
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,8 +18,6 @@ from stickslip_services.testing import ManualClock, PretendWorker, RunningServer
 
 if TYPE_CHECKING:
     from stickslip_services.testing_postgresql import PostgresqlServer
-
-os.environ.pop(DATABASE_VARIABLE, None)  # no test is to write into a database that is in use
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from sqlalchemy.exc import OperationalError
 from stickslip_schemas.states import JobState
 from stickslip_schemas.store import Store
 from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.cli import app
 from stickslip_services.coordinator import main, reindex
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, connect, opened
@@ -40,6 +42,7 @@ from stickslip_services.testing import (
     start_server,
     wait_until,
 )
+from typer.testing import CliRunner
 
 if TYPE_CHECKING:
     from stickslip_services.testing_postgresql import PostgresqlServer
@@ -78,12 +81,14 @@ class Pair:
 
 @pytest.fixture
 def pair(settings: Settings) -> Iterator[Pair]:
-    options = ("--store", str(settings.store_root))
-    servers = [start_server(settings.data.parent / name, options=options) for name in ("a", "b")]
-    with httpx.Client(trust_env=False, timeout=60) as client:
-        yield Pair(settings, (servers[0], servers[1]), client)
-    for server in servers:
-        server.stop()
+    def start(name: str) -> RunningServer:
+        server = start_server(settings.data.parent / name, options=("--store", str(settings.store_root)))
+        stack.callback(server.stop)
+        return server
+
+    with ExitStack() as stack:
+        client = stack.enter_context(httpx.Client(trust_env=False, timeout=60))
+        yield Pair(settings, (start("a"), start("b")), client)
 
 
 def test_two_coordinators_share_the_work(pair: Pair) -> None:
@@ -327,7 +332,7 @@ def test_a_lost_database_is_built_again(settings: Settings, postgresql: "Postgre
     known = list_datasets(coordinator)
     coordinator.close()
     lost = Settings.chosen(data=settings.data, durable=False, database=postgresql.empty())
-    with pytest.raises(DatabaseRefusedError, match="is gone: run `stickslip reindex --data"):
+    with pytest.raises(DatabaseRefusedError, match=r"is gone: run `stickslip reindex .*` with the same --database"):
         check(lost, Role.coordinator, with_store=True)
     assert reindex(lost) == 0
     again = Coordinator(lost)
@@ -369,6 +374,7 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
         ("sqlite:///file?password=secret", "'sqlite:///file'"),
         ("me:secret@host", "something else, which is not shown because it may hold a password"),
         ("coordinator.sqlite3", "'coordinator.sqlite3'"),
+        ("", "''"),
     ],
 )
 def test_other_databases_are_refused_without_their_password(
@@ -380,6 +386,9 @@ def test_other_databases_are_refused_without_their_password(
     assert str(raised.value) == rule + shown
     assert main(["--data", str(tmp_path), "--database", value]) == 2
     assert capsys.readouterr().err == f"error: {rule}{shown}\n"
+    result = CliRunner().invoke(app, ["up", "--data", str(tmp_path), "--database", value])
+    assert result.exit_code != 0
+    assert rule + shown in result.stderr
 
 
 def test_a_password_is_not_shown(tmp_path: Path) -> None:

@@ -62,14 +62,17 @@ class PostgresqlServer:
         return self.url(name)
 
     def clean(self) -> str:
-        """Return the URL of a migrated database without rows, always the same one; who still uses it is thrown out."""
+        """Return the URL of a migrated database as if it were new, always the same one.
+
+        It has no rows and counts from 1 again. Who still uses it is thrown out.
+        """
         deletions = [f"DELETE FROM {table.name}" for table in reversed(metadata.sorted_tables)]
         with psycopg.connect(self._migrated, autocommit=True) as connection:
             connection.execute(
                 "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity "
                 "WHERE datname = current_database() AND pid != pg_backend_pid()"
             )
-            connection.execute("; ".join(deletions))
+            connection.execute("; ".join([*deletions, "SELECT setval(seqrelid, 1, false) FROM pg_sequence"]))
         return self._migrated
 
     def execute(self, statement: str, database: str = "postgres") -> None:

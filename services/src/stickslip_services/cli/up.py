@@ -44,15 +44,16 @@ def up(
     from stickslip_services.settings import Settings
 
     screen = console()
-    chosen = {
-        "database": database,
+    doors = {
         "allowed_hosts": tuple(allow_host or ()),
         "require_keys": require_keys,
         "behind_proxy": behind_proxy,
         "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
-    given = {name: value for name, value in chosen.items() if value}
+    given = {name: value for name, value in doors.items() if value}
+    if database is not None:
+        given["database"] = database
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(

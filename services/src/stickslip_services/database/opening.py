@@ -60,9 +60,11 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> None:
     name = settings.database_name
     datasets = settings.store_root.glob("datasets/*/v*/manifest.json") if with_store else iter(())
     if revision is None and next(datasets, None) is not None:
+        given = {"--store": settings.store_path, "--database": settings.database}
+        same = " and ".join(option for option, value in given.items() if value is not None)
         raise DatabaseRefusedError(
             f"{settings.store_root} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
-            f"{settings.data}` to find them again"
+            f"{settings.data}`{same and f' with the same {same}'} to find them again"
         )
     known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
     if revision is not None and revision not in known:
