@@ -363,6 +363,10 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
     missing = refusal(postgresql.url("nowhere").replace("stickslip@", "stickslip:secret@"))
     assert "postgresql://stickslip:***@/nowhere cannot be opened" in missing
     assert 'database "nowhere" does not exist' in missing
+    assert "cannot be opened: invalid" in refusal(postgresql.url("postgres") + "&colour=red")
+    postgresql.execute("CREATE ROLE guest LOGIN")
+    guest = postgresql.empty().replace("stickslip@", "guest@")
+    assert "its user may not make tables in the database postgresql://guest@/" in refusal(guest)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DBAPIError
 
 from stickslip_services.database import migrate
 from stickslip_services.database.database import Database, Role
@@ -114,13 +114,18 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
                     "make another one with `createdb --encoding UTF8 --template template0`"
                 )
             if not tables:
+                if not connection.scalar(text("SELECT has_schema_privilege(current_schema(), 'CREATE')")):
+                    raise DatabaseRefusedError(
+                        f"its user may not make tables in the database {name}: make the user its owner, "
+                        "for example with `createdb --owner`"
+                    )
                 return None
             if "alembic_version" not in tables or "task_counts" not in tables:
                 raise DatabaseRefusedError(
                     f"{name} is not a database of stickslip: give it one of its own, which is empty, with --database"
                 )
             return str(connection.scalar(text("SELECT version_num FROM alembic_version")))
-    except OperationalError as error:
+    except DBAPIError as error:
         raise DatabaseRefusedError(f"{name} cannot be opened: {str(error.orig).splitlines()[0]}") from error
     finally:
         database.close()
