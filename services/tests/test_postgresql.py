@@ -342,6 +342,24 @@ def test_a_lost_database_is_built_again(settings: Settings, postgresql: "Postgre
     again.close()
 
 
+def test_nothing_is_deleted_by_an_empty_database(
+    settings: Settings, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    artifact = Store(settings.store_root).publish(b"of a job that runs")
+    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.empty())
+    arguments = ["gc", "--data", str(settings.data), "--older-than", "0", "--delete"]
+    result = CliRunner().invoke(app, arguments)
+    assert (result.exit_code, "does not exist or is empty: name the --database" in result.stderr) == (1, True)
+    assert Store(settings.store_root).path(artifact).exists()
+
+
+def test_a_data_directory_with_another_database_is_refused(settings: Settings) -> None:
+    with opened(settings.model_copy(update={"database": None}), Role.upkeep):
+        pass
+    with pytest.raises(DatabaseRefusedError, match=r"coordinator\.sqlite3 holds another one: move that file away"):
+        check(settings, Role.coordinator)
+
+
 def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Path) -> None:
     def refusal(url: str) -> str:
         with pytest.raises(DatabaseRefusedError) as raised:

@@ -27,6 +27,8 @@ from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, list_datasets, list_jobs, parsed, rods, show_job
 from typer.testing import CliRunner
 
+pytestmark = pytest.mark.databases(slow=True)
+
 DAY = 24 * 3600.0
 
 
@@ -217,12 +219,13 @@ def test_what_does_not_exist_is_refused(
     assert (result.exit_code, message in result.stderr) == (1, True), result.stderr
 
 
-def test_a_running_service_and_a_missing_database_are_refused(
-    settings: Settings, made: list[str], tmp_path: Path
-) -> None:
+def test_a_running_service_is_refused(settings: Settings, made: list[str]) -> None:
     with locked(settings.data):
         result = run(settings, "gc")
     assert (result.exit_code, "is in use by another" in result.stderr) == (1, True)
+
+
+def test_a_missing_database_is_refused(tmp_path: Path) -> None:
     empty = CliRunner().invoke(app, ["gc", "--data", str(tmp_path / "nothing")])
     assert (empty.exit_code, "does not exist" in empty.stderr) == (1, True)
 

@@ -51,9 +51,11 @@ def main(arguments: list[str] | None = None) -> int:
 def _data(data: Path, store_path: Path | None) -> Iterator[tuple[Database, Store]]:
     """Open what a coordinator left; raise DatabaseRefusedError where it runs, or where no database is."""
     settings = Settings.chosen(data=data, store_path=store_path)
-    if settings.database is None and not settings.database_path.exists():
-        raise DatabaseRefusedError(f"{settings.database_path} does not exist: name the data directory of a coordinator")
-    check(settings, Role.upkeep, with_store=True)
+    if not check(settings, Role.upkeep, with_store=True):
+        raise DatabaseRefusedError(
+            f"the database {settings.database_name} does not exist or is empty: name the "
+            f"{settings.database_option} of a coordinator"
+        )
     with locked(data), opened(settings, Role.upkeep) as database:
         yield database, Store(settings.store_root)
 

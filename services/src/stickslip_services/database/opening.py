@@ -48,8 +48,8 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
         database.close()
 
 
-def check(settings: Settings, role: Role, *, with_store: bool = False) -> None:
-    """Raise DatabaseRefusedError where a database cannot be used in a role.
+def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
+    """Return whether there is a database; raise DatabaseRefusedError where it cannot be used in a role.
 
     One that is not there can be made, unless there are datasets in the store, `with_store`: then it was lost.
     """
@@ -72,6 +72,7 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> None:
             f"{name} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
             f"install that version again, or name another {settings.database_option}"
         )
+    return revision is not None
 
 
 def _sqlite_revision(path: Path) -> str | None:
@@ -102,8 +103,12 @@ def _sqlite_revision(path: Path) -> str | None:
 
 def _postgresql_revision(settings: Settings, role: Role) -> str | None:
     """Return the last migration that a database has had; None where it is empty."""
-    database = connect(settings, role)
     name = settings.database_name
+    if settings.database_path.exists():
+        raise DatabaseRefusedError(
+            f"the queue is to be in {name}, and {settings.database_path} holds another one: move that file away"
+        )
+    database = connect(settings, role)
     try:
         with database.write() as connection:  # which is refused where others have the database for themselves
             tables = inspect(connection).get_table_names()
