@@ -241,6 +241,16 @@ def test_the_clock_is_that_of_the_database(settings: Settings) -> None:
     second.close()
 
 
+def test_a_connection_that_is_in_use_is_closed_when_it_is_returned(settings: Settings) -> None:
+    database = connect(settings)
+    with database.read() as connection:
+        raw = connection.connection.dbapi_connection
+        database.close()
+        assert connection.scalar(text("SELECT 1")) == 1
+    assert raw is not None
+    assert raw.closed
+
+
 def test_reads_see_one_state(settings: Settings) -> None:
     coordinator = Coordinator(settings)
     coordinator.start()

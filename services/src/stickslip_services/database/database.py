@@ -13,7 +13,8 @@ from enum import Enum, auto
 from itertools import islice
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Engine, Table
+from sqlalchemy import Connection, Engine, Table, event
+from sqlalchemy.pool import ConnectionPoolEntry
 
 T = TypeVar("T")
 
@@ -66,9 +67,14 @@ class Database(ABC):
         return
 
     def close(self) -> None:
-        """Close all connections."""
-        self._reader.dispose()
-        self._writer.dispose()
+        """Close all connections; one that a thread still uses, as soon as the thread has done with it."""
+        for engine in (self._reader, self._writer):
+            event.listen(engine, "checkin", _close_returned)
+            engine.dispose()
+
+
+def _close_returned(_connection: Any, record: ConnectionPoolEntry) -> None:
+    record.close()
 
 
 def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
