@@ -132,7 +132,6 @@ class Cloth:
             krylov_max=preset.krylov_max,
             krylov_tolerance=preset.krylov_tolerance,
             refactor_after=preset.refactor_after,
-            flips_max=preset.flips_max,
             patience=preset.patience,
             halvings_max=preset.halvings_max,
             step_error=preset.step_error or 1.0,
