@@ -1,8 +1,9 @@
 """What the coordinator costs: leasing and completing tasks, many watchers of one job, many clients at once.
 
-    python benchmarks/queue_costs.py [--watchers 500] [--seconds 10]
+    python benchmarks/queue_costs.py [--watchers 500] [--seconds 10] [--database postgresql://...]
 
-A coordinator runs as a process of its own with a database on a real disk, and its CPU time is read from /proc. Workers
+A coordinator runs as a process of its own with a database on a real disk, and its CPU time is read from /proc. That of
+a PostgreSQL server on this machine is told beside it: of all its processes, so nothing else is to use it. Workers
 pretend: their results are made up and lie in the store. Times of many clients depend on what else the machine does, so
 the load is printed with them.
 """
@@ -14,10 +15,12 @@ import os
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
+from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.testing import HttpApi, PretendWorker, RunningServer, rods, start_server
 
 
@@ -25,6 +28,17 @@ def cpu_seconds(server: RunningServer) -> float:
     """Return the CPU time that a server has taken so far [s]."""
     fields = Path(f"/proc/{server.process.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def database_seconds() -> float:
+    """Return the CPU time of the PostgreSQL servers of this machine, with all sessions that have ended [s]."""
+    ticks = 0
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it has just ended
+            name, _, rest = path.read_text().rpartition(")")
+            if name.endswith("(postgres"):
+                ticks += sum(map(int, rest.split()[11:15]))  # its own, and those of its children that have ended
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def submit(server: RunningServer, count: int, **spec: Any) -> str:
@@ -41,13 +55,16 @@ def report_lease_and_complete(server: RunningServer, worker: PretendWorker, batc
     worker.report((first, result))
     count -= 1
     done = 0
-    begin, cpu = time.perf_counter(), cpu_seconds(server)
+    begin, cpu, other = time.perf_counter(), cpu_seconds(server), database_seconds()
     while done < count:
         leases = worker.lease(simulate=batch)
         worker.report(*((lease, result) for lease in leases))
         done += len(leases)
-    wall, spent = time.perf_counter() - begin, cpu_seconds(server) - cpu
-    print(f"lease and complete, {batch} at a time: {1e3 * spent / done:.2f} CPU ms each, {done / wall:.0f} a second")
+    wall, spent, other = time.perf_counter() - begin, cpu_seconds(server) - cpu, database_seconds() - other
+    print(
+        f"lease and complete, {batch} at a time: {1e3 * spent / done:.2f} CPU ms each, {done / wall:.0f} a second"
+        + (f"; {1e3 * other / done:.2f} CPU ms of PostgreSQL" if DATABASE_VARIABLE in os.environ else "")
+    )
 
 
 async def report_watchers(server: RunningServer, worker: PretendWorker, count: int, seconds: float) -> None:
@@ -120,7 +137,10 @@ def main() -> None:
     parser.add_argument("--watchers", type=int, default=500)
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--database", help="URL of an empty PostgreSQL database")
     options = parser.parse_args()
+    if options.database is not None:
+        os.environ[DATABASE_VARIABLE] = options.database
     with tempfile.TemporaryDirectory() as directory:
         server = start_server(Path(directory) / "data")
         try:
@@ -131,8 +151,10 @@ def main() -> None:
                 print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
                 report_lease_and_complete(server, steady, 1, 601)
                 report_lease_and_complete(server, steady, 16, 6401)
-            asyncio.run(report_watchers(server, worker, options.watchers, options.seconds))
-            asyncio.run(report_clients(server, worker, options.clients, options.seconds))
+            if options.watchers:
+                asyncio.run(report_watchers(server, worker, options.watchers, options.seconds))
+            if options.clients:
+                asyncio.run(report_clients(server, worker, options.clients, options.seconds))
             print(f"load {os.getloadavg()[0]:.1f}")
         finally:
             server.stop()

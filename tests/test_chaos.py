@@ -23,7 +23,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.samples import samples
 from stickslip_schemas.store import Store
-from stickslip_services.database.database import Database
+from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.queue.audit import audit
 from stickslip_sim_core import solve_rods
 
@@ -103,7 +103,7 @@ def kill(pid: int) -> None:
 
 
 def check_ledger(data: Path) -> None:
-    database = Database(data / "coordinator.sqlite3")
+    database = SqliteDatabase(data / "coordinator.sqlite3")
     with database.read() as connection:
         assert audit(connection) == []
     database.close()

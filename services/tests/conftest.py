@@ -1,12 +1,70 @@
-"""A coordinator on a temporary directory: in the process with a clock of its own, or as a server."""
+"""A coordinator on a temporary directory: in the process with a clock of its own, or as a server.
 
-from collections.abc import Iterator
+Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL only as slow tests.
+"""
+
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.database.database import Database
+from stickslip_services.database.opening import connect
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, start_server
+
+if TYPE_CHECKING:
+    from stickslip_services.testing_postgresql import PostgresqlServer
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    marker = metafunc.definition.get_closest_marker("databases")
+    if marker is not None and "database" in metafunc.fixturenames:
+        marks = [pytest.mark.slow] if marker.kwargs.get("slow") else []
+        both = ["sqlite", pytest.param("postgresql", marks=marks)]
+        metafunc.parametrize("database", both, indirect=True)
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator["PostgresqlServer"]:
+    """A PostgreSQL server, started with the first test that needs it."""
+    if find_spec("psycopg") is None:
+        pytest.skip("psycopg is not installed: pip install 'stickslip-services[server,postgresql]'")
+    from stickslip_services.testing_postgresql import find_programs, postgresql_server
+
+    programs = find_programs()
+    if programs is None:
+        pytest.skip("PostgreSQL's server is not installed: apt-get install postgresql")
+    with postgresql_server(programs) as server:
+        yield server
+
+
+@pytest.fixture
+def database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Which database the coordinators of a test use, also those in other processes."""
+    chosen: str = getattr(request, "param", "sqlite")
+    if chosen == "postgresql":
+        server: PostgresqlServer = request.getfixturevalue("postgresql")
+        monkeypatch.setenv(DATABASE_VARIABLE, server.clean())
+    return chosen
+
+
+@pytest.fixture
+def empty_database(database: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Callable[[], Database]]:
+    """Makes databases without tables."""
+    made: list[Database] = []
+
+    def make() -> Database:
+        url = None if database == "sqlite" else request.getfixturevalue("postgresql").empty()
+        made.append(connect(Settings.chosen(data=tmp_path / str(len(made)), durable=False, database=url)))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
 
 
 @pytest.fixture(autouse=True)
@@ -22,7 +80,7 @@ def clock() -> ManualClock:
 
 
 @pytest.fixture
-def settings(tmp_path: Path) -> Settings:
+def settings(tmp_path: Path, database: str) -> Settings:
     return Settings(data=tmp_path / "data", durable=False)
 
 
@@ -41,7 +99,7 @@ def worker(coordinator: Coordinator) -> PretendWorker:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[RunningServer]:
+def server(tmp_path: Path, database: str) -> Iterator[RunningServer]:
     """A coordinator of its own for one test."""
     running = start_server(tmp_path / "data")
     yield running

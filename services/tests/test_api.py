@@ -11,6 +11,8 @@ from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import HttpApi, ManualClock, PretendWorker, failure, rejection, rods, serving
 
+pytestmark = pytest.mark.databases
+
 JSON = {"Content-Type": "application/json"}
 
 

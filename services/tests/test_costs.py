@@ -15,6 +15,8 @@ from stickslip_services.queue.costs import KEPT_RUNS, TIMES, limit_seconds
 from stickslip_services.queue.eta import MEASURED, Cost, StageTimings
 from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rejection, rods, show_job
 
+pytestmark = pytest.mark.databases(slow=True)
+
 FLOOR = 60.0
 
 

@@ -14,6 +14,8 @@ from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, failure, rods, serving
 
+pytestmark = pytest.mark.databases
+
 
 @pytest.fixture
 def app(settings: Settings, clock: ManualClock) -> FastAPI:
@@ -99,7 +101,7 @@ def test_a_quiet_stream_says_that_it_lives_and_holds_no_connection(
             text += piece
             if text.count(": still here\n\n") == 2:
                 break
-        pool = app.state.coordinator.database._engine.pool
+        pool = app.state.coordinator.database._reader.pool
         assert pool.checkedout() == 0
     assert text.startswith("retry: 1000\nid: 1\n")
     assert text.count("event: job.progress") == 1  # nothing has changed

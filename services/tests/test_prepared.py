@@ -1,10 +1,10 @@
 """Prepared statements do what SQLAlchemy does with the same statement."""
 
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 from sqlalchemy import bindparam, insert, select, update
-from sqlalchemy.exc import IntegrityError, OperationalError
+from sqlalchemy.exc import IntegrityError, OperationalError, ProgrammingError
 from stickslip_services.database.database import Database
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import metadata, previews
@@ -13,40 +13,43 @@ SOME = select(previews).where(previews.c.task.in_(bindparam("b_tasks", expanding
 OTHERS = select(previews.c.task).where(previews.c.task.not_in(bindparam("b_tasks", expanding=True)))
 
 
+pytestmark = pytest.mark.databases
+
+
 @pytest.fixture
-def database(tmp_path: Path) -> Database:
-    made = Database(tmp_path / "database.sqlite3", durable=False)
+def filled(empty_database: Callable[[], Database]) -> Database:
+    made = empty_database()
     with made.write() as connection:
         metadata.create_all(connection)
         Prepared(insert(previews)).run_all(connection, [{"task": task, "digest": f"d{task}"} for task in range(5)])
     return made
 
 
-def test_rows_have_the_names_of_their_columns(database: Database) -> None:
-    with database.read() as connection:
+def test_rows_have_the_names_of_their_columns(filled: Database) -> None:
+    with filled.read() as connection:
         rows = Prepared(SOME).rows(connection, {"b_tasks": [3, 1]})
         assert [(row.task, row.digest) for row in rows] == connection.execute(SOME, {"b_tasks": [3, 1]}).all()
         assert len(rows) == 2
 
 
-def test_a_list_may_be_empty(database: Database) -> None:
-    with database.read() as connection:
+def test_a_list_may_be_empty(filled: Database) -> None:
+    with filled.read() as connection:
         assert Prepared(SOME).tuples(connection, {"b_tasks": []}) == []
         assert len(Prepared(OTHERS).tuples(connection, {"b_tasks": []})) == 5
         assert Prepared(SOME).scalar(connection, {"b_tasks": []}) is None
 
 
-def test_values_in_the_statement_are_kept_and_missing_ones_are_an_error(database: Database) -> None:
+def test_values_in_the_statement_are_kept_and_missing_ones_are_an_error(filled: Database) -> None:
     statement = Prepared(update(previews).where(previews.c.task == bindparam("b_task")).values(digest="new"))
-    with database.write() as connection:
+    with filled.write() as connection:
         statement.run(connection, {"b_task": 2})
         assert Prepared("SELECT digest FROM previews WHERE task = :task").scalar(connection, {"task": 2}) == "new"
         with pytest.raises(KeyError, match="b_task"):
             statement.run(connection, {})
 
 
-def test_errors_are_those_of_sqlalchemy(database: Database) -> None:
-    with database.write() as connection, pytest.raises(IntegrityError):
+def test_errors_are_those_of_sqlalchemy(filled: Database) -> None:
+    with filled.write() as connection, pytest.raises(IntegrityError):
         Prepared(insert(previews)).run(connection, {"task": 1, "digest": "twice"})
-    with database.read() as connection, pytest.raises(OperationalError):
+    with filled.read() as connection, pytest.raises((OperationalError, ProgrammingError)):
         Prepared("SELECT nothing FROM nowhere").tuples(connection)

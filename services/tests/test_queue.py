@@ -30,6 +30,8 @@ from stickslip_services.testing import (
     show_job,
 )
 
+pytestmark = pytest.mark.databases
+
 
 def submit(coordinator: Coordinator, **spec: Any) -> str:
     job = coordinator.submit(parsed(rods(**spec)), None)

@@ -4,7 +4,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -31,6 +31,9 @@ from stickslip_services.testing import (
     show_job,
 )
 
+if TYPE_CHECKING:
+    from stickslip_services.testing_postgresql import PostgresqlServer
+
 SPECS = (
     rods(gamma=(1.0,)),
     rods(gamma=(1.0, 2.0)),  # shares tasks with the first
@@ -51,6 +54,9 @@ def _judge(task: Any) -> Any:
 class QueueMachine(RuleBasedStateMachine):
     """The model: who holds what until when, what was reported, what is settled."""
 
+    server: ClassVar["PostgresqlServer | None"] = None
+    """Where the database is; None: SQLite."""
+
     jobs = Bundle("jobs")
     leases = Bundle("leases")
     reported = Bundle("reported")
@@ -59,7 +65,11 @@ class QueueMachine(RuleBasedStateMachine):
     def begin(self) -> None:
         self.directory = tempfile.TemporaryDirectory()
         self.clock = ManualClock()
-        self.settings = Settings(data=Path(self.directory.name), durable=False)
+        self.settings = Settings.chosen(
+            data=Path(self.directory.name),
+            durable=False,
+            database=None if self.server is None else self.server.clean(),
+        )
         self.coordinator = Coordinator(self.settings, self.clock)
         self.coordinator.start()
         self.workers: dict[str, PretendWorker] = {}
@@ -255,7 +265,7 @@ def _no_fsync() -> Iterator[None]:
         yield
 
 
-def test_the_queue_in_any_order() -> None:
+def run_machine(machine: type[QueueMachine]) -> None:
     from hypothesis.stateful import run_state_machine_as_test
 
     profile = settings(
@@ -265,4 +275,16 @@ def test_the_queue_in_any_order() -> None:
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )
     with _no_fsync():
-        run_state_machine_as_test(QueueMachine, settings=profile)
+        run_state_machine_as_test(machine, settings=profile)
+
+
+def test_the_queue_in_any_order() -> None:
+    run_machine(QueueMachine)
+
+
+@pytest.mark.slow
+def test_the_queue_in_any_order_on_postgresql(postgresql: "PostgresqlServer") -> None:
+    class Machine(QueueMachine):
+        server = postgresql
+
+    run_machine(Machine)

@@ -11,9 +11,11 @@ from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.states import JobState
 from stickslip_schemas.store import Store
 from stickslip_services.cli import app
-from stickslip_services.database.database import Database
-from stickslip_services.database.opening import check, locked, opened
+from stickslip_services.database.database import Role
+from stickslip_services.database.opening import check, opened
+from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.local.locking import locked
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex
@@ -159,13 +161,13 @@ def test_it_does_not_write_beside_a_running_coordinator(settings: Settings, made
         result = run(settings)
     assert result.exit_code == 2
     assert "is in use by another `stickslip up`" in result.stderr
-    with opened(settings.data) as database:
+    with opened(settings, Role.upkeep) as database:
         assert [found.is_new for found in reindex(database, Store(settings.store_root))] == [True, True]
 
 
 def one_sentence(settings: Settings) -> str:
     with pytest.raises(DatabaseRefusedError) as raised:
-        check(settings.database_path, settings.store_root)
+        check(settings, Role.coordinator, with_store=True)
     assert "\n" not in str(raised.value)
     command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(settings.data), "--port", "0"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -174,7 +176,7 @@ def one_sentence(settings: Settings) -> str:
 
 
 def test_a_newer_database_is_refused(settings: Settings) -> None:
-    with opened(settings.data) as database, database.write() as connection:
+    with opened(settings, Role.upkeep) as database, database.write() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9042'"))
     sentence = one_sentence(settings)
     assert "was made by a newer stickslip (schema 9042" in sentence
@@ -184,11 +186,11 @@ def test_a_newer_database_is_refused(settings: Settings) -> None:
 @pytest.mark.parametrize("how", ["overwritten", "truncated", "not one", "another's"])
 def test_a_damaged_database_is_refused(settings: Settings, how: str) -> None:
     path = settings.database_path
-    with opened(settings.data):
+    with opened(settings, Role.upkeep):
         pass
     if how == "another's":
         path.unlink()
-        other = Database(path)
+        other = SqliteDatabase(path)
         with other.write() as connection:
             connection.execute(text("CREATE TABLE birds (name)"))
         other.close()

@@ -5,13 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select, update
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RecordRef, RenderOutput, SimulateOutput, TaskResult
+from stickslip_schemas.tasks import PackOutput, RecordRef, RenderOutput, SimulateOutput, TaskResult
 from stickslip_services.client.pulling import verify
+from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
 from stickslip_services.testing import ManualClock, PretendWorker, parsed, rods, show_job
+
+pytestmark = pytest.mark.databases(slow=True)
 
 
 def submit(coordinator: Coordinator, **spec: Any) -> str:
@@ -69,13 +73,8 @@ def test_only_what_is_damaged_is_made_again(
 ) -> None:
     finish(coordinator, worker, clock, submit(coordinator))
     with coordinator.database.read() as connection:
-        (path,) = [
-            row[0]
-            for row in connection.exec_driver_sql(
-                "SELECT json_extract(output, '$.files[0].sha256') FROM tasks WHERE stage = 'pack' ORDER BY seq LIMIT 1"
-            )
-        ]
-    worker.store.path(path).write_bytes(b"x")
+        output = connection.scalar(select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1))
+    worker.store.path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(b"x")
     worker.ran.clear()
     job = submit(coordinator)
     assert "1 of its files were damaged or lost" in show_job(coordinator, job).message
@@ -143,7 +142,7 @@ def test_big_datasets_are_checked_by_the_coordinator_itself(
 ) -> None:
     finish(coordinator, worker, clock, submit(coordinator))
     with coordinator.database.write() as connection:
-        connection.exec_driver_sql("UPDATE dataset_versions SET bytes = ?", (CHECKED_AT_ONCE + 1,))
+        connection.execute(update(dataset_versions).values(bytes=CHECKED_AT_ONCE + 1))
     job = submit(coordinator)
     shown = show_job(coordinator, job)
     assert (shown.state, shown.message) == (JobState.queued, "all of it was made before: checking it")

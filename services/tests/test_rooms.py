@@ -68,7 +68,7 @@ ALLOWED = {
     "pages": set(),
     "api": {"queue", "catalog", "database", "pages"},
     "client": set(),
-    "local": {"database"},
+    "local": set(),
     "cli": {"client", "local", "database"},
 }
 """Which rooms the modules of a room may import, besides their own and the single modules beside the rooms."""

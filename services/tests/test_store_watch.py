@@ -27,6 +27,8 @@ from stickslip_services.testing import (
     wait_until,
 )
 
+pytestmark = pytest.mark.databases(slow=True)
+
 MIB = 2**20
 
 

@@ -6,10 +6,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx
 import pytest
+from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.testing import wait_until
+
+if TYPE_CHECKING:
+    from stickslip_services.testing_postgresql import PostgresqlServer
 
 STUB = """
 import os, signal, sys, time
@@ -128,3 +133,19 @@ def test_a_port_that_is_taken_is_an_error(up: Up, tmp_path: Path) -> None:
     output = other.process.communicate(timeout=30)[0]
     assert other.process.returncode == 1
     assert "cannot listen on" in output
+
+
+def test_only_the_coordinator_is_told_the_database(
+    postgresql: "PostgresqlServer", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.clean())
+    up = Up(tmp_path)
+    try:
+        wait_until(lambda: bool(up.dispatchers()) and up.answers(), seconds=60)
+        coordinator, dispatcher = (Path(f"/proc/{pid}") for pid in (up.coordinator(), *up.dispatchers()))
+        assert DATABASE_VARIABLE.encode() in (coordinator / "environ").read_bytes()
+        assert b"postgresql" not in (coordinator / "cmdline").read_bytes()
+        assert DATABASE_VARIABLE.encode() not in (dispatcher / "environ").read_bytes()
+        assert not (up.data / "coordinator.sqlite3").exists()
+    finally:
+        up.stop()

@@ -16,7 +16,9 @@ from stickslip_schemas.store import Store
 from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
-from stickslip_services.database.opening import locked, opened
+from stickslip_services.database.database import Role
+from stickslip_services.database.opening import opened
+from stickslip_services.local.locking import locked
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex
@@ -24,6 +26,8 @@ from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, list_datasets, list_jobs, parsed, rods, show_job
 from typer.testing import CliRunner
+
+pytestmark = pytest.mark.databases(slow=True)
 
 DAY = 24 * 3600.0
 
@@ -171,7 +175,7 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
     away.rename(directory)
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
-    with opened(settings.data, durable=False) as database:
+    with opened(settings, Role.upkeep) as database:
         found = reindex(database, Store(settings.store_root))
         assert sorted(version.is_new for version in found) == [False, True]
 
@@ -215,12 +219,13 @@ def test_what_does_not_exist_is_refused(
     assert (result.exit_code, message in result.stderr) == (1, True), result.stderr
 
 
-def test_a_running_service_and_a_missing_database_are_refused(
-    settings: Settings, made: list[str], tmp_path: Path
-) -> None:
+def test_a_running_service_is_refused(settings: Settings, made: list[str]) -> None:
     with locked(settings.data):
         result = run(settings, "gc")
     assert (result.exit_code, "is in use by another" in result.stderr) == (1, True)
+
+
+def test_a_missing_database_is_refused(tmp_path: Path) -> None:
     empty = CliRunner().invoke(app, ["gc", "--data", str(tmp_path / "nothing")])
     assert (empty.exit_code, "does not exist" in empty.stderr) == (1, True)
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stickslip_sim_core import Cloth, Fabric, fabric, isotropic, preset_named
+from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
@@ -111,6 +112,19 @@ def test_factor_solves(name: str) -> None:
     cloth = cloth_of(mesh)
     for stretch in (1.0, 1.05):
         assert cloth._solver.factor_error(stretch * flat(mesh), cloth.slopes, 0.01) < 1e-4
+
+
+@pytest.mark.parametrize("kernel", cloth_kernels())
+def test_parts_of_a_factor_are_made_anew_as_the_whole(kernel: str) -> None:
+    mesh = meshes.grid(0.6, 0.6, 20, 20)
+    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), held=[0, 20], kernel=kernel)
+    vertices = np.arange(len(mesh.rest))
+    shares = []
+    for sticking in (vertices[210:211], vertices[-30:], vertices[21:]):
+        error, share = cloth._solver.part_error(sticking.tolist(), 0.02)
+        assert error == 0.0
+        shares.append(share)
+    assert 0.0 < shares[0] < shares[1] < shares[2] == 1.0
 
 
 def rotation(seed: int) -> Floats:

@@ -156,8 +156,14 @@ def cluster() -> Iterator[Cluster]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join([HERE, *filter(None, [os.environ.get("PYTHONPATH")])]))
+        others = _running()
         with ray_cluster(name="tests", address=None, cpus=2) as cluster:
-            processes = [thing for thing in gc.get_objects() if type(thing) is subprocess.Popen]
+            processes = [process for process in _running() if process not in others]
             yield cluster
         for process in processes:
             process.wait(timeout=30)  # Ray ends its processes and does not wait, of which Python warns
+
+
+def _running() -> list["subprocess.Popen[Any]"]:
+    """Return the processes that this one has started, and holds."""
+    return [thing for thing in gc.get_objects() if type(thing) is subprocess.Popen]

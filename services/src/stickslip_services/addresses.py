@@ -5,6 +5,8 @@ from ipaddress import ip_address
 
 DEFAULT_PORT = 8765
 DEFAULT_URL = f"http://127.0.0.1:{DEFAULT_PORT}"
+DATABASE_VARIABLE = "STICKSLIP_DATABASE"
+"""How processes hand each other the URL of the database: everybody can read their command lines."""
 
 
 def is_loopback(host: str) -> bool:

@@ -21,7 +21,6 @@ from tempfile import TemporaryDirectory
 
 import uvicorn
 from fastapi import FastAPI
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
 from stickslip_schemas.store import Store
@@ -36,11 +35,13 @@ from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMidd
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, tasks, textures, workers
 from stickslip_services.api.sse import Feeds
-from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.clock import Clock
+from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
-from stickslip_services.database.opening import locked, opened
-from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.database.opening import opened
+from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.keys import KeyRing, local_worker_key
+from stickslip_services.local.locking import locked
 from stickslip_services.local.logs import configure_logging
 from stickslip_services.local.sockets import listen
 from stickslip_services.pages.rendering import STATIC
@@ -56,7 +57,7 @@ GRACE_SECONDS = 3
 
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
-    coordinator = Coordinator(settings, clock or steady_clock())
+    coordinator = Coordinator(settings, clock)
     metrics = Metrics(
         coordinator.database, coordinator.store.root, coordinator.alive_workers, coordinator.eta_watch.held
     )
@@ -68,6 +69,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         keepers = [
             asyncio.create_task(_for_ever(coordinator.sweep, every)),
             asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+            asyncio.create_task(coordinator.database.listen(coordinator.bell.ring)),
         ]
         yield
         for keeper in keepers:
@@ -116,7 +118,7 @@ async def _for_ever(work: Callable[[], None], seconds: float) -> None:
 def openapi_text() -> str:
     """Return the OpenAPI document as it is committed."""
     with TemporaryDirectory() as data:
-        return json.dumps(make_app(Settings(data=Path(data))).openapi(), indent=2, sort_keys=True) + "\n"
+        return json.dumps(make_app(Settings(data=Path(data), database=None)).openapi(), indent=2, sort_keys=True) + "\n"
 
 
 class _Server(uvicorn.Server):
@@ -136,7 +138,7 @@ class _Server(uvicorn.Server):
 def reindex(settings: Settings) -> int:
     """Find the datasets in the store again; return the exit status."""
     counts = Counter[str]()
-    with locked(settings.data), opened(settings.data, durable=settings.durable) as database:
+    with locked(settings.data), opened(settings, Role.upkeep) as database:
         for found in find_versions(database, Store(settings.store_root)):
             name = f"{found.place.parent.name}:{found.place.name}"
             if found.fault:
@@ -156,6 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
     parser.add_argument("--data", type=Path, help="directory of the database and the store")
     parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
+    parser.add_argument("--database", help="URL of a PostgreSQL database; STICKSLIP_DATABASE hides its password better")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")
     parser.add_argument("--allow-host", action="append", dest="allowed_hosts", help="name to be asked by; repeatable")
@@ -172,15 +175,15 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     descriptor, is_reindexing = chosen.pop("fd", None), chosen.pop("reindex", False)
     try:
-        settings = Settings(**chosen)
-    except ValidationError as error:
-        sys.stderr.write("".join(f"error: {item['msg'].removeprefix('Value error, ')}\n" for item in error.errors()))
+        settings = Settings.chosen(**chosen)
+    except SettingsError as error:
+        sys.stderr.write(f"error: {error}\n")
         return 2
     configure_logging()
     try:
         if is_reindexing:
             return reindex(settings)
-        check_database(settings.database_path, settings.store_root)
+        check_database(settings, Role.coordinator, with_store=True)
         # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
         with locked(settings.data) if descriptor is None else nullcontext():
             return _serve(settings, descriptor)

@@ -71,6 +71,10 @@ class DatabaseRefusedError(Exception):
     """The database is damaged, lost, or of another version; the message says what to do."""
 
 
+class SettingsError(Exception):
+    """A setting breaks a rule."""
+
+
 class SupervisorError(Exception):
     """`stickslip up` cannot go on."""
 

@@ -1,12 +1,15 @@
 """Settings of the coordinator, from the environment (`STICKSLIP_...`) or the command line."""
 
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+from sqlalchemy import URL, make_url
+from sqlalchemy.exc import ArgumentError
 
 from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback, reachable
+from stickslip_services.errors import SettingsError
 
 
 class Settings(BaseSettings):
@@ -15,9 +18,11 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="STICKSLIP_", frozen=True, extra="forbid")
 
     data: Path = Path("stickslip-data")
-    """Directory of the database and, unless `store_path` says otherwise, of the store."""
+    """Directory of the worker key; also of database and store, unless `database` and `store_path` say otherwise."""
     store_path: Path | None = None
     """Root of the store; null is `data/store`."""
+    database: SecretStr | None = None
+    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`. Null is a SQLite file in `data`."""
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 
@@ -57,6 +62,34 @@ class Settings(BaseSettings):
     body_limit: int = Field(default=16 * 2**20, ge=1024)
     """The largest request body that is read [bytes]."""
 
+    @classmethod
+    def chosen(cls, **values: Any) -> Self:
+        """Return settings with these values, the others from the environment; raise SettingsError."""
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            rules = (item["msg"].removeprefix("Value error, ") for item in error.errors(include_input=False))
+            raise SettingsError("; ".join(rules)) from None
+
+    @field_validator("database")
+    @classmethod
+    def _is_postgresql(cls, database: SecretStr | None) -> SecretStr | None:
+        if database is not None:
+            value = database.get_secret_value()
+            try:
+                url = make_url(value)
+            except (ArgumentError, ValueError):
+                url = None
+            if url is None or url.drivername != "postgresql" or not url.database:
+                if url is not None:
+                    shown = repr(url.set(query={}).render_as_string(hide_password=True))
+                elif {"@", "?"} & set(value):
+                    shown = "something else, which is not shown because it may hold a password"
+                else:
+                    shown = repr(value[:100])
+                raise ValueError(f"database must be a URL of the form postgresql://USER@HOST/NAME, and is {shown}")
+        return database
+
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> Self:
         if (self.tls_certificate is None) != (self.tls_key is None):
@@ -79,9 +112,27 @@ class Settings(BaseSettings):
         return self.require_keys or self.behind_proxy or self.tls_certificate is not None or not is_loopback(self.host)
 
     @property
+    def database_url(self) -> URL | None:
+        """URL of the PostgreSQL database, which shows no password when printed; None where it is SQLite."""
+        if self.database is None:
+            return None
+        return make_url(self.database.get_secret_value()).set(drivername="postgresql+psycopg")
+
+    @property
     def database_path(self) -> Path:
-        """File of the database."""
+        """File of the database, where it is SQLite."""
         return self.data / "coordinator.sqlite3"
+
+    @property
+    def database_name(self) -> str:
+        """Name of the database for messages, without a password."""
+        url = self.database_url
+        return str(self.database_path) if url is None else url.set(drivername="postgresql", query={}).render_as_string()
+
+    @property
+    def database_option(self) -> str:
+        """The option of the command line that names another database."""
+        return "--data" if self.database is None else "--database"
 
     @property
     def worker_key_path(self) -> Path:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from stickslip_schemas.store import Store
 
-from stickslip_services.database.database import Database
-from stickslip_services.database.opening import check, locked, opened
-from stickslip_services.errors import ConflictError, DatabaseRefusedError, NotFoundError
+from stickslip_services.database.database import Database, Role
+from stickslip_services.database.opening import check, opened
+from stickslip_services.errors import ConflictError, DatabaseRefusedError, NotFoundError, SettingsError
+from stickslip_services.local.locking import locked
 from stickslip_services.queue.removing import remove
 from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
             if chosen.verb == "rm":
                 return _remove(database, store, chosen.version)
             return _collect(database, store, chosen.older_than, delete=chosen.delete)
-    except (ConflictError, DatabaseRefusedError, NotFoundError, ValueError) as error:
+    except (ConflictError, DatabaseRefusedError, NotFoundError, SettingsError, ValueError) as error:
         sys.stderr.write(f"error: {error}\n")
     except OSError as error:
         sys.stderr.write(f"error: {error.filename or 'the store'}: {error.strerror or error}\n")
@@ -49,11 +50,13 @@ def main(arguments: list[str] | None = None) -> int:
 @contextmanager
 def _data(data: Path, store_path: Path | None) -> Iterator[tuple[Database, Store]]:
     """Open what a coordinator left; raise DatabaseRefusedError where it runs, or where no database is."""
-    settings = Settings(data=data, store_path=store_path)
-    if not settings.database_path.exists():
-        raise DatabaseRefusedError(f"{settings.database_path} does not exist: name the data directory of a coordinator")
-    check(settings.database_path, settings.store_root)
-    with locked(data), opened(data) as database:
+    settings = Settings.chosen(data=data, store_path=store_path)
+    if not check(settings, Role.upkeep, with_store=True):
+        raise DatabaseRefusedError(
+            f"the database {settings.database_name} does not exist or is empty: name the "
+            f"{settings.database_option} of a coordinator"
+        )
+    with locked(data), opened(settings, Role.upkeep) as database:
         yield database, Store(settings.store_root)
 
 

@@ -2,6 +2,7 @@
 
 #include <nanobind/eigen/dense.h>
 #include <nanobind/stl/function.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -65,16 +66,16 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density,
              const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
              const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
-             int refactor_after, int flips_max, int patience, int halvings_max, double step_error, int coarsest,
-             int finest, const std::string& kernel) {
-            new (self) ClothSolver(rest, triangles, {density, {stretching}, rigidity}, held, clamped,
-                                   {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, flips_max,
-                                    patience, halvings_max},
-                                   {step_error, coarsest, finest}, kernel);
+             int refactor_after, int patience, int halvings_max, double step_error, int coarsest, int finest,
+             const std::string& kernel) {
+            new (self) ClothSolver(
+                rest, triangles, {density, {stretching}, rigidity}, held, clamped,
+                {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
+                {step_error, coarsest, finest}, kernel);
           },
           "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
-          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "flips_max"_a,
-          "patience"_a, "halvings_max"_a, "step_error"_a, "coarsest"_a, "finest"_a, "kernel"_a = "")
+          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a,
+          "halvings_max"_a, "step_error"_a, "coarsest"_a, "finest"_a, "kernel"_a = "")
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a)
       .def(
           "step",
@@ -115,6 +116,7 @@ void bind_cloth(nb::module_& m) {
           "positions"_a, "slopes"_a)
       .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "slopes"_a, "v"_a)
       .def("softest", &ClothSolver::softest, "positions"_a, "slopes"_a)
+      .def("part_error", &ClothSolver::part_error, "sticking"_a, "dt"_a)
       .def("factor_error", &ClothSolver::factor_error, "positions"_a, "slopes"_a, "dt"_a)
       .def("phases",
            [](const ClothSolver& self) {

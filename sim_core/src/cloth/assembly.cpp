@@ -27,9 +27,7 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Cl
       compact_bending_(mesh, compact_stencils, properties.rigidity, numbering, numbering.compact_bending),
       rigidity_size_(properties.rigidity.cwiseAbs().maxCoeff()),
       scalars_(numbering.bending.node.size(), 0.0f),
-      compact_scalars_(numbering.compact_bending.node.size(), 0.0f),
       blocks_(12 * numbering.membrane.node.size(), 0.0f),
-      definite_blocks_(blocks_),
       diagonal_(numbering.free_nodes, 0.0f),
       stiffening_(2 * mesh.triangles.rows(), 0.0f),
       assembled_stiffening_(2 * mesh.triangles.rows(), -1.0f),
@@ -101,16 +99,16 @@ double Assembly::own_stiffness(int node) const {
   return diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
 }
 
-ClothMatrix Assembly::neighbour(const Buffer<double>& x) {
-  std::fill(definite_blocks_.begin(), definite_blocks_.end(), 0.0f);
-  kernel.membrane(membrane_.data(), x.data(), unused_.data(), definite_blocks_.data(), true);
-  std::fill(compact_scalars_.begin(), compact_scalars_.end(), 0.0f);
-  kernel.bending_matrix(compact_bending_.data(), stiffening_.data(), compact_scalars_.data());
+ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbers) {
+  numbers.blocks.assign(blocks_.size(), 0.0f);
+  kernel.membrane(membrane_.data(), x.data(), unused_.data(), numbers.blocks.data(), true);
+  numbers.scalars.assign(numbering.compact_bending.node.size(), 0.0f);
+  kernel.bending_matrix(compact_bending_.data(), stiffening_.data(), numbers.scalars.data());
   ClothMatrix out = matrix;
-  out.membrane = definite_blocks_.data();
+  out.membrane = numbers.blocks.data();
   out.bending_begin = numbering.compact_bending.begin.data();
   out.bending_node = numbering.compact_bending.node.data();
-  out.bending = compact_scalars_.data();
+  out.bending = numbers.scalars.data();
   out.folds = &no_folds_;
   return out;
 }

@@ -14,6 +14,11 @@
 
 namespace sim_core {
 
+// Numbers of a matrix that a factor is of, which outlive the state that they are of.
+struct NeighbourNumbers {
+  Buffer<float> scalars, blocks;
+};
+
 class Assembly {
  public:
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const ClothProperties& properties,
@@ -46,7 +51,7 @@ class Assembly {
 
   // K's neighbour that the factor is of: the positive part of the stress, and the plate element that couples six nodes
   // in place of twelve.
-  ClothMatrix neighbour(const Buffer<double>& x);
+  ClothMatrix neighbour(const Buffer<double>& x, NeighbourNumbers& numbers);
 
  private:
   void assemble_bending();
@@ -56,7 +61,7 @@ class Assembly {
   Bending bending_, compact_bending_;
   double rigidity_size_;
   std::vector<int> bending_diagonal_, membrane_diagonal_;  // slots
-  Buffer<float> scalars_, compact_scalars_, blocks_, definite_blocks_, diagonal_;
+  Buffer<float> scalars_, blocks_, diagonal_;
   Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)
   Buffer<double> unused_;
   std::vector<int> fold_begin_, fold_nodes_;

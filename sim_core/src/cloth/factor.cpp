@@ -16,18 +16,34 @@ constexpr std::size_t pool_size = 3;
 StaleFactor::StaleFactor(const Numbering& numbering)
     : storage_(numbering.compact_bending, numbering.membrane, numbering.dissection),
       view_(storage_.view()),
-      added_(6L * numbering.free_nodes, 0.0f) {}
+      added_(6L * numbering.free_nodes, 0.0f),
+      touched_(numbering.free_nodes, 0) {}
 
-bool StaleFactor::stale(const std::vector<int>& modes, const ClothSettings& settings) const {
-  if (!made_ || excess_ > settings.refactor_after || last_ >= settings.krylov_max) return true;
-  int flips = 0;
-  for (std::size_t i = 0; i < modes.size(); ++i) flips += modes[i] != modes_[i];
-  return flips > settings.flips_max;
+double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
+                          const ClothSettings& settings) {
+  if (!made_ || excess_ > settings.refactor_after || last_ >= settings.krylov_max) {
+    make(assembly, x, contact, dt);
+    return 1.0;
+  }
+  if (contact.mode == modes_) return 0.0;
+  for (std::size_t i = 0; i < touched_.size(); ++i) touched_[i] = contact.mode[i] != modes_[i];
+  const double share = storage_.mark(touched_);
+  refresh(assembly, contact);
+  return share;
+}
+
+void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt) {
+  storage_.mark_all();
+  matrix_ = assembly.neighbour(x, numbers_);
+  refresh(assembly, contact);
+  made_ = true;
+  dt_ = dt;
+  excess_ = fresh_ = -1;
 }
 
 // Contact as a penalty: k n n^T where a node slips, and against a turn of friction; k in all directions where it
 // sticks.
-void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt) {
+void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact) {
   const int free_nodes = assembly.numbering.free_nodes;
   for (int i = 0; i < free_nodes; ++i) {
     float* own = &added_[6L * i];
@@ -46,11 +62,8 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
       }
     }
   }
-  assembly.kernel.factor(view_, assembly.neighbour(x), {added_.data()});
-  made_ = true;
+  assembly.kernel.factor(view_, matrix_, {added_.data()});
   modes_ = contact.mode;
-  dt_ = dt;
-  excess_ = fresh_ = -1;
 }
 
 void StaleFactor::spent(int iterations) {

@@ -21,17 +21,25 @@ class StaleFactor {
 
   // Whether it is for steps of this length.
   bool fits(double dt) const;
-  // Whether it never was made, has cost more GMRES iterations than a new one would, or is of other contacts.
-  bool stale(const std::vector<int>& modes, const ClothSettings& settings) const;
+  // Makes it anew if it never was made or has cost more GMRES iterations than a new one would; where it is of other
+  // contacts, those parts that hold them. Returns the share that was made.
+  double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
+               const ClothSettings& settings);
   void make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt);
   void spent(int iterations);
   void forget() { made_ = false; }
 
  private:
+  void refresh(const Assembly& assembly, const ContactState& contact);
+
   FactorStorage storage_;
   Factor view_;
+  // Without contact. Parts are made anew of the same: of one that moved on they would not fit the others.
+  ClothMatrix matrix_{};
+  NeighbourNumbers numbers_;
   Buffer<float> added_;
-  std::vector<int> modes_;  // that it was made for
+  std::vector<int> modes_;     // that it was made for
+  std::vector<char> touched_;  // nodes whose modes are others now
   bool made_ = false;
   double dt_ = 0.0;
   int last_ = 0, fresh_ = -1, excess_ = 0;  // iterations of the last solve, of the first, and beyond that

@@ -5,6 +5,9 @@
 namespace sim_core {
 namespace {
 
+// Subtrees of fewer nodes are made anew as one piece.
+constexpr int piece_nodes = 48;
+
 // Floats of the tiles of a front.
 long front_floats(long columns, long others) {
   long floats = 0;
@@ -13,6 +16,21 @@ long front_floats(long columns, long others) {
     floats += tile_floats(width, columns + others - j - width);
   }
   return floats;
+}
+
+// Of each front, that with which it is made anew.
+std::vector<int> pieces_of(const Dissection& dissection) {
+  const int fronts = static_cast<int>(dissection.parent.size());
+  std::vector<int> nodes(fronts), piece(fronts);
+  for (int f = 0; f < fronts; ++f) {
+    nodes[f] += dissection.pivot_begin[f + 1] - dissection.pivot_begin[f];
+    if (dissection.parent[f] >= 0) nodes[dissection.parent[f]] += nodes[f];
+  }
+  for (int f = fronts - 1; f >= 0; --f) {
+    const int parent = dissection.parent[f];
+    piece[f] = parent < 0 || nodes[parent] >= piece_nodes ? f : piece[parent];
+  }
+  return piece;
 }
 
 // Where things of some length lie that come and go: each in the first gap that holds it.
@@ -40,7 +58,7 @@ struct Shelf {
 }  // namespace
 
 FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, const Dissection& dissection)
-    : pivot_begin(dissection.pivot_begin) {
+    : piece(pieces_of(dissection)), due(piece.size(), 1), work(piece.size(), 0.0), pivot_begin(dissection.pivot_begin) {
   const int fronts = static_cast<int>(dissection.parent.size());
   std::vector<std::vector<int>> structure(fronts), below(fronts);
   for (int f = 0; f < fronts; ++f) {
@@ -52,7 +70,7 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
   tile_begin.push_back(0);
   child_begin.push_back(0);
   Shelf shelf;
-  long panel_max = 0, local_max = 0;
+  long kept = 0, panel_max = 0, local_max = 0;
   const auto pad = [](long rows) { return (rows + front_padding - 1) / front_padding * front_padding; };
   for (int f = 0; f < fronts; ++f) {
     const int first = pivot_begin[f], last = pivot_begin[f + 1];
@@ -106,25 +124,55 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
     tile_begin.push_back(tile_begin.back() + front_floats(columns, others));
     panel_max = std::max(panel_max, ld * columns);
     local_max = std::max(local_max, columns + others);
-    update_begin.push_back(shelf.put(f, pad(others) * others));
-    for (int child : below[f]) shelf.take(child);
+    const long update = pad(others) * others;
+    if (piece[f] == f) {
+      update_begin.push_back(kept);
+      kept += update;
+    } else {
+      update_begin.push_back(shelf.put(f, update));
+    }
+    for (int child : below[f]) {
+      if (piece[child] != child) shelf.take(child);
+    }
     children.insert(children.end(), below[f].begin(), below[f].end());
     child_begin.push_back(static_cast<int>(children.size()));
-    for (long c = 0; c < columns; ++c) flops += static_cast<double>(columns - c + others) * (columns - c + others);
+    for (long c = 0; c < columns; ++c) work[f] += static_cast<double>(columns - c + others) * (columns - c + others);
   }
   run_begin.push_back(0);
   for (const std::vector<FrontRun>& some : runs_of) {
     runs.insert(runs.end(), some.begin(), some.end());
     run_begin.push_back(static_cast<int>(runs.size()));
   }
+  for (std::size_t f = 0; f < piece.size(); ++f) {
+    if (piece[f] != static_cast<int>(f)) update_begin[f] += kept;
+  }
   tiles.assign(tile_begin.back() + 64, 0.0f);
   panel.assign(panel_max + 64, 0.0f);
-  updates.assign(shelf.length + 64, 0.0f);
+  updates.assign(kept + shelf.length + 64, 0.0f);
   local.assign(local_max + 64, 0.0f);
+}
+
+void FactorStorage::mark_all() { std::fill(due.begin(), due.end(), 1); }
+
+double FactorStorage::mark(const std::vector<char>& touched) {
+  const int fronts = static_cast<int>(due.size());
+  std::fill(due.begin(), due.end(), 0);
+  for (int f = 0; f < fronts; ++f) {
+    for (int i = pivot_begin[f]; i < pivot_begin[f + 1]; ++i) due[piece[f]] |= touched[i];
+    for (int c = child_begin[f]; c < child_begin[f + 1]; ++c) due[piece[f]] |= due[children[c]];
+  }
+  double all = 0.0, some = 0.0;
+  for (int f = 0; f < fronts; ++f) {
+    due[f] = due[piece[f]];
+    all += work[f];
+    if (due[f]) some += work[f];
+  }
+  return some / all;
 }
 
 Factor FactorStorage::view() {
   return {static_cast<int>(update_begin.size()),
+          due.data(),
           pivot_begin.data(),
           row_begin.data(),
           rows.data(),

@@ -112,10 +112,9 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
 // Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
 void Newton::correct(const StepProblem& problem, const Buffer<double>& x, double krylov_tolerance, StepReport& report) {
   StaleFactor& factor = factors.latest();
-  if (factor.stale(contact.mode, settings_)) {
+  {
     const Stopwatch watch(phases.factorization);
-    factor.make(assembly_, x, contact, problem.dt);
-    ++report.factorizations;
+    report.factorizations += factor.renew(assembly_, x, contact, problem.dt, settings_);
   }
   const Stopwatch watch(phases.krylov);
   subtract_corrections();

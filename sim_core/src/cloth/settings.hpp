@@ -9,7 +9,6 @@ struct ClothSettings {
   int krylov_max;    // of GMRES in one of those
   double krylov_tolerance;
   int refactor_after;  // GMRES iterations that a stale factor may cost
-  int flips_max;       // contacts that may change their mode before a factor is made anew
   int patience;        // iterations of Newton's method after which a step is halved rather than pursued
   int halvings_max;    // of a step that does not converge
 };
@@ -18,7 +17,8 @@ struct StepReport {
   bool converged = true;
   double residual = 0.0;           // N: worst over the substeps
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
-  int substeps = 0, newton = 0, krylov = 0, factorizations = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0;
+  int substeps = 0, newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0;
+  double factorizations = 0.0;  // whole ones, and shares of those in part
 
   void add_work(const StepReport& other) {
     newton += other.newton;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "cloth/control.hpp"
 #include "cloth/kernels/choice.hpp"
@@ -196,7 +197,8 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
       v[4 * i + c] = static_cast<float>(state >> 8) / (1 << 23) - 1.0f;
     }
   }
-  assembly.kernel.apply(assembly.neighbour(at), v.data(), b.data());
+  NeighbourNumbers numbers;
+  assembly.kernel.apply(assembly.neighbour(at, numbers), v.data(), b.data());
   assembly.kernel.solve(factor.view(), free_nodes, b.data(), b.data());
   double wrong = 0.0, size = 0.0;
   for (std::size_t i = 0; i < v.size(); ++i) {
@@ -206,9 +208,33 @@ double ClothSolver::factor_error(const Points3& positions, const Points3& slopes
   return std::sqrt(wrong / size);
 }
 
+std::pair<double, double> ClothSolver::part_error(const std::vector<std::int32_t>& sticking, double dt) {
+  const Buffer<double>& x = impl_->stepper.x;
+  Assembly& assembly = impl_->assembly;
+  assembly.set_diagonal(dt, 0.0);
+  impl_->newton.evaluate(x, true);
+  ContactState contact(impl_->numbering.free_nodes);
+  StaleFactor part(impl_->numbering), whole(impl_->numbering);
+  ClothSettings settings{};
+  settings.refactor_after = settings.krylov_max = krylov_max;
+  part.renew(assembly, x, contact, dt, settings);
+  for (const std::int32_t vertex : sticking) contact.mode[impl_->numbering.node[vertex]] = contact_stick;
+  const double share = part.renew(assembly, x, contact, dt, settings);
+  whole.renew(assembly, x, contact, dt, settings);
+  float wrong = 0.0f, size = 0.0f;
+  for (std::size_t i = 0; i < whole.storage().tiles.size(); ++i) {
+    wrong = std::max(wrong, std::abs(whole.storage().tiles[i] - part.storage().tiles[i]));
+    size = std::max(size, std::abs(whole.storage().tiles[i]));
+  }
+  return {wrong / size, share};
+}
+
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }
 ClothPhases ClothSolver::phases() const { return impl_->newton.phases; }
-double ClothSolver::factor_flops() const { return impl_->newton.factors.latest().storage().flops; }
+double ClothSolver::factor_flops() const {
+  const std::vector<double>& work = impl_->newton.factors.latest().storage().work;
+  return std::accumulate(work.begin(), work.end(), 0.0);
+}
 std::size_t ClothSolver::factor_floats() const { return impl_->newton.factors.latest().storage().tiles.size(); }
 std::string ClothSolver::kernel() const { return impl_->assembly.kernel.name; }
 

@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "cloth/control.hpp"
@@ -56,6 +57,9 @@ class ClothSolver {
   double softest(const Points3& positions, const Points3& slopes);
   // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
   double factor_error(const Points3& positions, const Points3& slopes, double dt);
+  // Largest difference between a factor whose parts that hold these vertices, which stick, were made anew, and a whole
+  // one, over its largest number; and the share that was made.
+  std::pair<double, double> part_error(const std::vector<std::int32_t>& sticking, double dt);
 
   const Eigen::VectorXd& masses() const;
   ClothPhases phases() const;

@@ -167,7 +167,7 @@ def _allowed_methods(request: Request) -> str:
 
 def _database_error(request: Request, error: Exception) -> Response:
     logger.error("%s %s: %s", request.method, request.url.path, error)
-    if "locked" in str(error) or "busy" in str(error):
+    if any(words in str(error) for words in ("locked", "busy", "lock timeout")):
         headers = {"Retry-After": "1"}
         return _answer(request, 503, ProblemCode.busy, "the database is busy; try again", headers=headers)
     detail = "the coordinator cannot use its database (is the disk full?); its log says more"

@@ -10,7 +10,13 @@ from rich.markup import escape
 
 from stickslip_services.cli.specs import SpecFileError
 from stickslip_services.client.calls import ClientError, ProblemError, UnreachableError
-from stickslip_services.errors import DatabaseRefusedError, NotFoundError, ServerNotInstalledError, SupervisorError
+from stickslip_services.errors import (
+    DatabaseRefusedError,
+    NotFoundError,
+    ServerNotInstalledError,
+    SettingsError,
+    SupervisorError,
+)
 from stickslip_services.local.certifying import CertifyError
 
 _SHOWN = (
@@ -19,6 +25,7 @@ _SHOWN = (
     DatabaseRefusedError,
     NotFoundError,
     ServerNotInstalledError,
+    SettingsError,
     SpecFileError,
     SupervisorError,
 )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from stickslip_services.cli.common import console, say, table
+from stickslip_services.cli.common import DatabaseOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 from stickslip_services.scopes import Scope
@@ -27,11 +27,14 @@ DEFAULT_DATA = Path("stickslip-data")
 
 
 @contextmanager
-def _writing(data: Path) -> Iterator["Connection"]:
+def _writing(data: Path, database_url: str | None) -> Iterator["Connection"]:
     require_server("keys")
-    from stickslip_services.database.opening import opened  # the server's packages may be missing
+    from stickslip_services.database.database import Role  # the server's packages may be missing
+    from stickslip_services.database.opening import opened
+    from stickslip_services.settings import Settings
 
-    with opened(data) as database, database.write() as connection:
+    chosen = {"data": data} if database_url is None else {"data": data, "database": database_url}
+    with opened(Settings.chosen(**chosen), Role.visitor) as database, database.write() as connection:
         yield connection
 
 
@@ -41,9 +44,10 @@ def create(
     name: Annotated[str, typer.Argument(help="whose key it is, or what for")],
     scope: Annotated[list[Scope], typer.Option(help="what it is for; repeatable. submit includes read, admin all")],
     data: DataOption = DEFAULT_DATA,
+    database: DatabaseOption = None,
 ) -> None:
     """Make a key and print it. It is shown this once: only its digest is kept."""
-    with _writing(data) as connection:
+    with _writing(data, database) as connection:
         from stickslip_services.keys import create_key
 
         key, secret = create_key(connection, name, scope, time.time())
@@ -54,9 +58,9 @@ def create(
 
 @app.command("list")
 @shows_errors
-def list_(data: DataOption = DEFAULT_DATA) -> None:
+def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
-    with _writing(data) as connection:
+    with _writing(data, database) as connection:
         from stickslip_services.keys import list_keys
 
         found = list_keys(connection)
@@ -77,9 +81,10 @@ def list_(data: DataOption = DEFAULT_DATA) -> None:
 def revoke(
     key_id: Annotated[str, typer.Argument(metavar="KEY", help="id of a key, as `stickslip keys list` shows it")],
     data: DataOption = DEFAULT_DATA,
+    database: DatabaseOption = None,
 ) -> None:
     """Let a key open nothing any more; a running coordinator knows it within a second."""
-    with _writing(data) as connection:
+    with _writing(data, database) as connection:
         from stickslip_services.keys import revoke_key
 
         revoke_key(connection, key_id, time.time())

@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
-from stickslip_services.cli.common import console
+from stickslip_services.cli.common import DatabaseOption, console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 
@@ -23,6 +23,7 @@ def up(
     host: Annotated[
         str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
     ] = "127.0.0.1",
+    database: DatabaseOption = None,
     slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
     allow_host: Annotated[
         list[str] | None, typer.Option(help="name that the coordinator may be asked by; repeatable")
@@ -37,7 +38,10 @@ def up(
 ) -> None:
     """Run a coordinator and a dispatcher with their workers on this machine, until Ctrl-C."""
     require_server("up")
-    from stickslip_services.local import supervisor  # it starts a server, and its settings need the server's packages
+    from stickslip_services.database.database import Role  # the server's packages may be missing
+    from stickslip_services.database.opening import check
+    from stickslip_services.local import supervisor
+    from stickslip_services.settings import Settings
 
     screen = console()
     doors = {
@@ -48,8 +52,12 @@ def up(
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
     given = {name: value for name, value in doors.items() if value}
+    if database is not None:
+        given["database"] = database
+    settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
+    check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
-        supervisor.LocalService(data=data, host=host, port=port, slots=slots, dispatcher=dispatcher, doors=given),
+        supervisor.LocalService(settings, slots=slots, dispatcher=dispatcher),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"

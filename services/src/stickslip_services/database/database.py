@@ -1,74 +1,80 @@
-"""The database: transactions over SQLite, written so that PostgreSQL can take its place.
+"""Transactions on the database, whichever it is: SQLite in the data directory, or PostgreSQL by a URL.
 
-There is one way to read and one to write. A write holds the database's write lock from its first statement
-(`BEGIN IMMEDIATE`): it never finds at its end that somebody else was faster, so nothing has to be tried again.
+There is one way to read and one to write. A write is alone in writing from its first statement on: it never finds at
+its end that somebody else was faster, so nothing has to be tried again.
 """
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from enum import Enum, auto
 from itertools import islice
-from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import URL, Connection, Table, create_engine, event
+from sqlalchemy import Connection, Engine, Table, event
+from sqlalchemy.pool import ConnectionPoolEntry
 
 T = TypeVar("T")
 
 BATCH = 5000
 """How many values go into one IN (...) and how many rows into one executemany."""
 
-_PRAGMAS = (
-    "journal_mode=WAL",  # readers and the writer do not wait for each other
-    "busy_timeout=30000",  # another process may look at the database (a backup, a person)
-    "foreign_keys=ON",
-    "cache_size=-65536",  # 64 MiB: the index of 200,000 task keys fits
-    "journal_size_limit=67108864",  # the log of a big plan does not stay that big
-)
+
+class Role(Enum):
+    """Who opens a database. Any number of coordinators may share one; upkeep has it for itself."""
+
+    coordinator = auto()
+    upkeep = auto()
+    visitor = auto()
+    """One who reads and writes a row or two beside the others."""
 
 
-class Database:
-    """Transactions on one database file."""
+class Database(ABC):
+    """Transactions on one database."""
 
-    def __init__(self, path: Path, *, durable: bool = True) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # FULL: what was answered with 202, or accepted as a dataset version, is there after a power cut, too. A
-        # commit costs an fsync; leases and reports come in batches, so that is a handful a second.
-        self._pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
-        url = URL.create("sqlite+pysqlite", database=str(path))
-        self._engine = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
-        # SQLite's own waiting for the write lock polls and is unfair; threads of this process queue up here.
+    def __init__(self, reader: Engine, writer: Engine) -> None:
+        self._reader = reader
+        self._writer = writer
+        # The database's own waiting is unfair, or takes a connection; threads of this process queue up here.
         self._writing = threading.Lock()
-        event.listen(self._engine, "connect", self._prepare)
-        event.listen(self._engine, "begin", _begin)
+        self._ahead = time.time() - time.monotonic()
+
+    def clock(self) -> float:
+        """Return what all coordinators on this database call now, in seconds since 1970 [s].
+
+        When somebody sets this machine's clock, leases neither expire at once nor live for ever.
+        """
+        return self._ahead + time.monotonic()
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Open a transaction that sees one state of the database."""
-        with self._engine.connect() as connection, connection.begin():
+        with self._reader.begin() as connection:
             yield connection
 
-    @contextmanager
-    def write(self) -> Iterator[Connection]:
+    @abstractmethod
+    def write(self) -> AbstractContextManager[Connection]:
         """Open a transaction that is alone in writing; it is durable when the block has been left."""
-        with self._writing, self._engine.connect() as connection:
-            connection.execution_options(stickslip_write=True)
-            with connection.begin():
-                yield connection
+
+    def is_alone(self, connection: Connection) -> bool:
+        """Tell, in a write, whether no other coordinator uses the database."""
+        return True
+
+    async def listen(self, ring: Callable[[], None]) -> None:
+        """Call `ring` whenever another coordinator has written, until cancelled."""
+        return
 
     def close(self) -> None:
-        """Close all connections."""
-        self._engine.dispose()
-
-    def _prepare(self, connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # transactions are begun by _begin, not by the driver
-        for pragma in self._pragmas:
-            connection.execute(f"PRAGMA {pragma}")
+        """Close all connections; one that a thread still uses, as soon as the thread has done with it."""
+        for engine in (self._reader, self._writer):
+            event.listen(engine, "checkin", _close_returned)
+            engine.dispose()
 
 
-def _begin(connection: Connection) -> None:
-    immediate = connection.get_execution_options().get("stickslip_write", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+def _close_returned(_connection: Any, record: ConnectionPoolEntry) -> None:
+    record.close()
 
 
 def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
@@ -80,7 +86,7 @@ def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
 
 def insert_rows(connection: Connection, table: Table, columns: Sequence[str], rows: Iterable[tuple[Any, ...]]) -> None:
     """Insert many rows by the driver's own executemany: an SQL expression per row would cost five times as much."""
-    marks = {"qmark": "?", "format": "%s", "pyformat": "%s"}[connection.dialect.paramstyle]
-    statement = f"INSERT INTO {table.name} ({', '.join(columns)}) VALUES ({', '.join([marks] * len(columns))})"
+    mark = {"qmark": "?", "format": "%s"}[connection.dialect.paramstyle]
+    statement = f"INSERT INTO {table.name} ({', '.join(columns)}) VALUES ({', '.join([mark] * len(columns))})"
     for batch in batches(rows, 20 * BATCH):
         connection.exec_driver_sql(statement, batch)

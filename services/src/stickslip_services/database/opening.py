@@ -1,31 +1,45 @@
-"""Opening the database of a data directory, or refusing it in one sentence that says what to do."""
+"""Opening a coordinator's database, or refusing it in one sentence that says what to do."""
 
-import fcntl
-import os
 import sqlite3
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 from alembic.script import ScriptDirectory
+from sqlalchemy import inspect, text
+from sqlalchemy.exc import DBAPIError
 
 from stickslip_services.database import migrate
-from stickslip_services.database.database import Database
+from stickslip_services.database.database import Database, Role
+from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.settings import Settings
 
-DATABASE_NAME = "coordinator.sqlite3"
+
+def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
+    """Return the database of a coordinator, as it is. Raise DatabaseRefusedError where its driver is missing."""
+    url = settings.database_url
+    if url is None:
+        return SqliteDatabase(settings.database_path, durable=settings.durable)
+    if find_spec("psycopg") is None:
+        raise DatabaseRefusedError(
+            f"the database {settings.database_name} needs psycopg, which is not installed: "
+            "pip install 'stickslip-services[server,postgresql]'"
+        )
+    from stickslip_services.database.postgresql import PostgresqlDatabase
+
+    return PostgresqlDatabase(url, durable=settings.durable, role=role)
 
 
 @contextmanager
-def opened(data: Path, *, durable: bool = True) -> Iterator[Database]:
-    """Open the database of a data directory, brought up to date; make it where there is none.
+def opened(settings: Settings, role: Role) -> Iterator[Database]:
+    """Open the database of a coordinator, brought up to date; make it where there is none.
 
-    Raise DatabaseRefusedError where it is damaged or was made by a newer version.
+    Raise DatabaseRefusedError where it is damaged, was made by a newer version, or cannot be had in this role.
     """
-    path = data / DATABASE_NAME
-    check(path)
-    database = Database(path, durable=durable)
+    check(settings, role)
+    database = connect(settings, role)
     try:
         with database.write() as connection:
             migrate.upgrade(connection)
@@ -34,19 +48,38 @@ def opened(data: Path, *, durable: bool = True) -> Iterator[Database]:
         database.close()
 
 
-def check(path: Path, store: Path | None = None) -> None:
-    """Raise DatabaseRefusedError where a database cannot be used.
+def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
+    """Return whether there is a database; raise DatabaseRefusedError where it cannot be used in a role.
 
-    One that is not there can be made, unless there are datasets in the `store`: then it was lost.
+    One that is not there can be made, unless there are datasets in the store, `with_store`: then it was lost.
     """
+    if settings.database_url is None:
+        revision = _sqlite_revision(settings.database_path)
+    else:
+        revision = _postgresql_revision(settings, role)
+    name = settings.database_name
+    datasets = settings.store_root.glob("datasets/*/v*/manifest.json") if with_store else iter(())
+    if revision is None and next(datasets, None) is not None:
+        given = {"--store": settings.store_path, "--database": settings.database}
+        same = " and ".join(option for option, value in given.items() if value is not None)
+        raise DatabaseRefusedError(
+            f"{settings.store_root} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
+            f"{settings.data}`{same and f' with the same {same}'} to find them again"
+        )
+    known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
+    if revision is not None and revision not in known:
+        raise DatabaseRefusedError(
+            f"{name} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
+            f"install that version again, or name another {settings.database_option}"
+        )
+    return revision is not None
+
+
+def _sqlite_revision(path: Path) -> str | None:
+    """Return the last migration that a file has had; None where there is no file, or an empty one."""
     if not path.exists():
-        if store is not None and next(store.glob("datasets/*/v*/manifest.json"), None) is not None:
-            raise DatabaseRefusedError(
-                f"{store} holds datasets, and the database {path} is gone: run `stickslip reindex --data "
-                f"{path.parent}` to find them again"
-            )
-        return
-    revision = ""
+        return None
+    revision = None
     try:
         with closing(sqlite3.connect(path, timeout=30)) as connection:
             (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
@@ -60,54 +93,44 @@ def check(path: Path, store: Path | None = None) -> None:
         ) from error
     except sqlite3.DatabaseError as error:
         found = str(error)
-    if found not in ("ok", "") and not revision:
+    if found != "ok":
         raise DatabaseRefusedError(
             f"{path} is damaged ({found.splitlines()[-1]}): move it away and run "
             f"`stickslip reindex --data {path.parent}`, which finds the datasets in the store again"
         )
-    known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
-    if revision and revision not in known:
+    return revision
+
+
+def _postgresql_revision(settings: Settings, role: Role) -> str | None:
+    """Return the last migration that a database has had; None where it is empty."""
+    name = settings.database_name
+    if settings.database_path.exists():
         raise DatabaseRefusedError(
-            f"{path} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
-            "install that version again, or name another --data"
+            f"the queue is to be in {name}, and {settings.database_path} holds another one: move that file away"
         )
-
-
-@contextmanager
-def locked(data: Path) -> Iterator[int]:
-    """Hold the lock of a data directory; the coordinator inherits it, so that it is held while one of them lives.
-
-    Yield its file descriptor; raise DatabaseRefusedError where another process holds it.
-    """
-    data.mkdir(parents=True, exist_ok=True)
-    path = data / "lock"
-    with path.open("a+") as file:
-        deadline = time.monotonic() + 10
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                holder = path.read_text(encoding="utf-8").strip()
-                # If the holder was killed, its coordinator is about to follow it.
-                if _is_alive(holder) or time.monotonic() > deadline:
-                    message = f"{path.parent} is in use by another `stickslip up` or coordinator (pid {holder})"
-                    raise DatabaseRefusedError(message) from None
-                time.sleep(0.1)
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
-        os.set_inheritable(file.fileno(), True)
-        yield file.fileno()
-
-
-def _is_alive(pid: str) -> bool:
-    if not pid.isdecimal():
-        return False
+    database = connect(settings, role)
     try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+        with database.write() as connection:  # which is refused where others have the database for themselves
+            tables = inspect(connection).get_table_names()
+            encoding = connection.scalar(text("SHOW server_encoding"))
+            if encoding != "UTF8":
+                raise DatabaseRefusedError(
+                    f"the encoding of the database {name} must be UTF8, and is {encoding}: "
+                    "make another one with `createdb --encoding UTF8 --template template0`"
+                )
+            if not tables:
+                if not connection.scalar(text("SELECT has_schema_privilege(current_schema(), 'CREATE')")):
+                    raise DatabaseRefusedError(
+                        f"its user may not make tables in the database {name}: make the user its owner, "
+                        "for example with `createdb --owner`"
+                    )
+                return None
+            if "alembic_version" not in tables or "task_counts" not in tables:
+                raise DatabaseRefusedError(
+                    f"{name} is not a database of stickslip: give it one of its own, which is empty, with --database"
+                )
+            return str(connection.scalar(text("SELECT version_num FROM alembic_version")))
+    except DBAPIError as error:
+        raise DatabaseRefusedError(f"{name} cannot be opened: {str(error.orig).splitlines()[0]}") from error
+    finally:
+        database.close()

@@ -18,8 +18,6 @@ from sqlalchemy.sql.compiler import SQLCompiler
 
 Values = Mapping[str, Any]
 
-_NO_VALUES = "SELECT NULL WHERE 1 != 1"  # PostgreSQL has no `IN ()`
-
 
 @dataclass(frozen=True, slots=True)
 class _Compiled:
@@ -27,8 +25,8 @@ class _Compiled:
     names: tuple[str, ...]
     """The parameters in the order of the SQL."""
     defaults: Values
-    lists: tuple[str, ...]
-    """Those of the parameters that are the values of an IN (...)."""
+    lists: Mapping[str, str]
+    """Those of the parameters that are the values of an IN (...), each with a query for none: there is no `IN ()`."""
     mark: str
 
 
@@ -72,14 +70,17 @@ class Prepared:
         names, defaults = compiled.names, compiled.defaults
         rows = [[row[name] if name in row else defaults[name] for name in names] for row in values]
         with _translated(connection, compiled.sql):
-            _driver(connection).executemany(compiled.sql, rows)
+            if len(rows) == 1:  # psycopg sends many as a pipeline, which costs more
+                _driver(connection).execute(compiled.sql, rows[0])
+            else:
+                _driver(connection).executemany(compiled.sql, rows)
 
     def _filled(self, connection: Connection, values: Values) -> tuple[str, list[Any]]:
         compiled = self._compile(connection.dialect)
         sql = compiled.sql
-        for name in compiled.lists:
+        for name, none in compiled.lists.items():
             count = len(values[name] if name in values else compiled.defaults[name])
-            sql = sql.replace(_list_mark(name), ", ".join([compiled.mark] * count) or _NO_VALUES)
+            sql = sql.replace(_list_mark(name), ", ".join([compiled.mark] * count) or none)
         parameters: list[Any] = []
         for name in compiled.names:
             value = values[name] if name in values else compiled.defaults[name]
@@ -95,7 +96,11 @@ class Prepared:
             made = self._statement.compile(dialect=dialect)  # type: ignore[attr-defined]
             assert isinstance(made, SQLCompiler)
             names = tuple(made.positiontup or ())
-            lists = tuple(dict.fromkeys(name for name in names if made.binds[name].expanding))
+            lists = {
+                name: made.visit_empty_set_expr([made.binds[name].type])  # type: ignore[no-untyped-call]
+                for name in dict.fromkeys(names)
+                if made.binds[name].expanding
+            }
             defaults = {name: value for name, value in made.params.items() if not made.binds[name].required}
             mark = {"qmark": "?", "format": "%s"}[dialect.paramstyle]
             compiled = _Compiled(str(made), names, defaults, lists, mark)

@@ -5,6 +5,7 @@ Tasks are global and keyed by content; jobs point at the tasks that they need. I
 """
 
 from sqlalchemy import (
+    BigInteger,
     Boolean,
     Column,
     Float,
@@ -28,10 +29,13 @@ metadata = MetaData(
     }
 )
 
+_Wide = BigInteger().with_variant(Integer, "sqlite")
+"""64 bits: SQLite's INTEGER has them, and it must be called so to be a rowid."""
+
 workers = Table(
     "workers",
     metadata,
-    Column("seq", Integer, primary_key=True),
+    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String, nullable=False, index=True),
     Column("builds", Text, nullable=False),  # JSON: by kind
@@ -46,14 +50,14 @@ workers = Table(
 jobs = Table(
     "jobs",
     metadata,
-    Column("seq", Integer, primary_key=True),
+    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String),
     Column("kind", String, nullable=False),
     Column("spec", Text, nullable=False),  # JSON
     Column("sample_count", Integer, nullable=False),
     Column("builds", Text),  # JSON; null until the job is planned
-    Column("publish_task", Integer, index=True),  # null until the job is planned
+    Column("publish_task", _Wide, index=True),  # null until the job is planned
     Column("state", String, nullable=False),
     Column("reason", String),
     Column("message", Text, nullable=False),
@@ -79,7 +83,7 @@ idempotency_keys = Table(
     metadata,
     Column("key", String, primary_key=True),
     Column("fingerprint", String, nullable=False),
-    Column("job", Integer, ForeignKey("jobs.seq"), nullable=False),
+    Column("job", _Wide, ForeignKey("jobs.seq"), nullable=False),
     Column("response", Text, nullable=False),
     Column("created_at", Float, nullable=False),
 )
@@ -87,7 +91,7 @@ idempotency_keys = Table(
 tasks = Table(
     "tasks",
     metadata,
-    Column("seq", Integer, primary_key=True),
+    Column("seq", _Wide, primary_key=True),
     Column("key", LargeBinary(32), nullable=False, unique=True),
     Column("stage", String, nullable=False),
     Column("kind", String, nullable=False),
@@ -95,7 +99,7 @@ tasks = Table(
     Column("payload", Text, nullable=False),  # JSON; what the task is besides the results it waits for
     Column("preview", Boolean, nullable=False),
     Column("cost_group", String, nullable=False, server_default=""),  # tasks of one group cost about the same
-    Column("job", Integer, nullable=False),  # the oldest live job that needs it, while it is pending
+    Column("job", _Wide, nullable=False),  # the oldest live job that needs it, while it is pending
     Column("state", String, nullable=False),
     Column("reason", String),
     Column("message", Text, nullable=False, server_default=""),
@@ -145,16 +149,16 @@ tasks = Table(
 task_dependencies = Table(
     "task_dependencies",
     metadata,
-    Column("task", Integer, primary_key=True, autoincrement=False),
-    Column("depends_on", Integer, primary_key=True, autoincrement=False, index=True),
+    Column("task", _Wide, primary_key=True, autoincrement=False),
+    Column("depends_on", _Wide, primary_key=True, autoincrement=False, index=True),
     sqlite_with_rowid=False,
 )
 
 job_tasks = Table(
     "job_tasks",
     metadata,
-    Column("job", Integer, primary_key=True, autoincrement=False),
-    Column("task", Integer, primary_key=True, autoincrement=False, index=True),
+    Column("job", _Wide, primary_key=True, autoincrement=False),
+    Column("task", _Wide, primary_key=True, autoincrement=False, index=True),
     Column("cached", Boolean, nullable=False),  # it was settled before the job came
     sqlite_with_rowid=False,
 )
@@ -162,11 +166,11 @@ job_tasks = Table(
 samples = Table(
     "samples",
     metadata,
-    Column("job", Integer, primary_key=True, autoincrement=False),
-    Column("slot", Integer, primary_key=True, autoincrement=False),
+    Column("job", _Wide, primary_key=True, autoincrement=False),
+    Column("slot", _Wide, primary_key=True, autoincrement=False),
     Column("key", LargeBinary(32), nullable=False),
-    Column("simulate_task", Integer, nullable=False),
-    Column("render_task", Integer),
+    Column("simulate_task", _Wide, nullable=False),
+    Column("render_task", _Wide),
     Column("split", Integer, nullable=False),
     Column("labels", Text, nullable=False),  # JSON: the point of the grid
     sqlite_with_rowid=False,
@@ -175,7 +179,7 @@ samples = Table(
 previews = Table(
     "previews",
     metadata,
-    Column("task", Integer, primary_key=True, autoincrement=False),
+    Column("task", _Wide, primary_key=True, autoincrement=False),
     Column("digest", String, nullable=False, index=True),
 )
 
@@ -184,7 +188,7 @@ previews = Table(
 job_counts = Table(
     "job_counts",
     metadata,
-    Column("job", Integer, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
+    Column("job", _Wide, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     Column("stage", String, primary_key=True),
     Column("state", String, primary_key=True),
     Column("count", Integer, nullable=False),
@@ -193,7 +197,7 @@ job_counts = Table(
 job_stages = Table(
     "job_stages",
     metadata,
-    Column("job", Integer, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
+    Column("job", _Wide, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     Column("stage", String, primary_key=True),
     Column("cached", Integer, nullable=False),
     Column("cpu_seconds", Float, nullable=False, server_default="0"),
@@ -213,7 +217,7 @@ task_counts = Table(
 job_groups = Table(
     "job_groups",
     metadata,
-    Column("job", Integer, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
+    Column("job", _Wide, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     Column("stage", String, primary_key=True),
     Column("cost_group", String, primary_key=True),
     Column("left", Integer, nullable=False),  # tasks of the group that are not over
@@ -235,7 +239,7 @@ cost_groups = Table(
 datasets = Table(
     "datasets",
     metadata,
-    Column("seq", Integer, primary_key=True),
+    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String),
     Column("kind", String, nullable=False),
@@ -248,19 +252,19 @@ dataset_versions = Table(
     metadata,
     Column("dataset", String, primary_key=True),
     Column("version", Integer, primary_key=True, autoincrement=False),
-    Column("publish_task", Integer, nullable=False, unique=True),
+    Column("publish_task", _Wide, nullable=False, unique=True),
     Column("manifest", String),  # null: the number is taken, the version is not committed
     Column("group_digest", String),  # of the root's zarr.json; null also for a version without a seal
     Column("created_at", Float),
     Column("sample_count", Integer),
     Column("valid_count", Integer),
-    Column("bytes", Integer),
+    Column("bytes", _Wide),
 )
 
 certificates = Table(
     "certificates",
     metadata,
-    Column("seq", Integer, primary_key=True),
+    Column("seq", _Wide, primary_key=True),
     Column("digest", String, nullable=False, unique=True),
     Column("artifact", String, nullable=False),  # the document
     Column("page", String, nullable=False),  # its page for people, an artifact
@@ -276,7 +280,7 @@ certificates = Table(
 api_keys = Table(
     "api_keys",
     metadata,
-    Column("seq", Integer, primary_key=True),
+    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String, nullable=False),
     Column("digest", String, nullable=False, unique=True),  # SHA-256 of the secret, which is nowhere
@@ -289,8 +293,8 @@ api_keys = Table(
 events = Table(
     "events",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("job", Integer, ForeignKey("jobs.seq"), nullable=False),
+    Column("id", _Wide, primary_key=True),
+    Column("job", _Wide, ForeignKey("jobs.seq"), nullable=False),
     Column("name", String, nullable=False),
     Column("data", Text, nullable=False),  # JSON
     Column("created_at", Float, nullable=False),

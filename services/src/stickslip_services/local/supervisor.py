@@ -13,19 +13,19 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any
+from typing import IO
 
 import httpx
-from pydantic import ValidationError
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.database.opening import check, locked
+from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.errors import SupervisorError
+from stickslip_services.local.locking import locked
 from stickslip_services.local.sockets import listen
 from stickslip_services.settings import Settings
 
@@ -44,14 +44,11 @@ _PR_SET_PDEATHSIG = 1
 class LocalService:
     """What `stickslip up` runs."""
 
-    data: Path
-    host: str
-    port: int
+    settings: Settings
+    """Of the coordinator. `data` is an absolute path."""
     slots: int | None = None
     dispatcher: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
-    doors: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the coordinator that say who may come in, by name."""
 
 
 @dataclass(slots=True)
@@ -60,6 +57,8 @@ class _Child:
     command: list[str]
     log: Path
     inherited: tuple[int, ...] = ()
+    database: str | None = None
+    """URL of the database, with its password: only the environment of the process has it."""
     process: subprocess.Popen[bytes] | None = None
     started_at: float = 0.0
     failed_starts: int = 0
@@ -67,6 +66,9 @@ class _Child:
 
     def start(self) -> None:
         """Start in a session of its own: Ctrl-C is for the supervisor, which then stops children in order."""
+        environment = {name: value for name, value in os.environ.items() if name != DATABASE_VARIABLE}
+        if self.database is not None:
+            environment[DATABASE_VARIABLE] = self.database
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 self.command,
@@ -76,6 +78,7 @@ class _Child:
                 start_new_session=True,
                 preexec_fn=_die_with_parent,
                 pass_fds=self.inherited,
+                env=environment,
             )
         self.started_at = time.monotonic()
 
@@ -136,15 +139,14 @@ class _Child:
 def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable[[str], None] | None = None) -> int:
     """Run until a signal to stop; return the exit status. Raise SupervisorError."""
     say = say or (lambda message: print_line(sys.stderr, message))
-    data = service.data.absolute()
-    settings = _settings(service, data)
+    settings = service.settings
+    data = settings.data
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         lock = stack.enter_context(locked(data))
-        check(settings.database_path, settings.store_root)
         signals = stack.enter_context(_stop_signals())
         # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
-        listener = _listen(service.host, service.port)
+        listener = _listen(settings.host, settings.port)
         stack.callback(listener.close)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         coordinator = _Child(
@@ -152,6 +154,7 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
             _coordinator_command(settings, listener.fileno()),
             data / "logs" / "coordinator.log",
             (lock, listener.fileno()),
+            None if settings.database is None else settings.database.get_secret_value(),
         )
         dispatcher = _Child("dispatcher", _dispatcher_command(service, settings), data / "logs" / "dispatcher.log")
         children = [coordinator, dispatcher]
@@ -177,15 +180,6 @@ def print_line(stream: IO[str], message: str) -> None:
     """Write a line at once."""
     stream.write(f"{time.strftime('%H:%M:%S')} {message}\n")
     stream.flush()
-
-
-def _settings(service: LocalService, data: Path) -> Settings:
-    try:
-        return Settings(data=data, host=service.host, port=service.port, **service.doors)
-    except ValidationError as error:
-        raise SupervisorError(
-            "; ".join(item["msg"].removeprefix("Value error, ") for item in error.errors())
-        ) from error
 
 
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:

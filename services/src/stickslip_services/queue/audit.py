@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, case, func, select
 from stickslip_schemas.states import JobState, Stage, TaskState
 
 from stickslip_services.database.tables import (
@@ -64,7 +64,7 @@ def _task_faults(connection: Connection) -> list[str]:
 def _dependency_faults(connection: Connection) -> list[str]:
     needed = tasks.alias()
     settled = (TaskState.succeeded, TaskState.rejected)
-    unsettled = func.sum(func.iif(needed.c.state.in_(settled), 0, 1))
+    unsettled = func.sum(case((needed.c.state.in_(settled), 0), else_=1))
     rows = connection.execute(
         select(tasks.c.seq, tasks.c.waiting_on, unsettled)
         .join(task_dependencies, task_dependencies.c.task == tasks.c.seq)

@@ -6,7 +6,7 @@ What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 from sqlalchemy import Connection
 from stickslip_schemas.certificate import CertificateUpload
@@ -31,9 +31,10 @@ from stickslip_schemas.worker_api import (
 from stickslip_services.catalog.certificates import insert_certificate, store_certificate
 from stickslip_services.catalog.textures import check_textures
 from stickslip_services.catalog.versions import ManifestSummary, check_output, damaged_files, read_version
-from stickslip_services.clock import Clock, steady_clock
+from stickslip_services.clock import Clock
 from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
+from stickslip_services.database.opening import connect
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.keys import admit_local_worker
 from stickslip_services.queue.bell import Bell
@@ -93,17 +94,20 @@ class Coordinator:
     """The queue, the store's index and the clock."""
 
     settings: Settings
-    clock: Clock = field(default_factory=steady_clock)
+    given_clock: InitVar[Clock | None] = None
+    """Another clock than the database's, for tests."""
     bell: Bell = field(default_factory=Bell)
     database: Database = field(init=False)
+    clock: Clock = field(init=False)
     store: Store = field(init=False)
     store_watch: StoreWatch = field(init=False)
     eta_watch: EtaWatch = field(init=False, default_factory=EtaWatch)
     _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
     """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
 
-    def __post_init__(self) -> None:
-        self.database = Database(self.settings.database_path, durable=self.settings.durable)
+    def __post_init__(self, given_clock: Clock | None) -> None:
+        self.database = connect(self.settings)
+        self.clock = given_clock or self.database.clock
         self.store = Store(self.settings.store_root)
         self.store_watch = StoreWatch(
             self.settings.store_root,
@@ -117,7 +121,8 @@ class Coordinator:
         with self.database.write() as connection:
             migrate.upgrade(connection)
             admit_local_worker(connection, self.settings.worker_key_path, self.clock())
-            renew_all_leases(connection, self.clock(), self.settings)
+            if self.database.is_alone(connection):  # nobody could take a heartbeat
+                renew_all_leases(connection, self.clock(), self.settings)
         self.plan_waiting_jobs()
 
     def close(self) -> None:
@@ -237,13 +242,11 @@ class Coordinator:
         """Lease tasks to a worker."""
         wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
         with self.database.read() as connection:
-            worker = find_worker(connection, request.worker_id)
+            worker = _unsuperseded(connection, request.worker_id)
             due = is_sweep_due(connection, self.clock())
             ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
             waiting = ready or has_runnable_job(connection)
         self._note_seen(worker)
-        if worker.superseded:
-            raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
         if due:
             self._take_back()
         if self.store_watch.trouble:
@@ -251,7 +254,7 @@ class Coordinator:
         if not (ready or due):
             return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
         with self._book() as book:
-            worker = find_worker(book.connection, worker.id)
+            worker = _unsuperseded(book.connection, worker.id)
             leases = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
@@ -432,3 +435,11 @@ class Coordinator:
             with self.database.write() as connection:
                 note_stranded(connection, self.clock(), self.settings)
             self.bell.ring()
+
+
+def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
+    """Return a worker; raise UnknownWorkerError, or ConflictError where it has been started anew."""
+    worker = find_worker(connection, worker_id)
+    if worker.superseded:
+        raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
+    return worker

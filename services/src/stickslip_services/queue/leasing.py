@@ -71,7 +71,6 @@ _READY_TASKS = Prepared(
     .where(*_OF_GROUP, tasks.c.job == bindparam("b_job"))
     .order_by(tasks.c.seq)
     .limit(bindparam("b_count"))
-    .with_for_update(skip_locked=True)  # SQLite has no such thing and needs none: the writer is alone
 )
 _JOBS_WITH_PENDING = Prepared(
     select(

@@ -33,10 +33,7 @@ class SolverSettings:
     """Residual over right-hand side at which GMRES stops, below 1."""
 
     refactor_after: int = 10
-    """GMRES iterations that a stale factor may cost beyond those with a fresh one before it is made anew."""
-
-    flips_max: int = 4
-    """Contacts that may change between open, stick and slip before the factor is made anew."""
+    """GMRES iterations that a stale factor may cost beyond those with a fresh one before all of it is made anew."""
 
     patience: int = 10
     """Iterations of Newton's method after which a step is halved rather than pursued, 1 ... 1000."""
@@ -70,7 +67,6 @@ class SolverSettings:
             ("newton_max", 1, 1000),
             ("krylov_max", 1, 40),
             ("refactor_after", 0, 10_000),
-            ("flips_max", 0, 1_000_000),
             ("patience", 1, 1000),
             ("halvings_max", 0, 20),
         ):

@@ -132,7 +132,6 @@ class Cloth:
             krylov_max=preset.krylov_max,
             krylov_tolerance=preset.krylov_tolerance,
             refactor_after=preset.refactor_after,
-            flips_max=preset.flips_max,
             patience=preset.patience,
             halvings_max=preset.halvings_max,
             step_error=preset.step_error or 1.0,
@@ -144,7 +143,9 @@ class Cloth:
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
-        self.newton = self.krylov = self.factorizations = self.flips = self.halvings = 0
+        self.newton = self.krylov = self.flips = self.halvings = 0
+        self.factorizations = 0.0
+        """Whole ones, and shares of those in part."""
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     @property

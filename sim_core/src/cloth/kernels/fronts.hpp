@@ -85,6 +85,7 @@ inline void add_update(const Factor& factor, int child, const FrontSize& size, b
 void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagonal& diagonal) {
   const FlushTiny flush;
   for (int front = 0; front < factor.fronts; ++front) {
+    if (!factor.due[front]) continue;
     const FrontSize size(factor, front);
     float* panel = factor.panel;
     const long ldu = size.other_rows;

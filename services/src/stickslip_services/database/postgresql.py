@@ -1,0 +1,153 @@
+"""PostgreSQL: one database for any number of coordinators.
+
+Writers exclude each other by one advisory lock, as they do on SQLite: the queue's rules never see a half-done change
+of another coordinator, and a thousand cores need no more than one writer at a time can do. The statement that takes
+the lock also reads the database's clock and announces the change to the other coordinators; PostgreSQL delivers that
+with the commit.
+"""
+
+import asyncio
+import logging
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import psycopg
+from psycopg.types.string import StrDumper
+from sqlalchemy import URL, Connection, create_engine, event
+
+from stickslip_services.database.database import Database, Role
+from stickslip_services.errors import DatabaseRefusedError
+
+logger = logging.getLogger(__name__)
+
+_LOCKS = 0x736C6970
+"""First of the two numbers of our advisory locks: "slip". The second is 1 of whoever writes, 2 of whoever is there."""
+
+_CHANNEL = "stickslip"
+
+_CONNECT = {
+    "application_name": "stickslip",
+    "client_encoding": "utf8",
+    "connect_timeout": 10,
+    # A coordinator whose machine is gone, or a server that is, is noticed within a minute.
+    "keepalives_idle": 30,
+    "keepalives_interval": 10,
+    "keepalives_count": 3,
+}
+
+_WRITER_SETTINGS = (
+    "lock_timeout = '30s'",
+    # Who stops in the middle of a write (a stopped process, a lost network) does not hold up the others for ever.
+    "idle_in_transaction_session_timeout = '60s'",
+    "tcp_keepalives_idle = 30",
+    "tcp_keepalives_interval = 10",
+    "tcp_keepalives_count = 3",
+)
+
+_BEGIN = (
+    f"SELECT pg_advisory_xact_lock({_LOCKS}, 1), pg_notify('{_CHANNEL}', %s), "
+    "CAST(extract(epoch FROM clock_timestamp()) AS double precision)"
+)
+_ENTER = {
+    Role.coordinator: f"SELECT pg_try_advisory_lock_shared({_LOCKS}, 2)",
+    Role.upkeep: f"SELECT pg_try_advisory_lock({_LOCKS}, 2)",
+    Role.visitor: "SELECT true",
+}
+_REFUSALS = {
+    Role.coordinator: "`stickslip rm`, `gc` or `reindex` is at work on the database {}: wait until it has ended",
+    Role.upkeep: "the database {} is in use by a coordinator, or by another `stickslip rm`, `gc` or `reindex`: "
+    "stop it first",
+}
+_OTHERS = (
+    f"SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid = {_LOCKS} AND objid = 2 AND objsubid = 2 "
+    "AND pid != pg_backend_pid() AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+)
+
+
+class PostgresqlDatabase(Database):
+    """Transactions on one PostgreSQL database.
+
+    Reads see one state (REPEATABLE READ). Writes go through one connection, which also holds the lock that tells that
+    this coordinator is there. Raises DatabaseRefusedError where the role cannot be had, with the first write.
+    """
+
+    def __init__(self, url: URL, *, durable: bool = True, role: Role = Role.coordinator) -> None:
+        self._name = url.set(drivername="postgresql", query={}).render_as_string(hide_password=True)
+        self._token = secrets.token_hex(8)
+        """Tells this process's announcements from those of others."""
+        self._role = role
+        self._durable = durable
+        given = {name: value for name, value in _CONNECT.items() if name not in url.query}
+        # 32 readers and the writer: three coordinators fit into the 100 connections that a server has by default.
+        reader = create_engine(url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=24)
+        writer = create_engine(url, paramstyle="format", connect_args=given, pool_size=1, max_overflow=0)
+        self._arguments: dict[str, Any] = {**writer.dialect.create_connect_args(url)[1], **given}
+        event.listen(reader, "connect", _prepare_reader)
+        event.listen(writer, "connect", self._prepare_writer)
+        event.listen(writer, "close", _leave)
+        super().__init__(reader, writer)
+
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
+        """Open a transaction that is alone in writing; it is durable when the block has been left."""
+        with self._writing, self._writer.begin() as connection:
+            _, _, now = connection.exec_driver_sql(_BEGIN, (self._token,)).one()
+            # Leases are granted, renewed and taken back in writes: all coordinators do it by the same clock.
+            self._ahead = now - time.monotonic()
+            yield connection
+
+    def is_alone(self, connection: Connection) -> bool:
+        """Tell, in a write, whether no other coordinator uses the database."""
+        return not connection.exec_driver_sql(_OTHERS).scalar_one()
+
+    async def listen(self, ring: Callable[[], None]) -> None:
+        """Call `ring` whenever another coordinator has written, until cancelled."""
+        while True:
+            try:
+                connection = await psycopg.AsyncConnection.connect(**self._arguments, autocommit=True)
+                async with connection:
+                    await connection.execute(f"LISTEN {_CHANNEL}")
+                    ring()  # for what was announced while nobody listened
+                    async for notice in connection.notifies():
+                        if notice.payload != self._token:
+                            ring()
+            except psycopg.Error as error:
+                logger.warning("no news of other coordinators from %s: %s", self._name, error)
+                await asyncio.sleep(1.0)
+
+    def _prepare_writer(self, connection: Any, _record: Any) -> None:
+        _prepare(connection)
+        for setting in _WRITER_SETTINGS:
+            connection.execute(f"SET {setting}")
+        if not self._durable:
+            connection.execute("SET synchronous_commit = off")
+        (entered,) = connection.execute(_ENTER[self._role]).fetchone()
+        connection.commit()
+        if not entered:
+            raise DatabaseRefusedError(_REFUSALS[self._role].format(self._name))
+
+
+def _leave(connection: Any, _record: Any) -> None:
+    """Let the locks go at once: the server ends a session only some time after its connection has."""
+    with suppress(psycopg.Error):
+        connection.execute("SELECT pg_advisory_unlock_all()")
+
+
+def _prepare_reader(connection: Any, _record: Any) -> None:
+    _prepare(connection)
+    connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
+    connection.read_only = True
+
+
+def _prepare(connection: Any) -> None:
+    connection.adapters.register_dumper(str, _TextDumper)
+
+
+class _TextDumper(StrDumper):
+    """Text as PostgreSQL can keep it: it has no character 0, which messages of workers and paths of URLs may bring."""
+
+    def dump(self, obj: str) -> Any:
+        return super().dump(obj.replace("\0", "\N{REPLACEMENT CHARACTER}"))

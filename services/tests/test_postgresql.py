@@ -1,0 +1,435 @@
+"""Several coordinators on one PostgreSQL database, and what they are refused."""
+
+import asyncio
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import httpx
+import pytest
+from httpx_sse import connect_sse
+from sqlalchemy import func, select, text
+from sqlalchemy.exc import OperationalError
+from stickslip_schemas.states import JobState
+from stickslip_schemas.store import Store
+from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.cli import app
+from stickslip_services.coordinator import main, reindex
+from stickslip_services.database.database import Role
+from stickslip_services.database.opening import check, connect, opened
+from stickslip_services.database.tables import dataset_versions, tasks
+from stickslip_services.errors import DatabaseRefusedError, SettingsError
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.settings import Settings
+from stickslip_services.testing import (
+    HttpApi,
+    ManualClock,
+    PretendWorker,
+    RunningServer,
+    failure,
+    list_datasets,
+    list_jobs,
+    parsed,
+    rods,
+    show_job,
+    start_server,
+    wait_until,
+)
+from typer.testing import CliRunner
+
+if TYPE_CHECKING:
+    from stickslip_services.testing_postgresql import PostgresqlServer
+
+
+@pytest.fixture
+def settings(tmp_path: Path, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch) -> Settings:
+    """Settings with a database on PostgreSQL, which processes find in their environment."""
+    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.clean())
+    return Settings(data=tmp_path / "data", durable=False)
+
+
+def one_more(settings: Settings, name: str) -> Settings:
+    """Return the settings of another coordinator with the same database and the same store."""
+    return settings.model_copy(update={"data": settings.data.parent / name, "store_path": settings.store_root})
+
+
+@dataclass
+class Pair:
+    """Two coordinators as processes of their own, with one database and one store."""
+
+    settings: Settings
+    servers: tuple[RunningServer, RunningServer]
+    client: httpx.Client
+
+    def worker(self, which: int, name: str) -> PretendWorker:
+        server = self.servers[which]
+        api = HttpApi(server.url, (server.data / "worker-key").read_text().strip(), self.client.post)
+        return PretendWorker(api, Store(self.settings.store_root), name=name).register()
+
+    def submit(self, which: int, **spec: object) -> str:
+        response = self.client.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec))
+        response.raise_for_status()
+        return str(response.json()["id"])
+
+
+@pytest.fixture
+def pair(settings: Settings) -> Iterator[Pair]:
+    def start(name: str) -> RunningServer:
+        server = start_server(settings.data.parent / name, options=("--store", str(settings.store_root)))
+        stack.callback(server.stop)
+        return server
+
+    with ExitStack() as stack:
+        client = stack.enter_context(httpx.Client(trust_env=False, timeout=60))
+        yield Pair(settings, (start("a"), start("b")), client)
+
+
+def test_two_coordinators_share_the_work(pair: Pair) -> None:
+    workers = [pair.worker(number % 2, f"w{number}") for number in range(4)]
+    specs = [{"gamma": [1.0 + number, 2.0 + number, 3.0 + number]} for number in range(4)]  # they share tasks
+    jobs: list[str] = []
+    is_over = threading.Event()
+
+    def submit_all(which: int) -> None:
+        jobs.extend(pair.submit(which, **spec) for spec in specs)
+
+    def work(worker: PretendWorker) -> None:
+        while not is_over.wait(0.1):
+            if leases := worker.lease(simulate=3, render=3, pack=1, publish=1):
+                worker.finish(*leases)
+
+    def states() -> set[str]:
+        return {job["state"] for job in pair.client.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]}
+
+    threads = [threading.Thread(target=submit_all, args=(which,)) for which in range(2)]
+    threads += [threading.Thread(target=work, args=(worker,)) for worker in workers]
+    for thread in threads:
+        thread.start()
+    try:
+        wait_until(lambda: len(jobs) == 2 * len(specs) and states() == {"succeeded"}, seconds=240)
+    finally:
+        is_over.set()
+        for thread in threads:
+            thread.join()
+    database = connect(pair.settings, Role.visitor)
+    with database.read() as connection:
+        assert audit(connection) == []
+        count = connection.scalar(select(func.count()).select_from(tasks))
+        attempts = set(connection.scalars(select(tasks.c.attempts)))
+    database.close()
+    ran = Counter(name for worker in workers for name in worker.ran)
+    assert (len(ran), set(ran.values()), attempts) == (count, {1}, {1})
+    assert sum(bool(worker.ran) for worker in workers) > 1
+    for server in pair.servers:
+        listed = pair.client.get(f"{server.url}/v1/jobs").json()["items"]
+        assert {job["id"] for job in listed} == set(jobs)
+        assert {job["state"] for job in listed} == {"succeeded"}
+
+
+def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
+    one, other = (server.url for server in pair.servers)
+    job = pair.submit(0)
+    heard: list[tuple[str, float]] = []
+    with (
+        httpx.Client(base_url=other, timeout=20) as client,
+        connect_sse(client, "GET", f"/v1/jobs/{job}/events") as source,
+    ):
+        for event in source.iter_sse():
+            if event.event != "job.state":
+                continue
+            heard.append((json.loads(event.data)["state"], time.monotonic()))
+            if len(heard) == 1:
+                time.sleep(2.5)  # now the stream waits for the bell: by itself it looks again after 15 s
+                asked = time.monotonic()
+                pair.client.post(f"{one}/v1/jobs/{job}:cancel").raise_for_status()
+    assert [state for state, _ in heard][-1] == "cancelled"
+    assert heard[-1][1] - asked < 6.0
+
+
+def test_leases_are_renewed_at_start_only_if_nobody_was_there(settings: Settings, clock: ManualClock) -> None:
+    first = Coordinator(settings, clock)
+    first.start()
+    worker = PretendWorker(first, first.store).register()
+    first.submit(parsed(rods()), None)
+    (lease,) = worker.lease(simulate=1)
+
+    def expires_at() -> float:
+        with first.database.read() as connection:
+            return float(connection.scalar(select(tasks.c.expires_at).where(tasks.c.owner.is_not(None))) or 0.0)
+
+    leased_until = expires_at()
+    clock.advance(10.0)
+    second = Coordinator(one_more(settings, "second"), clock)
+    second.start()
+    assert expires_at() == leased_until
+    first.close()
+    second.close()
+    third = Coordinator(settings, clock)
+    third.start()
+    assert expires_at() == leased_until + 10.0
+    worker.api = third
+    assert worker.finish(lease) == ["accepted"]
+    first.close()
+    third.close()
+
+
+def test_upkeep_has_the_database_for_itself(settings: Settings) -> None:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    with pytest.raises(DatabaseRefusedError, match="is in use by a coordinator"), opened(settings, Role.upkeep):
+        pass
+    with opened(settings, Role.visitor):
+        pass
+    coordinator.close()
+    with opened(settings, Role.upkeep):
+        with pytest.raises(DatabaseRefusedError, match=r"is at work on the database postgresql.*wait until"):
+            check(settings, Role.coordinator)
+        with pytest.raises(DatabaseRefusedError, match="is in use by"):
+            check(settings, Role.upkeep)
+    check(settings, Role.coordinator)
+
+
+def test_a_coordinator_goes_on_after_the_server_has_closed_its_connections(
+    settings: Settings, postgresql: "PostgresqlServer"
+) -> None:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = coordinator.submit(parsed(rods()), None)
+    postgresql.execute(
+        "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+        "WHERE application_name = 'stickslip' AND backend_type = 'client backend'"
+    )
+    for _ in range(4):  # each broken connection costs one request at most
+        try:
+            worker.work()
+            break
+        except OperationalError:
+            pass
+    assert show_job(coordinator, job.id).state is JobState.succeeded  # type: ignore[union-attr]
+    with pytest.raises(DatabaseRefusedError), opened(settings, Role.upkeep):  # it is known to be there again
+        pass
+    coordinator.close()
+
+
+def test_the_clock_is_that_of_the_database(settings: Settings) -> None:
+    first, second = connect(settings), connect(settings)
+    with first.write() as connection:
+        now = float(connection.scalar(text("SELECT extract(epoch FROM clock_timestamp())")) or 0.0)
+        assert first.clock() == pytest.approx(now, abs=0.2)
+        seen: list[float] = []
+
+        def wait_for_the_lock() -> None:
+            with second.write():
+                seen.append(second.clock())
+
+        thread = threading.Thread(target=wait_for_the_lock)
+        thread.start()
+        time.sleep(1.0)
+        assert not seen  # writers exclude each other across coordinators
+        left_at = first.clock()
+    thread.join()
+    assert seen[0] > left_at - 0.01  # read after the wait, not before
+    first.close()
+    second.close()
+
+
+def test_a_connection_that_is_in_use_is_closed_when_it_is_returned(settings: Settings) -> None:
+    database = connect(settings)
+    with database.read() as connection:
+        raw = connection.connection.dbapi_connection
+        database.close()
+        assert connection.scalar(text("SELECT 1")) == 1
+    assert raw is not None
+    assert raw.closed
+
+
+def test_reads_see_one_state(settings: Settings) -> None:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    with coordinator.database.read() as connection:
+        before = connection.scalar(text("SELECT count(*) FROM jobs"))
+        coordinator.submit(parsed(rods()), None)
+        assert connection.scalar(text("SELECT count(*) FROM jobs")) == before
+        with pytest.raises(Exception, match="read-only"):
+            connection.execute(text("DELETE FROM jobs"))
+    assert len(list_jobs(coordinator)) == 1
+    coordinator.close()
+
+
+def test_what_was_rolled_back_is_not_announced(settings: Settings) -> None:
+    database = connect(settings)
+    other = connect(settings)
+    rung: list[float] = []
+
+    async def listen() -> None:
+        task = asyncio.create_task(other.listen(lambda: rung.append(time.monotonic())))
+        await _until(lambda: len(rung) == 1)  # it listens
+        for fails in (True, False):
+            try:
+                with database.write():
+                    if fails:
+                        raise RuntimeError
+            except RuntimeError:
+                await asyncio.sleep(0.5)
+                assert len(rung) == 1
+        await _until(lambda: len(rung) == 2)
+        with other.write():
+            pass
+        await asyncio.sleep(0.5)
+        assert len(rung) == 2  # one's own words are no news
+        task.cancel()
+
+    asyncio.run(listen())
+    database.close()
+    other.close()
+
+
+async def _until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come to pass"
+        await asyncio.sleep(0.02)
+
+
+def test_numbers_may_have_64_bits(settings: Settings) -> None:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    with coordinator.database.write() as connection:
+        for table in ("jobs", "workers", "datasets", "certificates", "api_keys"):
+            connection.execute(text(f"SELECT setval('{table}_seq_seq', 3000000000)"))
+        connection.execute(text("SELECT setval('events_id_seq', 3000000000)"))
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = coordinator.submit(parsed(rods()), None)
+    worker.work()
+    assert show_job(coordinator, job.id).state is JobState.succeeded  # type: ignore[union-attr]
+    with coordinator.database.write() as connection:
+        connection.execute(text(f"UPDATE dataset_versions SET bytes = {2**40}"))
+    with coordinator.database.read() as connection:
+        assert connection.scalar(select(dataset_versions.c.bytes)) == 2**40
+        assert audit(connection) == []
+    coordinator.close()
+
+
+def test_texts_may_have_any_character(settings: Settings) -> None:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    coordinator.submit(parsed(rods()), None)
+    (lease,) = worker.lease(simulate=1)
+    assert worker.report((lease, failure(message="nul \0 and \N{SNOWMAN}"))) == ["accepted"]
+    with coordinator.database.read() as connection:
+        assert (
+            connection.scalar(select(tasks.c.message).where(tasks.c.tries == 1))
+            == "nul \N{REPLACEMENT CHARACTER} and \N{SNOWMAN}"
+        )
+    coordinator.close()
+
+
+def test_a_lost_database_is_built_again(settings: Settings, postgresql: "PostgresqlServer") -> None:
+    coordinator = Coordinator(settings)
+    coordinator.start()
+    PretendWorker(coordinator, coordinator.store).register()
+    coordinator.submit(parsed(rods()), None)
+    PretendWorker(coordinator, coordinator.store).register().work()
+    known = list_datasets(coordinator)
+    coordinator.close()
+    lost = Settings.chosen(data=settings.data, durable=False, database=postgresql.empty())
+    with pytest.raises(DatabaseRefusedError, match=r"is gone: run `stickslip reindex .*` with the same --database"):
+        check(lost, Role.coordinator, with_store=True)
+    assert reindex(lost) == 0
+    again = Coordinator(lost)
+    again.start()
+    (found,) = list_datasets(again)
+    assert (found.id, found.versions[0].manifest) == (known[0].id, known[0].versions[0].manifest)
+    again.close()
+
+
+def test_nothing_is_deleted_by_an_empty_database(
+    settings: Settings, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    artifact = Store(settings.store_root).publish(b"of a job that runs")
+    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.empty())
+    arguments = ["gc", "--data", str(settings.data), "--older-than", "0", "--delete"]
+    result = CliRunner().invoke(app, arguments)
+    assert (result.exit_code, "does not exist or is empty: name the --database" in result.stderr) == (1, True)
+    assert Store(settings.store_root).path(artifact).exists()
+
+
+def test_a_data_directory_with_another_database_is_refused(settings: Settings) -> None:
+    with opened(settings.model_copy(update={"database": None}), Role.upkeep):
+        pass
+    with pytest.raises(DatabaseRefusedError, match=r"coordinator\.sqlite3 holds another one: move that file away"):
+        check(settings, Role.coordinator)
+
+
+def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Path) -> None:
+    def refusal(url: str) -> str:
+        with pytest.raises(DatabaseRefusedError) as raised:
+            check(Settings.chosen(data=tmp_path, database=url), Role.coordinator)
+        assert "secret" not in str(raised.value)
+        assert "\n" not in str(raised.value)
+        return str(raised.value)
+
+    newer = postgresql.empty()
+    with opened(Settings.chosen(data=tmp_path, database=newer), Role.upkeep):
+        pass
+    postgresql.execute("UPDATE alembic_version SET version_num = '9042'", newer.partition("?")[0].rpartition("/")[2])
+    assert "was made by a newer stickslip (schema 9042" in refusal(newer)
+    others = postgresql.empty()
+    postgresql.execute("CREATE TABLE birds (name text)", others.partition("?")[0].rpartition("/")[2])
+    assert "is not a database of stickslip: give it one of its own" in refusal(others)
+    postgresql.execute("CREATE DATABASE latin ENCODING latin1 LOCALE 'C' TEMPLATE template0")
+    assert "must be UTF8, and is LATIN1" in refusal(postgresql.url("latin"))
+    missing = refusal(postgresql.url("nowhere").replace("stickslip@", "stickslip:secret@"))
+    assert "postgresql://stickslip:***@/nowhere cannot be opened" in missing
+    assert 'database "nowhere" does not exist' in missing
+    assert "cannot be opened: invalid" in refusal(postgresql.url("postgres") + "&colour=red")
+    postgresql.execute("CREATE ROLE guest LOGIN")
+    guest = postgresql.empty().replace("stickslip@", "guest@")
+    assert "its user may not make tables in the database postgresql://guest@/" in refusal(guest)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        ("mysql://me:secret@host/x", "'mysql://me:***@host/x'"),
+        ("postgresql+asyncpg://me:sec?ret@host/x", "'postgresql+asyncpg://me:***@host/x'"),
+        ("postgresql://me@host", "'postgresql://me@host'"),
+        ("sqlite:///file?password=secret", "'sqlite:///file'"),
+        ("me:secret@host", "something else, which is not shown because it may hold a password"),
+        ("coordinator.sqlite3", "'coordinator.sqlite3'"),
+        ("", "''"),
+    ],
+)
+def test_other_databases_are_refused_without_their_password(
+    value: str, shown: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rule = "database must be a URL of the form postgresql://USER@HOST/NAME, and is "
+    with pytest.raises(SettingsError) as raised:
+        Settings.chosen(data=tmp_path, database=value)
+    assert str(raised.value) == rule + shown
+    assert main(["--data", str(tmp_path), "--database", value]) == 2
+    assert capsys.readouterr().err == f"error: {rule}{shown}\n"
+    result = CliRunner().invoke(app, ["up", "--data", str(tmp_path), "--database", value])
+    assert result.exit_code != 0
+    assert rule + shown in result.stderr
+
+
+def test_a_password_is_not_shown(tmp_path: Path) -> None:
+    settings = Settings.chosen(data=tmp_path, database="postgresql://me:s3cret@host/name?sslpassword=s3cret")
+    assert "s3cret" not in f"{settings!r} {settings} {settings.model_dump_json()}"
+    assert settings.database_name == "postgresql://me:***@host/name"
+
+
+def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stickslip_services.database.opening.find_spec", lambda _name: None)
+    with pytest.raises(DatabaseRefusedError, match=r"pip install 'stickslip-services\[server,postgresql\]'"):
+        connect(Settings.chosen(data=tmp_path, database="postgresql://me@host/name"))
