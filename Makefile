@@ -16,7 +16,8 @@ RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
 # rod_families.py is imported, cloth_grid.py takes half an hour, and the last two need what others write, or train.
 # render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py cloth_grid.py curvature_methods.py \
-  natural_from_pictures.py render_cloth.py render_trajectory.py),$(wildcard benchmarks/*.py))
+  natural_from_pictures.py clip_codecs.py render_cloth.py render_memory.py render_peers.py render_sheets.py \
+  render_silhouettes.py render_trajectory.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
 
 .PHONY: setup demo test test-parts test-service test-whole test-blender check docs bench constraints clean

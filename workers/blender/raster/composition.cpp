@@ -56,8 +56,8 @@ void settle(const std::uint16_t* exact, int width, std::uint8_t* row) {
       }
     }
     for (int k = 0; k < 3; ++k)
-      out[k] = k > 0 && is_near(here[k], out[k - 1]) ? out[k - 1]
-                                                     : static_cast<std::uint8_t>((here[k] + fine / 2) / fine);
+      out[k] =
+          k > 0 && is_near(here[k], out[k - 1]) ? out[k - 1] : static_cast<std::uint8_t>((here[k] + fine / 2) / fine);
     ++column;
   }
 }

@@ -38,7 +38,8 @@ constexpr int tolerance = 1;
 // Pixels in a row that have to be near the pixel before them to take it over.
 constexpr int shortest_run = 3;
 
-// Write linear light (height x width x 3) as an 8-bit sRGB picture of few different pixels, which is smaller when coded.
+// Write linear light (height x width x 3) as an 8-bit sRGB picture of few different pixels, which is smaller when
+// coded.
 //
 // In each row, from left to right: where the pixel to the left is within `tolerance` of the exact values of
 // `shortest_run` pixels or more, or of all that are left of the row, they take it over. Otherwise red is rounded, and
