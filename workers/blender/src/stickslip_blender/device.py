@@ -36,12 +36,9 @@ def use_device(scene: Any) -> None:
 
     To be called after factory settings were read: they forget the devices.
     """
-    if device() == CPU:
-        scene.cycles.device = "CPU"
-        return
-    for found in _found():
-        found.use = True
-    scene.cycles.device = "GPU"
+    if device() != CPU:
+        _found()
+    scene.cycles.device = "CPU" if device() == CPU else "GPU"
 
 
 def described() -> dict[str, Any]:
@@ -52,7 +49,7 @@ def described() -> dict[str, Any]:
 
 
 def _found() -> list[Any]:
-    """Return Cycles' devices of the sort that is asked for; all others are switched off."""
+    """Return Cycles' devices of the sort that is asked for, and switch them on and all others off."""
     preferences = import_bpy().context.preferences.addons["cycles"].preferences
     sort = device().upper()
     try:
@@ -60,8 +57,8 @@ def _found() -> list[Any]:
     except TypeError as error:  # of an enumeration that does not have it
         raise NoDeviceError(f"{VARIABLE} is {device()!r}, and this Blender cannot use such devices: {error}") from error
     preferences.refresh_devices()
-    for other in preferences.devices:
-        other.use = False
+    for each in preferences.devices:
+        each.use = each.type == sort
     found = [each for each in preferences.devices if each.type == sort]
     if not found:
         raise NoDeviceError(
