@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +112,12 @@ class Clips:
             self.landed[chosen],
             self.run[chosen],
         )
+
+    @staticmethod
+    def joined(parts: "Sequence[Clips]") -> "Clips":
+        """Return the clips of all parts."""
+        columns = [[getattr(part, field.name) for part in parts] for field in fields(Clips)]
+        return Clips(*(torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each) for each in columns))
 
     def truth(self) -> Truth:
         """Return what is true of the clips, as scores ask for it."""
