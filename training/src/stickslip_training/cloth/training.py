@@ -70,6 +70,8 @@ class ClothTraining:
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    instants: tuple[int, ...] = INSTANTS
+    """Of the frames that the network sees, of 300."""
     seed: int = 0
     width: int = 96
     threads: int = 1
@@ -219,7 +221,7 @@ def train_friction(
         seen = learner.validation
         found = features(net, seen)
         temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
-        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
+        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
         familiarity = Familiarity.of(features(net, known), known.material, found, len(train.materials))
     card = {
         "settings": asdict(settings),
@@ -232,7 +234,7 @@ def train_friction(
         "history": [asdict(report) for report in fitted.history],
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
     }
-    instants = frames_at(train.instants)[1]
+    instants = frames_at(train.instants, settings.instants)[1]
     return FrictionModel((net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card)
 
 
@@ -320,13 +322,14 @@ def render_clips(
     turn: tuple[float, float] = (0.0, 0.0),
     spread: float = 0.0,
     style: Callable[[Style], Style] | None = None,
+    wanted: tuple[int, ...] = INSTANTS,
 ) -> Clips:
-    """Render every run `renders` times, each with a look of its own, by the cameras in turn.
+    """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
 
     `turn` turns all cameras (about the vertical, up) [degree]; `spread` adds random turns of this deviation; `style`
     changes the looks that were drawn.
     """
-    frames, instants = frames_at(runs.instants)
+    frames, instants = frames_at(runs.instants, wanted)
     rig = training_cameras() if cameras is None else cameras
     number = np.repeat(np.arange(len(runs)), renders)
     crops, directions = [], []
@@ -380,7 +383,7 @@ class _FrictionLearner(Learner):
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
-        self.frames, self.instants = frames_at(train.instants)
+        self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
         self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
@@ -389,7 +392,9 @@ class _FrictionLearner(Learner):
         self.rig = training_cameras()
         self.clips = clips
         self.validation = (
-            render_clips(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
+            render_clips(validation, 6, settings.seed, spread=settings.turn, wanted=settings.instants)
+            if clips is None
+            else clips.validation
         )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
         with seeded(settings.seed):
