@@ -21,6 +21,7 @@ import numpy as np  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
 from stickslip_schemas.clips import shown_frames  # noqa: E402
 from stickslip_sim_core import build_info, drop_and_drag, fabric_names  # noqa: E402
+from stickslip_training.cloth.runs import STEP, write_packed  # noqa: E402
 
 SHOWN = 30  # frames of a clip
 FRAMES = 300  # of a simulation
@@ -63,7 +64,7 @@ def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int, fram
     instants = instants_of(frames)
     shown = scene.positions[instants] if scene.valid else np.zeros((len(instants), len(scene.rest), 3))
     return {
-        "positions": np.round(shown / 1e-5).astype(np.int16),
+        "positions": np.round(shown / STEP).astype(np.int16),
         "rest": scene.rest.astype(np.float32),
         "triangles": scene.triangles.astype(np.int16),
         "instants": np.array(instants, np.int16),
@@ -72,7 +73,7 @@ def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int, fram
 
 
 def pack(folder: Path, file: Path) -> None:
-    """Write the valid runs of a folder into one file; differences of consecutive instants are packed best."""
+    """Write the valid runs of a folder into one file."""
     runs = []
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as run:
@@ -81,17 +82,9 @@ def pack(folder: Path, file: Path) -> None:
     first = runs[0]
     if any(not np.array_equal(run[name], first[name]) for run in runs for name in ("triangles", "instants")):
         raise ValueError(f"the runs in {folder} must have one mesh and as many frames: pack a folder for each")
-    positions = np.stack([run["positions"] for run in runs])
-    differences = np.diff(positions, axis=1, prepend=np.int16(0))
-    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
-    np.savez_compressed(
-        file,
-        differences=np.moveaxis(bytes_apart, -1, 0),  # low bytes, high bytes, (2, runs, frames, vertices, 3)
-        rest=first["rest"],
-        triangles=first["triangles"],
-        instants=first["instants"],
-        about=np.array([str(run["about"]) for run in runs]),
-    )
+    positions = np.stack([run["positions"] for run in runs]) * STEP
+    about = [str(run["about"]) for run in runs]
+    write_packed(file, positions, first["rest"], first["triangles"], first["instants"], about)
     print(f"{file}: {len(runs)} runs, {file.stat().st_size / 1e6:.2f} MB")
 
 

@@ -20,7 +20,7 @@ import torch
 from stickslip_schemas.cameras import load_rig
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import predictions
-from stickslip_training.cloth.runs import load_runs
+from stickslip_training.cloth.runs import grid_order, load_runs, write_packed
 from stickslip_training.cloth.training import INSTANTS, RIG, WEIGHTS, Clips, FrictionModel, load_friction
 from stickslip_training.cloth.video import RATE, Calibration, VideoError, import_video, load_clip, save_clip
 from stickslip_training.testing import meshes_at, write_film
@@ -35,19 +35,12 @@ def meshes(runs_file: Path, out: Path, only: list[int]) -> None:
     runs = load_runs(runs_file)
     film = np.arange(0.0, START + INSTANTS[-1] / RATE + 1.0, 1 / FRAMES_A_SECOND) - START
     seconds = np.concatenate([film, np.array(INSTANTS) / RATE])
-    steps = [np.round(meshes_at(runs[np.array([run])], seconds) / 1e-5).astype(np.int16) for run in only]
-    positions = np.stack([each.reshape(len(seconds), -1, 3) for each in steps])
-    differences = np.diff(positions, axis=1, prepend=np.int16(0))
-    apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
+    positions = np.stack([meshes_at(runs[np.array([run])], seconds).reshape(len(seconds), -1, 3) for run in only])
     with np.load(runs_file) as file:
-        np.savez_compressed(
-            out,
-            differences=np.moveaxis(apart, -1, 0),
-            rest=file["rest"],
-            triangles=file["triangles"],
-            instants=np.arange(len(seconds), dtype=np.int16),
-            about=file["about"][only],
-        )
+        order = grid_order(file["rest"]).ravel()
+        about = [str(line) for line in file["about"][only]]
+        triangles = np.argsort(order)[file["triangles"]]
+        write_packed(out, positions, file["rest"][order], triangles, range(len(seconds)), about)
     print(f"{out}: {len(only)} runs, {len(film)} frames of a film and {len(INSTANTS)} of a clip each")
 
 
