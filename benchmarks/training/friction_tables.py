@@ -4,9 +4,9 @@
     python benchmarks/training/friction_tables.py measure MODEL CLIPS.npz ... --records FILE.jsonl
     python benchmarks/training/friction_tables.py draw FILE.jsonl
 
-`numbers` prints the numbers of the test runs of a packed file, for `blender_clips.py --only`. `measure` writes an answer
-for each clip to the file, and draws it. `draw` needs no model and no clip. It prints a row for each file of clips. Where
-viewpoints are turned it adds a row for each angle and for each viewpoint.
+`numbers` prints the numbers of the test runs of a packed file, for `blender_clips.py --only`. `measure` writes an
+answer for each clip to the file, and draws it. `draw` needs no model and no clip. It prints a row for each file of
+clips. Where viewpoints are turned it adds a row for each angle and for each viewpoint.
 """
 
 import argparse
