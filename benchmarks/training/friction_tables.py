@@ -1,12 +1,12 @@
 """How well a model measures friction from Blender's clips of simulations that it has not seen, set by set.
 
-    python benchmarks/training/friction_tables.py numbers RUNS.npz
+    python benchmarks/training/friction_tables.py numbers RUNS.npz [--split test]
     python benchmarks/training/friction_tables.py measure MODEL CLIPS.npz ... --records FILE.jsonl
-    python benchmarks/training/friction_tables.py draw FILE.jsonl
+    python benchmarks/training/friction_tables.py draw FILE.jsonl [--figure FILE.png]
 
-`numbers` prints the numbers of the test runs of a packed file, for `blender_clips.py --only`. `measure` writes an
+`numbers` prints the numbers of the runs of a split of a packed file, for `blender_clips.py --only`. `measure` writes an
 answer for each clip to the file, and draws it. `draw` needs no model and no clip. It prints a row for each file of
-clips. Where viewpoints are turned it adds a row for each angle and for each viewpoint.
+clips. Where viewpoints are turned it adds a row for each angle and for each viewpoint. The figure shows the first set.
 """
 
 import argparse
@@ -21,6 +21,8 @@ from stickslip_training.cloth.evaluation import Errors, errors, measure
 from stickslip_training.cloth.posterior import Estimates, estimates
 from stickslip_training.cloth.runs import load_runs, split_of_runs
 from stickslip_training.cloth.training import VIEWPOINTS, FrictionModel, load_friction
+
+SPLITS = ("train", "validation", "test")
 
 Record = dict[str, Any]
 
@@ -79,25 +81,58 @@ def draw(records: list[Record]) -> None:
             row(f"{name}, {view}", [r for r in own if r["viewpoint"] == view])
 
 
+def figure(records: list[Record], path: Path) -> None:
+    """Draw what was estimated for each clip of the first set over what is true, and errors over the true mu."""
+    import matplotlib.pyplot as plt
+
+    own = [record for record in records if record["set"] == records[0]["set"]]
+    mu, median, low, high = (np.array([record[key] for record in own]) for key in ("mu", "median", "low", "high"))
+    inside = (low <= mu) & (mu <= high)
+    canvas, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.4), constrained_layout=True)
+    left.plot([0, 1.6], [0, 1.6], color="0.7", linewidth=1)
+    for chosen, color, name in ((inside, "#2b6cb0", "holds the truth"), (~inside, "#c8102e", "does not")):
+        left.vlines(mu[chosen], low[chosen], high[chosen], color=color, alpha=0.25, linewidth=1)
+        left.plot(
+            mu[chosen], median[chosen], ".", color=color, markersize=3, label=f"80 % set {name} ({chosen.mean():.0%})"
+        )
+    left.set(xlabel="true friction coefficient", ylabel="estimated: median and 80 % set", xlim=(0, 1.6), ylim=(0, 1.6))
+    left.legend(frameon=False, fontsize=8)
+    for name in dict.fromkeys(record["set"] for record in records):
+        some = [record for record in records if record["set"] == name]
+        off = np.array([abs(record["median"] - record["mu"]) for record in some])
+        band = np.array([min(int(record["mu"] / 0.2), 7) for record in some])
+        right.plot(0.1 + 0.2 * np.arange(8), [off[band == each].mean() for each in range(8)], "o-", label=name)
+    right.set(xlabel="true friction coefficient", ylabel="mean error", xlim=(0, 1.6), ylim=(0, None))
+    right.legend(frameon=False, fontsize=8)
+    canvas.savefig(path, dpi=110)
+
+
 def main() -> None:
     """Print the numbers of the test runs, or the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     actions = parser.add_subparsers(dest="action", required=True)
-    actions.add_parser("numbers").add_argument("runs", type=Path)
+    numbered = actions.add_parser("numbers")
+    numbered.add_argument("runs", type=Path)
+    numbered.add_argument("--split", choices=SPLITS, default="test")
     asked = actions.add_parser("measure")
     asked.add_argument("model", type=Path)
     asked.add_argument("clips", type=Path, nargs="+")
     asked.add_argument("--records", type=Path, required=True)
-    actions.add_parser("draw").add_argument("records", type=Path)
+    drawn = actions.add_parser("draw")
+    drawn.add_argument("records", type=Path)
+    drawn.add_argument("--figure", type=Path)
     args = parser.parse_args()
     if args.action == "numbers":
-        print(*np.flatnonzero(split_of_runs(load_runs(args.runs), SHARES, 0) == 2))
+        print(*np.flatnonzero(split_of_runs(load_runs(args.runs), SHARES, 0) == SPLITS.index(args.split)))
         return
     if args.action == "measure":
         model = load_friction(args.model)
         told = [json.dumps(record) for path in args.clips for record in answers(path, model)]
         args.records.write_text("\n".join(told) + "\n")
-    draw([json.loads(line) for line in args.records.read_text().splitlines()])
+    records = [json.loads(line) for line in args.records.read_text().splitlines()]
+    draw(records)
+    if args.action == "draw" and args.figure is not None:
+        figure(records, args.figure)
 
 
 if __name__ == "__main__":
