@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.store import CorruptArtifactError, Store, write_durably
+from stickslip_schemas.store import CorruptArtifactError, Store, sync, write_durably
 
 
 def test_publish_and_read(tmp_path: Path) -> None:
@@ -69,3 +69,13 @@ def test_link_copies_where_it_cannot_link(tmp_path: Path, monkeypatch: pytest.Mo
     store = Store(tmp_path)
     store.link(store.publish(b"shard"), tmp_path / "datasets" / "file")
     assert (tmp_path / "datasets" / "file").read_bytes() == b"shard"
+
+
+def test_a_file_and_its_name_are_synced_before_a_write_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
+    write_durably(tmp_path / "file", b"data")
+    assert synced[0].name.startswith(".file.")
+    assert synced[1:] == [tmp_path]
+    sync(tmp_path / "file")
+    assert synced[2:] == [tmp_path / "file"]
