@@ -22,7 +22,7 @@ from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.manifest import SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.samples import samples
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.queue.audit import audit
 from stickslip_sim_core import solve_rods
@@ -111,7 +111,7 @@ def check_ledger(data: Path) -> None:
 
 def check_dataset(data: Path, reference: dict[str, Any], spec: dict[str, Any], builds: Builds) -> None:
     """Every slot holds its own sample, and every byte is what the manifest says."""
-    store = Store(data / "store")
+    store = DirectoryStore(data / "store")
     directory = store.dataset_path(reference["dataset"], reference["version"])
     text = (directory / "manifest.json").read_bytes()
     assert sha256(text) == reference["manifest"]

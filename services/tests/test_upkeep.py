@@ -12,7 +12,7 @@ import pytest
 from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.responses import JobDetail
 from stickslip_schemas.states import JobState
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
@@ -53,7 +53,7 @@ def made(settings: Settings) -> list[str]:
         assert dataset is not None
         ids.append(dataset.dataset)
     for file in unused(coordinator.database, coordinator.store, older_than=-1):
-        file.path.unlink()  # a pretended worker leaves something behind
+        coordinator.store.delete(file.name)  # a pretended worker leaves something behind
     coordinator.close()
     return ids
 
@@ -176,14 +176,14 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
     with opened(settings, Role.upkeep) as database:
-        found = reindex(database, Store(settings.store_root))
+        found = reindex(database, DirectoryStore(settings.store_root))
         assert sorted(version.is_new for version in found) == [False, True]
 
 
 def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[str]) -> None:
     _, datasets, coordinator = look(settings)
     coordinator.close()
-    coordinator.store.path(datasets[0].versions[0].manifest).unlink()
+    coordinator.store.delete(datasets[0].versions[0].manifest)
     before = artifacts(settings)
     result = run(settings, "gc", "--delete", "--older-than", 0)
     assert result.exit_code == 1
@@ -195,7 +195,7 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
     _, datasets, coordinator = look(settings)
     PretendWorker(coordinator, coordinator.store).register()
     (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
-    coordinator.store.path(version.manifest).unlink()  # so that a job makes it once more
+    coordinator.store.delete(version.manifest)  # so that a job makes it once more
     again = submitted(coordinator, (1.0, 2.0))
     coordinator.close()
     result = run(settings, "rm", f"{made[0]}:v1")

@@ -29,7 +29,7 @@ ran = set()
 def note(frame, event, argument):
     if event == "call" and frame.f_code.co_name != "<module>":
         ran.add(frame.f_code.co_filename)
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import task_adapter
 from stickslip_workers.stages.actor import StageActor
 actor = StageActor(sys.argv[2])
@@ -47,7 +47,7 @@ _IMPORT = """
 import sys
 import stickslip_workers.stages.actor, stickslip_workers.stages.pack, stickslip_workers.stages.publish
 import stickslip_workers.stages.simulate
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.kinds import kind, kind_names
 for name in kind_names():
     kind(name)

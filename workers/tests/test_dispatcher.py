@@ -14,7 +14,7 @@ from coordinator_double import CoordinatorDouble
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason, Stage
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_workers.cluster import Cluster
 from stickslip_workers.coordinator_client import SupersededError
@@ -61,7 +61,7 @@ Start = Callable[..., Running]
 
 
 @pytest.fixture
-def start(double: CoordinatorDouble, store: Store, cluster: Cluster) -> Iterator[Start]:
+def start(double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster) -> Iterator[Start]:
     """Start a dispatcher; it is stopped after the test."""
     store.root.mkdir()
     started: list[Running] = []
@@ -107,7 +107,7 @@ def _cloth() -> SimulateTask:
 HANG = fake_renderer.UNTIL_RELEASED
 
 
-def _wait_for_pid(double: CoordinatorDouble, store: Store, what: int) -> int:
+def _wait_for_pid(double: CoordinatorDouble, store: DirectoryStore, what: int) -> int:
     """Wait until the renderer is at work; heartbeats, which go on, are the clock."""
     path = store.root / f"pid-{what}"
     double.until(lambda: path.exists() and path.read_text() != "")
@@ -115,7 +115,7 @@ def _wait_for_pid(double: CoordinatorDouble, store: Store, what: int) -> int:
 
 
 def test_runs_what_it_is_given_and_says_who_it_is(
-    start: Start, double: CoordinatorDouble, store: Store, make_dataset: Callable[..., Any]
+    start: Start, double: CoordinatorDouble, store: DirectoryStore, make_dataset: Callable[..., Any]
 ) -> None:
     made = make_dataset(count=5, per_shard=4)
     start()
@@ -142,7 +142,9 @@ def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -
     assert double.results["fine"].outcome == "succeeded"
 
 
-def test_a_render_process_that_is_killed_costs_one_try(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_a_render_process_that_is_killed_costs_one_try(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start()
     double.offer(crash=_render(HANG), other=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
@@ -158,7 +160,7 @@ def test_a_render_process_that_is_killed_costs_one_try(start: Start, double: Coo
 
 
 def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
-    start: Start, double: CoordinatorDouble, store: Store
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
 ) -> None:
     start(slots=1)
     double.offer(first=_render(fake_renderer.FINE))
@@ -179,7 +181,7 @@ def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
     }
 
 
-def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(exec_seconds={**Settings(url="", store=store.root, name="x").exec_seconds, Stage.render: 0.5})
     double.offer(slow=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
@@ -190,7 +192,7 @@ def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, 
 
 
 def test_a_lease_has_a_limit_of_its_own_and_a_stopped_process_is_killed(
-    start: Start, double: CoordinatorDouble, store: Store
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
 ) -> None:
     start()
     double.limits["stopped"] = 1.5
@@ -210,7 +212,7 @@ def _is_gone(pid: int) -> bool:
         return True
 
 
-def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     """Two long tasks hold both slots; what was leased ahead goes back, and what is short runs at once."""
     start(clog_seconds=1.0)
     double.long |= {"one", "two", "three"}
@@ -249,7 +251,7 @@ def test_a_simulation_tells_how_far_it_is(start: Start, double: CoordinatorDoubl
     assert 0 < done <= frames == 300
 
 
-def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(slots=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1), third=_render(HANG + 2))
     _wait_for_pid(double, store, HANG)
@@ -260,7 +262,9 @@ def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorD
     assert double.started == {"running"}
 
 
-def test_dropped_tasks_are_left_alone_and_never_reported(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_dropped_tasks_are_left_alone_and_never_reported(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start(slots=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
@@ -272,7 +276,9 @@ def test_dropped_tasks_are_left_alone_and_never_reported(start: Start, double: C
     assert not (store.root / f"pid-{HANG + 1}").exists()
 
 
-def test_results_wait_for_a_coordinator_that_is_away(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_results_wait_for_a_coordinator_that_is_away(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start()
     double.offer(one=_render(HANG), two=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
@@ -288,7 +294,7 @@ def test_results_wait_for_a_coordinator_that_is_away(start: Start, double: Coord
     assert Path(f"/proc/{pid}").exists()  # no process was lost over it
 
 
-def test_a_forgotten_session_is_opened_again(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_a_forgotten_session_is_opened_again(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(slots=1)
     double.offer(lost=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
@@ -318,7 +324,7 @@ def test_a_superseded_dispatcher_goes(start: Start, double: CoordinatorDouble) -
     assert isinstance(running.error, SupersededError)
 
 
-def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     running = start(slots=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     _wait_for_pid(double, store, HANG)
@@ -329,7 +335,7 @@ def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorD
     assert double.results == {}
 
 
-def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     running = start(slots=1, stop_seconds=20)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     _wait_for_pid(double, store, HANG)
@@ -341,7 +347,7 @@ def test_stopping_waits_for_what_is_nearly_done(start: Start, double: Coordinato
     assert double.results.keys() == {"running"}
 
 
-def test_processes_give_way_to_fresh_ones(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_processes_give_way_to_fresh_ones(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(slots=1, renders_per_process=1)
     pids = []
     for what in (HANG, HANG + 1):
@@ -360,7 +366,9 @@ def test_a_renderer_that_does_not_start_is_told(start: Start, double: Coordinato
     assert double.registrations == []
 
 
-def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: Store, cluster: Cluster) -> None:
+def test_work_that_nothing_can_be_found_for_is_told(
+    double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster
+) -> None:
     settings = Settings(
         url=f"http://127.0.0.1:{double.port}",
         store=store.root,

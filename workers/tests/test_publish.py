@@ -15,7 +15,7 @@ from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
 from stickslip_schemas.manifest import Manifest, Pictures, check_seal
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages import publish as publish_module
 from stickslip_workers.stages.publish import publish
 
@@ -98,9 +98,9 @@ def test_publishing_again_and_after_a_crash_gives_the_same(make_dataset: Make, m
         """Not an Exception: nothing on the way may catch it, as nothing catches SIGKILL."""
 
     links = 0
-    link = Store.link
+    link = DirectoryStore.link
 
-    def dying_link(self: Store, digest: str, target: Path) -> None:
+    def dying_link(self: DirectoryStore, digest: str, target: Path) -> None:
         nonlocal links
         links += 1
         if links == 10:

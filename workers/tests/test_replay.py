@@ -9,7 +9,7 @@ import pytest
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask, TaskResult, task_adapter
 from stickslip_workers.__main__ import main
 from stickslip_workers.replay import replay
@@ -21,7 +21,7 @@ def test_the_command_prints_the_result(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["replay", str(tmp_path / "task.json"), "--store", str(tmp_path / "store")]) == 0
     result = TaskResult.model_validate_json(capsys.readouterr().out)
     assert result.outcome == "succeeded"
-    assert Store(tmp_path / "store").path(result.output.record.digest).exists()
+    assert DirectoryStore(tmp_path / "store").path(result.output.record.digest).exists()
 
 
 @pytest.mark.parametrize("what", [fake_renderer.FINE, fake_renderer.BUG])

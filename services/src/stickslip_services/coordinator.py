@@ -23,7 +23,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
@@ -58,9 +58,7 @@ GRACE_SECONDS = 3
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
     coordinator = Coordinator(settings, clock)
-    metrics = Metrics(
-        coordinator.database, coordinator.store.root, coordinator.alive_workers, coordinator.eta_watch.held
-    )
+    metrics = Metrics(coordinator.database, coordinator.store, coordinator.alive_workers, coordinator.eta_watch.held)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -139,12 +137,11 @@ def reindex(settings: Settings) -> int:
     """Find the datasets in the store again; return the exit status."""
     counts = Counter[str]()
     with locked(settings.data), opened(settings, Role.upkeep) as database:
-        for found in find_versions(database, Store(settings.store_root)):
-            name = f"{found.place.parent.name}:{found.place.name}"
+        for found in find_versions(database, open_store(settings.store_root)):
             if found.fault:
-                sys.stderr.write(f"left out: {found.place}: {found.fault}\n")
+                sys.stderr.write(f"left out: {found.name}: {found.fault}\n")
             elif found.is_new:
-                sys.stdout.write(f"{name}  {found.samples} samples\n")
+                sys.stdout.write(f"{found.name}  {found.samples} samples\n")
             counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
     sys.stderr.write(
         f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out\n"

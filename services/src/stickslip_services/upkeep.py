@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
@@ -57,7 +57,7 @@ def _data(data: Path, store_path: Path | None) -> Iterator[tuple[Database, Store
             f"{settings.database_option} of a coordinator"
         )
     with locked(data), opened(settings, Role.upkeep) as database:
-        yield database, Store(settings.store_root)
+        yield database, open_store(settings.store_root)
 
 
 def _remove(database: Database, store: Store, name: str) -> int:
@@ -80,7 +80,7 @@ def _collect(database: Database, store: Store, hours: float, *, delete: bool) ->
         count += 1
         size += file.bytes
         if delete:
-            file.path.unlink(missing_ok=True)
+            store.delete(file.name)
     done = "were deleted" if delete else "may be deleted: add --delete"
     sys.stdout.write(f"{count} files, {size / 1e6:,.1f} MB, that nothing refers to {done}\n")
     return 0

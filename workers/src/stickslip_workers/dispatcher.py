@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Reason, Stage
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 from stickslip_schemas.tasks import RenderTask, SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
@@ -142,7 +142,7 @@ class Dispatcher:
                 **common,
             )
         )
-        self._store = Store(settings.store)
+        self._store = open_store(settings.store)
         self._coordinator = CoordinatorClient(settings.url, settings.key, settings.tls_certificate)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None

@@ -14,7 +14,7 @@ from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import JobState, Reason
-from stickslip_schemas.store import Store, is_unavailable
+from stickslip_schemas.store import Store, is_unavailable, open_store
 from stickslip_schemas.tasks import PublishOutput
 from stickslip_schemas.worker_api import (
     Heartbeat,
@@ -107,9 +107,9 @@ class Coordinator:
     def __post_init__(self, given_clock: Clock | None) -> None:
         self.database = connect(self.settings)
         self.clock = given_clock or self.database.clock
-        self.store = Store(self.settings.store_root)
+        self.store = open_store(self.settings.store_root)
         self.store_watch = StoreWatch(
-            self.settings.store_root,
+            self.store,
             self.settings.data,
             min_free_bytes=self.settings.min_free_bytes,
             clock=lambda: self.clock(),
