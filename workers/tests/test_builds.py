@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.sources import LIST_OF_KINDS, sources
+from stickslip_schemas.sources import UNCOUNTED, sources
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_workers import builds
 from stickslip_workers.kinds import kind
@@ -62,7 +62,7 @@ def _python(script: str, *arguments: str) -> str:
 
 
 def _files(stage: str, name: str) -> set[Path]:
-    return {path.resolve() for path in sources(builds.roots(stage, name), cut=LIST_OF_KINDS).values()}
+    return {path.resolve() for path in sources(builds.roots(stage, name), cut=UNCOUNTED).values()}
 
 
 def _only_passes_on(path: Path) -> bool:

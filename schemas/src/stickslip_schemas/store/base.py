@@ -16,11 +16,11 @@ from stickslip_schemas.keys import is_sha256
 
 ARTIFACTS = "artifacts"
 DATASETS = "datasets"
-VERSION = r"v[1-9]\d{0,8}"
+VERSION = re.compile(r"v[1-9]\d{0,8}")
 """How the directory of a version is called."""
 
 _SCRATCH = re.compile(r"\.([0-9a-f]{64})\..*\.tmp")
-_UNAVAILABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ESTALE)
+_UNAVAILABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ESTALE, errno.EHOSTUNREACH)
 
 
 class CorruptArtifactError(OSError):
@@ -28,7 +28,7 @@ class CorruptArtifactError(OSError):
 
 
 def is_unavailable(error: OSError) -> bool:
-    """Tell whether an error says that a store takes no files: it is full, read-only, not ours, or gone."""
+    """Tell whether an error says that a store takes no files: full, read-only, not ours, gone, or out of reach."""
     return error.errno in _UNAVAILABLE
 
 

@@ -6,7 +6,6 @@ no room and any Zarr reader opens it.
 
 import hashlib
 import os
-import re
 import shutil
 import uuid
 from collections.abc import Iterator, Sequence
@@ -169,7 +168,7 @@ class DirectoryStore:
         """See `Store`."""
         for place in sorted(self.root.glob(f"{DATASETS}/*/v*/{path}")):
             dataset, version = place.relative_to(self.root / DATASETS).parts[:2]
-            if re.fullmatch(VERSION, version):
+            if VERSION.fullmatch(version):
                 yield ShownVersion(dataset, int(version[1:]), place.stat().st_mtime)
 
     def hide(self, dataset: str, version: int) -> None:
