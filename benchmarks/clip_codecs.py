@@ -33,6 +33,10 @@ class Codec:
     encode: Callable[[np.ndarray], bytes]
     decode: Callable[[bytes], bytes]
 
+    @property
+    def label(self) -> str:
+        return f"{self.order} {'delta ' * self.delta}{self.name}"
+
     def write(self, clip: np.ndarray) -> bytes:
         turned = np.ascontiguousarray(clip.transpose([AXES.index(axis) for axis in self.order]))
         return self.encode(np.diff(turned.ravel(), prepend=np.uint8(0)) if self.delta else turned)
@@ -51,7 +55,7 @@ def zstd(level: int, order: str, *, delta: bool = False) -> Codec:
 
 def blosc_zstd(level: int, order: str, shuffle: int, *, delta: bool = False, block: int = 0) -> Codec:
     codec = blosc.Blosc("zstd", level, shuffle, blocksize=block)
-    names = {blosc.NOSHUFFLE: "", blosc.BITSHUFFLE: ", bits shuffled"}
+    names = {blosc.NOSHUFFLE: "", blosc.SHUFFLE: ", shuffled", blosc.BITSHUFFLE: ", bits shuffled"}
 
     def encode(values: np.ndarray) -> bytes:
         return bytes(codec.encode(values.ravel().view("V3")))  # bits of red, green and blue apart
@@ -59,15 +63,15 @@ def blosc_zstd(level: int, order: str, shuffle: int, *, delta: bool = False, blo
     return Codec(order, delta, f"blosc zstd {level}{names[shuffle]}", encode, codec.decode)
 
 
-_BLOSC = ((5, blosc.BITSHUFFLE), (6, blosc.BITSHUFFLE), (6, blosc.NOSHUFFLE))
+_BLOSC = ((6, blosc.SHUFFLE), (6, blosc.BITSHUFFLE), (6, blosc.NOSHUFFLE))
 
 
 CODECS = [
     zstd(3, "tyxc"),  # of datasets before 2026-11-22
-    *(zstd(level, "ytxc") for level in (3, 6, 9, 12)),  # 9 is that of datasets since
+    *(zstd(level, "ytxc") for level in (3, 6, 9, 11, 12)),  # 11 is that of datasets since
     *(zstd(9, order) for order in ("tyxc", "ytcx", "tcyx", "cytx", "yxct", "cyxt")),
     *(zstd(9, order, delta=True) for order in ("ytxc", "tcyx", "cytx")),
-    *(blosc_zstd(level, "ytxc", shuffle, block=1 << 20) for level, shuffle in _BLOSC),
+    *(blosc_zstd(level, "ytxc", shuffle, block=16 * 30 * 224 * 3) for level, shuffle in _BLOSC),
 ]
 
 
@@ -84,13 +88,16 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("clips", type=Path, nargs="+")
     arguments.add_argument("--repeats", type=int, default=3)
+    arguments.add_argument("--only", metavar="LABEL", help="codecs whose labels begin so, as in 'ytxc zstd'")
     options = arguments.parse_args()
-    for path in options.clips:
-        clips = np.load(path)
-        print(f"{path.stem}: {len(clips)} clips, {clips.nbytes / 1e6:.1f} MB")
+    sets = {path.stem: np.load(path) for path in options.clips}
+    if len(sets) > 1:
+        sets["all of them"] = np.concatenate(list(sets.values()))
+    for name, clips in sets.items():
+        print(f"{name}: {len(clips)} clips, {clips.nbytes / 1e6:.1f} MB")
         for codec in CODECS:
-            found = measured(codec, clips, options.repeats)
-            print(f"  {codec.order} {'delta' if codec.delta else '':5} {codec.name:28} {found}", flush=True)
+            if options.only is None or codec.label.startswith(options.only):
+                print(f"  {codec.label:40} {measured(codec, clips, options.repeats)}", flush=True)
 
 
 def measured(codec: Codec, clips: np.ndarray, repeats: int) -> str:

@@ -242,7 +242,7 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
     )
 
 
-def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> None:
+def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
     """Make the clips of a task, all of it, and print where the time goes."""
     with np.load(trajectory) as file:
         record = {"positions": file["track"][None], "rest": file["rest"][None], "triangles": file["triangles"][None]}
@@ -259,15 +259,11 @@ def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> No
     look = ClothDragRender(
         rig="drag",
         rig_digest=rig_digest("drag"),
-        quality=quality,
-        material=MATERIAL,
         texture=TEXTURES[0],
-        viewpoint="calibrated",
-        substrate=substrate,
-        creases=CREASES,
         instants=shown_frames(30, len(record["positions"][0])),
         light_seed=3,
         crease_seed=1,
+        **look_of_clip,
     )
     with tempfile.TemporaryDirectory() as folder:
         store = DirectoryStore(folder)
@@ -291,8 +287,8 @@ def whole_clips(trajectory: Path, out: Path, quality: str, substrate: str) -> No
     np.save(out, clips)
     blender, every = spent
     print(
-        f"{quality}, {substrate}: {every / (shape[0] * shape[1]):.4f} CPU s per frame and texture; Blender "
-        f"{blender:.2f} s, all else {every - blender:.2f} s ({100 * (every / blender - 1):.1f} %); "
+        f"{', '.join(map(str, look_of_clip.values()))}: {every / (shape[0] * shape[1]):.4f} CPU s per frame and "
+        f"texture; Blender {blender:.2f} s, all else {every - blender:.2f} s ({100 * (every / blender - 1):.1f} %); "
         f"gate {result.output.labels['gate_db']:.1f} dB",
         flush=True,
     )
@@ -307,13 +303,17 @@ def main() -> None:
     arguments.add_argument("--clip", type=Path, metavar="NPY", help="make whole clips instead, and write them there")
     arguments.add_argument("--quality", default="standard", help="of --clip")
     arguments.add_argument("--substrate", default="matt", help="of --clip")
+    arguments.add_argument("--material", default=MATERIAL, help="of --clip")
+    arguments.add_argument("--viewpoint", default="calibrated", help="of --clip")
+    arguments.add_argument("--creases", type=float, default=CREASES, help="of --clip")
     arguments.add_argument("--direct", action="store_true", help="direct renderings too")
     arguments.add_argument("--look", action="store_true", help="only what the look of cloth costs")
     arguments.add_argument("--ground-truth", action="store_true", help="only what ground truth costs")
     arguments.add_argument("--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings")
     options = arguments.parse_args()
     if options.clip is not None:
-        whole_clips(options.trajectory, options.clip, options.quality, options.substrate)
+        names = ("quality", "material", "viewpoint", "substrate", "creases")
+        whole_clips(options.trajectory, options.clip, **{name: getattr(options, name) for name in names})
         return
 
     bench = Bench(options.trajectory, options.references)

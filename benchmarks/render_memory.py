@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import Texture
@@ -60,7 +61,7 @@ def main() -> None:
             crease_seed=number,
         )
         clip = renderer.clip(look, small(camera), track)
-        clip.clips(clip.trace(), [list(Texture)[number % len(Texture)]])
+        clip.clips(clip.trace(), [texture_image(list(Texture)[number % len(Texture)])])
         if number + 1 == WARM_UP:
             begun = resident()
     ended = resident()

@@ -18,6 +18,7 @@ from PIL import Image
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.preview import sheet
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.jobs import Quality
@@ -27,6 +28,8 @@ from stickslip_schemas.textures import HELD_OUT_TEXTURES, Texture
 Clip = npt.NDArray[np.uint8]
 
 SIDE = 128
+CUT, CLOSE = 132, 176
+"""Of a close view: the side that is cut out of a frame, and what it is made [px]."""
 SUBSTRATES = (
     "matt",
     "aluminium",
@@ -54,8 +57,13 @@ class Studio:
         self._renderer = ClothRenderer(*self._mesh, Holders)
         self._frames, self._quality = frames, quality
 
-    def clips(self, material: str, textures: Sequence[Texture], **look: object) -> tuple[list[Clip], float]:
-        """Return a fabric's clips with textures, made small, and what the image gate found."""
+    def clips(
+        self, material: str, textures: Sequence[Texture], *, close: bool = False, **look: object
+    ) -> tuple[list[Clip], float]:
+        """Return a fabric's clips with textures, made small, and what the image gate found.
+
+        Close: instead of the whole frame, what is around the cloth, made larger.
+        """
         track = self.tracks[material]
         document = ClothDragRender.model_validate(
             {
@@ -74,12 +82,26 @@ class Studio:
         (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
         clip = self._renderer.clip(document, camera, track[list(document.instants)])
         trace = clip.trace()
-        videos, _ = clip.clips(trace, textures)
-        small = [
-            np.stack([np.asarray(Image.fromarray(frame).resize((SIDE, SIDE), Image.Resampling.BOX)) for frame in video])
-            for video in videos
-        ]
-        return small, trace.gate_db
+        videos, _ = clip.clips(trace, [texture_image(texture) for texture in textures])
+        if close:
+            boxes = [_around(camera.project(positions)[0]) for positions in track[list(document.instants)]]
+            return [_resized(video, CLOSE, boxes) for video in videos], trace.gate_db
+        whole = [(0, 0, camera.width, camera.height)] * len(document.instants)
+        return [_resized(video, SIDE, whole) for video in videos], trace.gate_db
+
+
+def _around(pixels: npt.NDArray[np.float64]) -> tuple[int, int, int, int]:
+    """Return the square about the cloth's middle, of a side that all cloths fit in."""
+    x, y = ((pixels.min(axis=0) + pixels.max(axis=0)) / 2.0).astype(int).tolist()
+    return x - CUT // 2, y - CUT // 2, x + CUT // 2, y + CUT // 2
+
+
+def _resized(video: Clip, side: int, boxes: Sequence[tuple[int, int, int, int]]) -> Clip:
+    method = Image.Resampling.BOX if side == SIDE else Image.Resampling.BICUBIC
+    frames = [
+        Image.fromarray(frame).crop(box).resize((side, side), method) for frame, box in zip(video, boxes, strict=True)
+    ]
+    return np.stack([np.asarray(frame) for frame in frames])
 
 
 def save(path: Path, tiles: Sequence[tuple[str, Clip]], columns: int) -> None:
@@ -102,14 +124,16 @@ def main() -> None:
     arguments.add_argument("folder", type=Path)
     arguments.add_argument("out", type=Path)
     arguments.add_argument("--frames", type=int, default=12)
+    arguments.add_argument("--fabrics", action="store_true", help="only the sheet of fabrics")
     arguments.add_argument("--quality", type=Quality, default=Quality.draft)
     options = arguments.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     studio = Studio(options.folder, options.frames, options.quality)
 
-    found = {material: studio.clips(material, (Texture.checker, Texture.floral))[0] for material in studio.tracks}
-    tiles = [(material, clips[row]) for row in (0, 1) for material, clips in found.items()]
+    tiles = [(name, studio.clips(name, (Texture.gingham,), close=True)[0][0]) for name in studio.tracks]
     save(options.out / "cloth-fabrics.webp", tiles, 5)
+    if options.fabrics:
+        return
 
     material = next(iter(studio.tracks))
     tiles = []

@@ -8,7 +8,9 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from stickslip_schemas.fabrics import FabricNumbers, Material
+from stickslip_schemas.appearance import Calibration, FloorNumbers, LampNumbers
+from stickslip_schemas.base import Document
+from stickslip_schemas.fabrics import FabricNumbers
 from stickslip_schemas.kinds import KINDS
 
 HEAD = """# Every key of a spec
@@ -38,7 +40,13 @@ An axis of names, such as `material`, takes one name or a list. A job has at mos
 
 def reference() -> str:
     """Return the page."""
-    return "\n".join([HEAD, *(part for kind in KINDS.values() for part in _kind(kind)), *_fabric()]) + "\n"
+    return "\n".join(
+        [
+            HEAD,
+            *(part for kind in KINDS.values() for part in _kind(kind)),
+            *(part for own in OWN for part in _own(*own)),
+        ]
+    )
 
 
 def _kind(kind: Any) -> Iterator[str]:
@@ -56,8 +64,7 @@ def _kind(kind: Any) -> Iterator[str]:
             value = _resolved(value["anyOf"][0], schema)
         meaning = axis.get("description") or value.get("description", "")
         required = "" if name in axes.get("required", ()) else " (optional)"
-        allowed = ", ".join(f"`{item}`" for item in Material) if name == "material" else _allowed(value)
-        yield f"| `{name}`{required} | {allowed} | {_first_line(meaning)} |"
+        yield f"| `{name}`{required} | {_allowed(value)} | {_first_line(meaning)} |"
     yield "\nOther keys:\n"
     yield "| key | values | default | meaning | cost |"
     yield "|---|---|---|---|---|"
@@ -67,23 +74,35 @@ def _kind(kind: Any) -> Iterator[str]:
     yield ""
 
 
-def _fabric() -> Iterator[str]:
-    schema = FabricNumbers.model_json_schema()
-    yield "## A fabric of your own\n"
-    yield "An entry of `materials` names a fabric and gives its numbers. " + " ".join(
-        (FabricNumbers.__doc__ or "").split("\n\n")[1].split()
-    )
-    yield "\n| key | values | default | meaning | cost |"
+OWN: tuple[tuple[str, str, type[Document]], ...] = (
+    ("materials", "fabric", FabricNumbers),
+    ("viewpoints", "camera", Calibration),
+    ("lamps", "lamp", LampNumbers),
+    ("substrates", "floor", FloorNumbers),
+)
+"""What a spec may define: its key, what one entry is, and the model of an entry."""
+
+
+def _own(key: str, what: str, model: type[Document]) -> Iterator[str]:
+    schema = model.model_json_schema()
+    meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
+    yield f"## A {what} of your own\n"
+    yield f"An entry of `{key}` names a {what} and gives its numbers. {meaning}\n"
+    yield "| key | values | default | meaning | cost |"
     yield "|---|---|---|---|---|"
     for name, field in schema["properties"].items():
         yield _field_row(name, field, schema)
+    yield ""
+
+
+_MAPPINGS = ("textures", *(key for key, _, _ in OWN))
 
 
 def _field_row(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:
     value = _resolved(field, schema)
     default = json.dumps(field["default"]) if "default" in field else "" if "anyOf" in field else "required"
     meaning = field.get("description") or value.get("description", "")
-    default = "`{}`" if name == "materials" else f"`{default}`" if default not in ("", "required") else default
+    default = "`{}`" if name in _MAPPINGS else f"`{default}`" if default not in ("", "required") else default
     cells = (f"`{name}`", _allowed(value), default, _first_line(meaning), field.get("x-cost", ""))
     return f"| {' | '.join(cells)} |"
 

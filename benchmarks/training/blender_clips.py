@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS, ClothDragRender
@@ -66,7 +67,7 @@ def main() -> None:
                 }
             )
             made = renderer.clip(look, cameras[view.value], positions[run][frames])
-            videos += list(made.clips(made.trace(), chosen)[0])
+            videos += list(made.clips(made.trace(), [texture_image(texture) for texture in chosen])[0])
             for texture in chosen:
                 told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **about[run]})
                 print(json.dumps(told[-1]), flush=True)

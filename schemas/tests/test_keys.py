@@ -181,7 +181,7 @@ PINNED: dict[str, object] = {
     "color_seed": 1423131992,
     "spec": "473d8dc6dc2024b5e3f18fbc9953dca6f325c8f53e87629de6d8277bf2b4c8db",
     "cloth_simulation": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
-    "cloth_render": "107c2801e5b93322b1fee9db2f284bd859d4154d0e5cb0862e87efa66073fc81",
+    "cloth_render": "3c2b35606083d3125e50c1f1cfb77725a5802eb33db4d3d035fb21f5ae0a16ac",
 }
 
 

@@ -290,6 +290,8 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
         quality=Quality.standard,
         psnr_db=PICTURE_DECIBELS[Quality.standard],
         gate_db=round(float(made.arrays["gate_db"][made.arrays["valid"]].min()), 2),
+        frame_share=round(float(made.arrays["frame_share"][made.arrays["valid"]].mean()), 4),
+        device="cpu",
         direct_slots=(1,),
     )
     assert "rendered directly instead: 1." in (directory / "README.md").read_text()

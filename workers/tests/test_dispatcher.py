@@ -381,3 +381,26 @@ def test_work_that_nothing_can_be_found_for_is_told(
     # As if the cluster had promised more CPUs than it has.
     with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 25 CPUs"):
         Dispatcher(settings, Cluster(100)).run()
+
+
+def test_a_gpu_that_the_cluster_does_not_have_is_told(
+    double: CoordinatorDouble, store: Store, cluster: Cluster
+) -> None:
+    """Nothing is rendered on the CPU instead."""
+    import ray
+
+    if ray.cluster_resources().get("GPU"):
+        pytest.skip("the cluster has a GPU")
+    settings = Settings(
+        url=f"http://127.0.0.1:{double.port}",
+        store=store.root,
+        name="test",
+        slots=1,
+        blender_python=Path(sys.executable),
+        render_actor="fake_renderer:RenderActor",
+        render_device="optix",
+        start_seconds=8.0,
+    )
+    with pytest.raises(StartError, match=r"no render process could be started within 8 s; .* CPUs and 1 GPUs"):
+        Dispatcher(settings, cluster).run()
+    assert double.registrations == []

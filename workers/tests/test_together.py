@@ -65,6 +65,17 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     assert [(result.cpu_seconds, result.wall_seconds) for result in results] == [(2.0, 1.0)] * 3
 
 
+def test_textures_of_the_users_own_go_by_their_pictures() -> None:
+    """Two jobs may give one name to two pictures, and one picture may have two names."""
+    one, other = (f"sha256:{digit * 64}" for digit in "12")
+    tasks = [clip("dots"), clip("logo", image=one), clip("logo", image=other), clip("brand", image=one)]
+    asked = together(tasks)
+    assert asked.textures == ("dots", one, other)
+    output = RenderOutput(chunks={}, labels={}, clips={name: chunk(n) for n, name in enumerate(asked.textures)})
+    results = apart(tasks, TaskResult(outcome="succeeded", output=output))
+    assert [result.output.chunks["video"] for result in results] == [chunk(n) for n in (0, 1, 2, 1)]
+
+
 def test_what_is_wrong_with_a_trace_is_wrong_with_all_its_clips() -> None:
     tasks = [clip("dots"), clip("plaid")]
     out = TaskResult(outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0)

@@ -27,9 +27,9 @@ class CorruptChunkError(ValueError):
     """A checksum does not hold, or a chunk is not of the size that it should have."""
 
 
-def encode_chunk(data: bytes | np.ndarray) -> bytes:
-    """Return the encoded chunk of C-ordered little-endian `data`."""
-    return _with_crc(bytes(Zstd(level=ZSTD_LEVEL).encode(data)))
+def encode_chunk(data: bytes | np.ndarray, level: int = ZSTD_LEVEL) -> bytes:
+    """Return the encoded chunk of C-ordered little-endian `data`, with a level of zstd."""
+    return _with_crc(bytes(Zstd(level=level).encode(data)))
 
 
 def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:

@@ -1,12 +1,13 @@
 """What the kinds of cloth have in common: materials, presets, clips, and the arrays of a trajectory."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, WithJsonSchema, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from stickslip_schemas.appearance import CLIP_SIZE, Calibration, FloorNumbers, LampNumbers
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.base import Bool, Document, Float, Int
@@ -15,6 +16,7 @@ from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.fabrics import MATERIAL_NAME, FabricNumbers, Material
 from stickslip_schemas.hints import did_you_mean
 from stickslip_schemas.jobs import JobSpec, Quality, Render, Simulation
+from stickslip_schemas.keys import ArtifactRef, Sha256, referred
 from stickslip_schemas.states import Stage
 from stickslip_schemas.textures import Texture
 
@@ -22,7 +24,16 @@ Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, descriptio
 Factor = Annotated[
     float, quantity("Factor"), Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric")
 ]
-MaterialName = Annotated[str, quantity("Material"), Field(pattern=MATERIAL_NAME)]
+OwnName = Annotated[str, Field(pattern=MATERIAL_NAME)]
+
+
+def name_schema(built_in: Iterable[str]) -> WithJsonSchema:
+    """Say in the JSON schema which names are built in, and what one of the user's own looks like."""
+    return WithJsonSchema({"anyOf": [{"enum": list(map(str, built_in))}, {"type": "string", "pattern": MATERIAL_NAME}]})
+
+
+MaterialName = Annotated[OwnName, quantity("Material"), name_schema(Material)]
+TextureName = Annotated[OwnName, quantity("Texture"), name_schema(Texture)]
 
 _TAGGED = Field(discriminator="type")
 MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], _TAGGED, SHORTHAND]
@@ -30,7 +41,7 @@ FactorAxis = Annotated[
     ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor], _TAGGED, SHORTHAND
 ]
 MaterialAxis = Annotated[ListAxis[MaterialName], SHORTHAND]
-TextureAxis = Annotated[ListAxis[Texture], SHORTHAND]
+TextureAxis = Annotated[ListAxis[TextureName], SHORTHAND]
 
 
 class Lighting(StrEnum):
@@ -75,8 +86,20 @@ class GroundTruth(StrEnum):
 SEGMENTS = ("background", "floor", "cloth", "prop")
 """Names of the codes of the array `segmentation`: add new ones at the end."""
 
-LightingAxis = Annotated[ListAxis[Lighting], SHORTHAND]
-SubstrateAxis = Annotated[ListAxis[Substrate], SHORTHAND]
+LightingName = Annotated[OwnName, quantity("Lighting"), name_schema(Lighting)]
+SubstrateName = Annotated[OwnName, quantity("Substrate"), name_schema(Substrate)]
+LightingAxis = Annotated[ListAxis[LightingName], SHORTHAND]
+SubstrateAxis = Annotated[ListAxis[SubstrateName], SHORTHAND]
+
+
+class Own(NamedTuple):
+    """Where the spec defines what an axis of names may name besides what is built in."""
+
+    key: str
+    """Of the spec: a mapping from the user's names to what they mean."""
+    field: str
+    """Of the document that takes it."""
+    built_in: tuple[str, ...]
 
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
@@ -93,6 +116,12 @@ class PresetName(StrEnum):
     thesis_low_small_dt = "thesis-low-small-dt"
     thesis_low_big_dt = "thesis-low-big-dt"
 
+
+OWN_LOOKS = {
+    "material": Own("materials", "fabric", tuple(Material)),
+    "texture": Own("textures", "image", tuple(Texture)),
+}
+"""What specs of all kinds of cloth may add: see `ClothSpec.own`."""
 
 PICTURE_DECIBELS = {Quality.preview: 34.8, Quality.draft: 38.9, Quality.standard: 40.9, Quality.high: 43.1}
 """PSNR of the cloth's pixels by quality [dB]: `benchmarks/render_cloth.py` measures it."""
@@ -136,10 +165,14 @@ class ClothRender(Render):
     """
 
     material: str
-    texture: Texture
+    texture: str
+    image: ArtifactRef | None = Field(default=None, description="of a texture of the user's own; null: built in")
     viewpoint: str
-    lighting: Lighting = Lighting.drawn
-    substrate: Substrate = Substrate.matt
+    camera: Camera | None = Field(default=None, description="of a viewpoint of the user's own; null: one of the rig")
+    lighting: str = Lighting.drawn.value
+    lamp: LampNumbers | None = Field(default=None, description="lighting of the user's own; null: built in")
+    substrate: str = Substrate.matt.value
+    finish: FloorNumbers | None = Field(default=None, description="of a substrate of the user's own; null: built in")
     creases: float = 0.0
     instants: tuple[int, ...] = Field(description="which instants of the trajectory the frames of the clip show")
     ground_truth: tuple[GroundTruth, ...] = ()
@@ -149,12 +182,12 @@ class ClothRender(Render):
     @property
     def trace(self) -> dict[str, Any]:
         """What the trace depends on, as JSON: all but the texture."""
-        return self.model_dump(mode="json", exclude={"texture"})
+        return self.model_dump(mode="json", exclude={"texture", "image"})
 
     @property
     def variant(self) -> str:
-        """The texture, which no trace depends on."""
-        return self.texture.value
+        """The texture, which no trace depends on: a name that is built in, or a reference to a picture."""
+        return self.image or self.texture
 
 
 class ClothSpec(JobSpec):
@@ -166,10 +199,25 @@ class ClothSpec(JobSpec):
     instants_per_second: ClassVar[float]
     rig: ClassVar[str]
     """The cameras; their names are those of the viewpoints."""
+    own: ClassVar[Mapping[str, Own]]
+    """By axis of names, what the user may add to it."""
 
-    materials: dict[Annotated[str, Field(pattern=MATERIAL_NAME)], FabricNumbers] = Field(
+    materials: dict[OwnName, FabricNumbers] = Field(
         default_factory=dict,
         description="fabrics of your own, by the names that the axis `material` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
+    textures: dict[OwnName, ArtifactRef] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="textures of your own, by the names that the axis `texture` uses: `sha256:` and the digest that "
+        "`stickslip upload` prints",
+        json_schema_extra={"additionalProperties": False},
+    )
+    viewpoints: dict[OwnName, Calibration] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="cameras of your own, by the names that the axis `viewpoint` uses",
         json_schema_extra={"additionalProperties": False},
     )
     preset: PresetName = Field(
@@ -234,11 +282,27 @@ class ClothSpec(JobSpec):
         return not self.allow_uncertified
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
-        """Return the fields that a value of an axis sets: a material of the user's own brings its numbers along."""
-        if axis != "material":
+        """Return the fields that a value of an axis sets: what the user has defined brings its numbers along."""
+        if axis not in self.own:
             return {axis: value}
-        own = self.materials.get(value)
-        return {"material": value, "fabric": None if own is None else own.model_dump(mode="json")}
+        _, field, _ = self.own[axis]
+        given = self._own(axis).get(value)
+        if isinstance(given, Calibration):
+            given = given.camera(value)
+        return {axis: value, field: given.model_dump(mode="json") if isinstance(given, Document) else given}
+
+    def _own(self, axis: str) -> dict[str, Any]:
+        defined: dict[str, Any] = getattr(self, self.own[axis].key)
+        return defined
+
+    def names(self, axis: str) -> tuple[str, ...]:
+        """Return the names that an axis may use, the built-in ones first: they are the codes of the label."""
+        return (*map(str, self.own[axis].built_in), *self._own(axis))
+
+    @property
+    def artifacts(self) -> dict[str, Sha256]:
+        """The pictures of the user's own textures."""
+        return {f"/textures/{name}": digest for name, image in self.textures.items() if (digest := referred(image))}
 
     def simulation_settings(self) -> dict[str, Any]:
         """Return the fields of the simulation document that are the same for all samples."""
@@ -257,7 +321,7 @@ class ClothSpec(JobSpec):
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the viewpoints, by name."""
-        return load_rig(self.rig)
+        return (*load_rig(self.rig), *(own.camera(name) for name, own in self.viewpoints.items()))
 
     def picture_decibels(self) -> float | None:
         """Return the PSNR of the pictures of this quality, as measured [dB]."""
@@ -274,30 +338,28 @@ class ClothSpec(JobSpec):
         """Which instants of the trajectory the frames of a clip show."""
         return shown_frames(self.frames, self.instants)
 
-    @property
-    def material_names(self) -> tuple[str, ...]:
-        """Names of the codes of the label `material`: the measured ones, then the user's own."""
-        return (*Material, *self.materials)
-
     @model_validator(mode="after")
-    def _known_materials(self) -> Self:
-        for name in self.materials:
-            if name in list(Material):
-                raise ValueError(f"materials must not redefine a measured fabric, and {name!r} is one")
-        named = self.axes.material.values  # type: ignore[attr-defined]  # every kind of cloth has the axis
-        unknown = [
-            InitErrorDetails(
-                type=PydanticCustomError(
-                    "unknown_material",
-                    "Input should be one of {known}{hint}",
-                    {"known": ", ".join(self.material_names), "hint": did_you_mean(name, self.material_names)},
-                ),
-                loc=("axes", "material", "list", "values", position),
-                input=name,
-            )
-            for position, name in enumerate(named)
-            if name not in self.material_names
-        ]
+    def _known_names(self) -> Self:
+        unknown = []
+        for axis, (key, _, built_in) in self.own.items():
+            for name in self._own(axis):
+                if name in built_in:
+                    raise ValueError(f"{key} must not redefine what is built in, and {name!r} is")
+            known = self.names(axis)
+            given = getattr(self.axes, axis)  # type: ignore[attr-defined]  # every kind has axes of its own
+            unknown += [
+                InitErrorDetails(
+                    type=PydanticCustomError(
+                        "unknown_name",
+                        "Input should be one of {known}{hint}",
+                        {"known": ", ".join(known), "hint": did_you_mean(name, known)},
+                    ),
+                    loc=("axes", axis, "list", "values", position),
+                    input=name,
+                )
+                for position, name in enumerate(() if given is None else given.values)
+                if name not in known
+            ]
         if unknown:
             raise ValidationError.from_exception_data(type(self).__name__, unknown)
         return self
@@ -316,13 +378,13 @@ class ClothSpec(JobSpec):
 
     # --- arrays ---------------------------------------------------------------------------------------------------
 
-    def clip_arrays(self, viewpoints: tuple[str, ...]) -> tuple[ArrayLayout, ...]:
+    def clip_arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the clip and the labels of what it shows."""
         return (
             ArrayLayout(
                 "video",
                 "uint8",
-                (self.frames, 224, 224, 3),
+                (self.frames, CLIP_SIZE, CLIP_SIZE, 3),
                 ("frame", "y", "x", "rgb"),
                 "sRGB clip",
                 per_sample=True,
@@ -330,10 +392,10 @@ class ClothSpec(JobSpec):
                 attributes={"instants": list(self.shown_instants)},
             ),
             *self._ground_truth_arrays(),
-            _codes("texture", tuple(Texture)),
-            _codes("viewpoint", viewpoints),
-            _codes("lighting", tuple(Lighting)),
-            _codes("substrate", tuple(Substrate)),
+            _codes("texture", self.names("texture")),
+            _codes("viewpoint", self.names("viewpoint")),
+            _codes("lighting", self.names("lighting") if "lighting" in self.own else tuple(Lighting)),
+            _codes("substrate", self.names("substrate") if "substrate" in self.own else tuple(Substrate)),
             ArrayLayout("light_seed", "int32", (), (), "seed of the lamp, the floor and the noise", fill=-1),
             ArrayLayout(
                 "light",
@@ -364,7 +426,7 @@ class ClothSpec(JobSpec):
 
     def _ground_truth_arrays(self) -> tuple[ArrayLayout, ...]:
         """Return what the spec asks for, of every pixel. Textures share it, and each of their samples has it."""
-        frame, axes = (self.frames, 224, 224), ("frame", "y", "x")
+        frame, axes = (self.frames, CLIP_SIZE, CLIP_SIZE), ("frame", "y", "x")
         known = {
             GroundTruth.depth: ("float32", (), (), "depth along the optical axis [m], infinite where nothing is", NAN),
             GroundTruth.segmentation: ("uint8", (), (), "code of what is seen", 0),
@@ -408,7 +470,7 @@ class ClothSpec(JobSpec):
             "stretching": "factor of the fabric's stiffness in its plane",
         }
         return (
-            _codes("material", self.material_names),
+            _codes("material", self.names("material")),
             ArrayLayout("mu", "float64", (), (), "friction coefficient", fill=NAN),
             *(
                 ArrayLayout(name, "float64", (), (), text, fill=NAN)

@@ -164,6 +164,11 @@ class JobSpec(Document):
         """Return the fields of documents that a value of an axis sets: by default the one of the axis's name."""
         return {axis: value}
 
+    @property
+    def artifacts(self) -> dict[str, Sha256]:
+        """Artifacts that the spec names and that have to be in the store, by JSON pointers into the spec."""
+        return {}
+
     # --- what follows from it -------------------------------------------------------------------------------------
 
     @property

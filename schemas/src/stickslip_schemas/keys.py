@@ -50,6 +50,19 @@ def is_sha256(text: str) -> bool:
     return re.fullmatch(KEY_PATTERN, text) is not None
 
 
+ARTIFACT = "sha256:"
+"""How a reference to an artifact begins, where a name might stand as well."""
+
+ArtifactRef = Annotated[
+    str, Field(pattern=r"^sha256:[0-9a-f]{64}$", description="`sha256:` and the SHA-256 of an artifact")
+]
+
+
+def referred(name: str) -> Sha256 | None:
+    """Return the digest that a reference to an artifact names; None where `name` is a name."""
+    return name.removeprefix(ARTIFACT) if name.startswith(ARTIFACT) else None
+
+
 def _normalised(value: Any) -> Any:
     if isinstance(value, float):
         return value + 0.0  # -0.0 + 0.0 is 0.0

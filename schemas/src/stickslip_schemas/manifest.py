@@ -42,6 +42,13 @@ class Pictures(Document):
     gate_db: float | None = Field(
         description="least of what the image gate found in this version [dB]; null: it has no composed pictures"
     )
+    frame_share: float | None = Field(
+        default=None, description="share of the frame that is cloth, mean of the valid samples; null: no cloth"
+    )
+    device: str = Field(
+        default="cpu",
+        description="what Cycles computed on: `cpu`, or a sort of GPU, whose name and driver are in the build `render`",
+    )
     direct_slots: tuple[int, ...] = Field(
         description="slots whose pictures the image gate refused to compose: they were rendered directly"
     )

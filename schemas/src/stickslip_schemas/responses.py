@@ -7,7 +7,7 @@ from pydantic import Field
 
 from stickslip_schemas.base import Document, Int
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.keys import Sha256
+from stickslip_schemas.keys import ArtifactRef, Sha256
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
@@ -119,6 +119,14 @@ class DatasetVersion(Document):
     created_at: datetime
     sample_count: int
     valid_count: int
+    bytes: int
+
+
+class TextureEntry(Document):
+    """A picture that the coordinator has taken as a texture."""
+
+    texture: ArtifactRef = Field(description="what a spec writes under `textures`")
+    side: int = Field(description="width and height [px]")
     bytes: int
 
 

@@ -6,7 +6,7 @@ from pydantic import Field, TypeAdapter, model_validator
 
 from stickslip_schemas.base import Bool, Document, Float, Int
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.keys import Sha256
+from stickslip_schemas.keys import Sha256, referred
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.states import Reason
 
@@ -65,7 +65,9 @@ class RenderTask(Document):
     record: RecordRef
     preview: Bool = False
     textures: tuple[str, ...] = Field(
-        default=(), description="textures to make clips of, one sample each; none: that of the render document"
+        default=(),
+        description="textures to make clips of, one sample each, by name or `sha256:` and digest; none: that of the "
+        "render document",
     )
 
 
@@ -192,7 +194,8 @@ task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = 
 def input_digests(task: SimulateTask | RenderTask | PackTask | PublishTask) -> tuple[Sha256, ...]:
     """Return the artifacts that a task reads."""
     if isinstance(task, RenderTask):
-        return (task.record.digest,)
+        pictures = map(referred, task.textures or (task.render.variant,))
+        return tuple(dict.fromkeys([task.record.digest, *filter(None, pictures)]))
     if isinstance(task, PublishTask):
         return tuple(dict.fromkeys(file.sha256 for file in task.files))
     if isinstance(task, SimulateTask):

@@ -8,8 +8,11 @@ StickslipError
 ├── IdempotencyKeyReusedError   422
 ├── KindNotAvailableError       409
 ├── PresetNotCertifiedError     409
+├── UnknownTextureError         422
 └── MissingArtifactError        500
 """
+
+from stickslip_schemas.problems import FieldError
 
 
 class StickslipError(Exception):
@@ -46,6 +49,14 @@ class PresetNotCertifiedError(StickslipError):
             "certificates do not count), or write `allow_uncertified: true` in the spec"
         )
         super().__init__(f"preset {preset!r} has no passing certificate: {self.rule}")
+
+
+class UnknownTextureError(StickslipError):
+    """A spec names textures that are not in the store."""
+
+    def __init__(self, fields: list[FieldError]) -> None:
+        self.fields = fields
+        super().__init__("; ".join(f"{field.pointer}: {field.rule}" for field in fields[:3]))
 
 
 class UnknownWorkerError(StickslipError):

@@ -1,19 +1,28 @@
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from stickslip_training.cli import app
+from stickslip_training.cli.cloth import SHARES
+from stickslip_training.cloth.clips import clips_of_file
 from stickslip_training.cloth.posterior import MU_BINS
-from stickslip_training.cloth.runs import split_runs
+from stickslip_training.cloth.runs import split_of_runs, split_runs
 from stickslip_training.cloth.training import (
+    INSTANTS,
     WEIGHTS,
     ClothTraining,
+    RenderedClips,
+    _FrictionLearner,
     calibrated,
+    jittered,
     load_friction,
     render_clips,
     save_friction,
     train_friction,
 )
+from typer.testing import CliRunner
 
 SMALL = ClothTraining(steps=6, batch_size=2, width=16)
 
@@ -108,3 +117,82 @@ def test_settings_are_checked(changes, message):
 def test_runs_to_validate_are_needed(few):
     with pytest.raises(ValueError, match="there must be runs to train on and to validate: 9 and 0"):
         train_friction(few[0], few[1][np.arange(0)], SMALL)
+
+
+def some_clips(few, renders=2):
+    train, validation = (render_clips(part, renders, 5) for part in few[:2])
+    return RenderedClips(train, replace(validation, run=validation.run + 100))
+
+
+def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_path):
+    first = train_friction(*few[:2], SMALL, epoch=6)
+    going = replace(SMALL, steps=4, learning_rate=1e-4)
+    clips = some_clips(few)
+    model = train_friction(*few[:2], going, clips=clips, start=first, epoch=2)
+    assert model.card["training_clips"] == len(clips.train) == 18
+    assert equal(model, train_friction(*few[:2], going, clips=clips, start=first, epoch=2))
+    # It went on: weights are nearer to those of the model than to those of another start.
+    fresh = train_friction(*few[:2], going, clips=clips, epoch=2)
+
+    def distance(a, b):
+        return sum(float((weights(a)[name] - value).norm()) for name, value in weights(b).items() if value.ndim > 1)
+
+    assert 0.0 < distance(model, first) < 0.2 * distance(fresh, first)
+
+
+def test_half_of_each_batch_is_of_the_clips(few):
+    black = replace(some_clips(few).train, mu=np.full(18, 9.0))
+    learner = _FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
+    crops, direction, material, mu = learner.batch(0)
+    assert len(crops) == len(direction) == len(material) == 6
+    assert (mu == 9.0).tolist() == [False] * 3 + [True] * 3
+
+
+def test_jittered_crops_are_those_of_another_exposure():
+    crops = torch.rand(4, 6, 72, 88, generator=torch.Generator().manual_seed(0))
+    other = jittered(crops, torch.Generator().manual_seed(1))
+    assert torch.equal(other, jittered(crops, torch.Generator().manual_seed(1)))
+    for clip, changed in zip(crops, other, strict=True):
+        shifts = [torch.roll(clip, (y, x), (1, 2)) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+        likeness = max(float(torch.corrcoef(torch.stack([s.flatten(), changed.flatten()]))[0, 1]) for s in shifts)
+        assert 0.95 < likeness < 1.0
+
+
+def test_clips_of_one_simulation_in_both_splits_are_refused(few):
+    clips = render_clips(few[0], 1, 0)
+    with pytest.raises(ValueError, match="clips of one simulation must not be in both splits"):
+        RenderedClips(clips, clips)
+    with pytest.raises(
+        ValueError, match="the clips for validation must be some, and of materials of the runs: 0 clips"
+    ):
+        RenderedClips(clips, clips[np.arange(0)])
+
+
+def test_a_model_of_another_size_is_no_start(few):
+    model = train_friction(*few[:2], SMALL, epoch=6)
+    with pytest.raises(ValueError, match="the model to start from must know the runs' materials, and be"):
+        train_friction(*few[:2], replace(SMALL, width=24), start=model)
+
+
+def file_of_clips(path, run, size=224):
+    video = np.random.default_rng(0).integers(0, 255, (len(run), 6, size, size, 3), dtype=np.uint8)
+    about = [
+        {"run": number, "material": "gray-interlock", "mu": 0.5, "landed_side": 1, "viewpoint": "calibrated"}
+        for number in run
+    ]
+    np.savez(path, video=video, instants=np.array(INSTANTS), about=[json.dumps(clip) for clip in about])
+
+
+def test_a_file_of_clips_is_read_and_its_test_simulations_are_refused(runs, packed, tmp_path):
+    split = split_of_runs(runs, SHARES, 0)
+    kept, tested = np.flatnonzero(split == 0)[:2].tolist(), int(np.flatnonzero(split == 2)[0])
+    file_of_clips(tmp_path / "clips.npz", kept)
+    clips, about = clips_of_file(tmp_path / "clips.npz", runs.materials)
+    assert clips.crops.shape == (2, 6, 72, 88)
+    assert clips.run.tolist() == kept == [clip["run"] for clip in about]
+    file_of_clips(tmp_path / "tested.npz", [*kept, tested])
+    done = CliRunner().invoke(
+        app, ["cloth", "train", str(packed), "--out", str(tmp_path / "out"), "--clips", str(tmp_path / "tested.npz")]
+    )
+    assert done.exit_code == 1
+    assert "must not show simulations to test with" in " ".join(done.output.split())

@@ -4,6 +4,7 @@
 #include <array>
 #include <bit>
 #include <cmath>
+#include <cstdlib>
 
 #include "kernel.hpp"
 
@@ -13,18 +14,52 @@ namespace {
 
 constexpr int levels = 65536;  // of the table that encodes linear light
 
-// Linear light as 8-bit sRGB [IEC 61966-2-1].
-const std::vector<std::uint8_t>& encoding() {
-  static const std::vector<std::uint8_t> table = [] {
-    std::vector<std::uint8_t> codes(levels);
+constexpr int fine = 256;  // parts of an 8-bit level
+
+// Linear light as sRGB [IEC 61966-2-1], in parts of an 8-bit level.
+const std::vector<std::uint16_t>& encoding() {
+  static const std::vector<std::uint16_t> table = [] {
+    std::vector<std::uint16_t> codes(levels);
     for (int k = 0; k < levels; ++k) {
       const double light = k / (levels - 1.0);
       const double srgb = light <= 0.0031308 ? 12.92 * light : 1.055 * std::pow(light, 1.0 / 2.4) - 0.055;
-      codes[k] = static_cast<std::uint8_t>(std::lrint(255.0 * srgb));
+      codes[k] = static_cast<std::uint16_t>(std::lrint(fine * 255.0 * srgb));
     }
     return codes;
   }();
   return table;
+}
+
+int code(float light) {
+  const float bounded = light > 0.0f ? (light < 1.0f ? light : 1.0f) : 0.0f;
+  return static_cast<std::int32_t>(bounded * (levels - 1.0f) + 0.5f);
+}
+
+bool is_near(int exact, int level) { return std::abs(exact - fine * level) <= tolerance * fine; }
+
+bool is_near(const std::uint16_t* exact, const std::uint8_t* pixel) {
+  return is_near(exact[0], pixel[0]) && is_near(exact[1], pixel[1]) && is_near(exact[2], pixel[2]);
+}
+
+// Write a row of 8-bit pixels near the exact values, as `settled` says.
+void settle(const std::uint16_t* exact, int width, std::uint8_t* row) {
+  for (int column = 0; column < width;) {
+    const std::uint16_t* const here = exact + 3 * column;
+    std::uint8_t* const out = row + 3 * column;
+    if (column > 0) {
+      int run = 0;
+      while (column + run < width && is_near(here + 3 * run, out - 3)) ++run;
+      if (run >= shortest_run || (run > 0 && column + run == width)) {
+        for (int k = 0; k < 3 * run; ++k) out[k] = out[k - 3];
+        column += run;
+        continue;
+      }
+    }
+    for (int k = 0; k < 3; ++k)
+      out[k] =
+          k > 0 && is_near(here[k], out[k - 1]) ? out[k - 1] : static_cast<std::uint8_t>((here[k] + fine / 2) / fine);
+    ++column;
+  }
 }
 
 // A half float that is not NaN; infinity is 65536.
@@ -39,8 +74,7 @@ RASTER_KERNEL void add_up(float gloss, float once, float twice, const float* __r
                           int count) {
   for (int k = 0; k < count; ++k) {
     const float light = (gloss + (once + twice * other[k]) * albedo[k]) * factor[k];
-    const float bounded = light > 0.0f ? (light < 1.0f ? light : 1.0f) : 0.0f;
-    codes[k] = static_cast<std::int32_t>(bounded * (levels - 1.0f) + 0.5f);
+    codes[k] = code(light);
   }
 }
 
@@ -56,10 +90,12 @@ std::ptrdiff_t index_in(const Window& window, int column, int row) {
 void compose(const Trace& trace, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
              const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
              std::size_t stride) {
-  const std::vector<std::uint8_t>& table = encoding();
+  const std::vector<std::uint16_t>& table = encoding();
   const int colors = static_cast<int>(overall.size());
   std::vector<float> albedo(colors), factor(colors);
   std::vector<std::int32_t> codes(colors);
+  const std::size_t row_size = 3 * static_cast<std::size_t>(trace.width);
+  std::vector<std::uint16_t> exact(row_size * (colors / 3));  // a row of each picture
   for (int row = 0; row < trace.height; ++row) {
     for (int column = 0; column < trace.width; ++column) {
       const std::size_t pixel = static_cast<std::size_t>(row) * trace.width + column;
@@ -86,13 +122,25 @@ void compose(const Trace& trace, std::span<const float> overall, const Part& clo
       }
       for (int k = 0; k < colors; ++k) factor[k] = 1.0f + (1.0f - cover) * (floor[3 * pixel + k % 3] - 1.0f);
       add_up(gloss, once, twice, albedo.data(), overall.data(), factor.data(), codes.data(), colors);
-      std::uint8_t* out = pictures + 3 * pixel;
-      for (int k = 0; k < colors; k += 3, out += stride) {
+      std::uint16_t* out = exact.data() + 3 * static_cast<std::size_t>(column);
+      for (int k = 0; k < colors; k += 3, out += row_size) {
         out[0] = table[codes[k]];
         out[1] = table[codes[k + 1]];
         out[2] = table[codes[k + 2]];
       }
     }
+    for (int n = 0; n < colors / 3; ++n)
+      settle(exact.data() + n * row_size, trace.width, pictures + n * stride + row * row_size);
+  }
+}
+
+void settled(std::span<const float> light, int width, int height, std::uint8_t* picture) {
+  const std::vector<std::uint16_t>& table = encoding();
+  const std::size_t row_size = 3 * static_cast<std::size_t>(width);
+  std::vector<std::uint16_t> exact(row_size);
+  for (int row = 0; row < height; ++row) {
+    for (std::size_t k = 0; k < row_size; ++k) exact[k] = table[code(light[row * row_size + k])];
+    settle(exact.data(), width, picture + row * row_size);
   }
 }
 

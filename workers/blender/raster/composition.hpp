@@ -33,6 +33,20 @@ void compose(const Trace& trace, std::span<const float> overall, const Part& clo
              const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
              std::size_t stride);
 
+// 8-bit levels that a pixel of a clip may be away from its exact value.
+constexpr int tolerance = 1;
+// Pixels in a row that have to be near the pixel before them to take it over.
+constexpr int shortest_run = 3;
+
+// Write linear light (height x width x 3) as an 8-bit sRGB picture of few different pixels, which is smaller when
+// coded.
+//
+// In each row, from left to right: where the pixel to the left is within `tolerance` of the exact values of
+// `shortest_run` pixels or more, or of all that are left of the row, they take it over. Otherwise red is rounded, and
+// green and blue take over the level of the colour before them where it is within `tolerance`, or else are rounded.
+// `compose` writes its pictures so, too.
+void settled(std::span<const float> light, int width, int height, std::uint8_t* picture);
+
 // Return the mean of a picture that repeats over the plane z = height, seen through pixels (height x width) of a
 // camera.
 //

@@ -183,7 +183,7 @@ def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> 
     description = actor.describe()
     assert set(description["builds"]) == set(KINDS)
     assert all(map(is_sha256, description["builds"].values()))
-    assert set(description["versions"]) == {"bpy", "blender_build"}
+    assert set(description["versions"]) == {"bpy", "blender_build", "device"}
     assert RenderActor(str(tmp_path / "elsewhere")).describe() == description
 
 
@@ -277,7 +277,7 @@ def test_every_function_that_renders_is_in_the_build(
         ours = {Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")}
         built = {path.resolve() for path in sources(roots(kind), cut=UNCOUNTED).values()}
         contract = {path for path in ours if path.parent.name == "stickslip_schemas"}
-        documents = {path for path in contract if path.stem in ("cloth", "jobs")}
+        documents = {path for path in contract if path.stem in ("cloth", "jobs", "appearance")}
         registry = {path for path in ours if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")}
         assert len(ours) > 8
         assert ours - registry - documents <= built, ours - built

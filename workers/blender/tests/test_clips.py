@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from stickslip_blender import clips
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.raster import projected, see, window_about
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import Texture
@@ -42,7 +44,7 @@ def _render(renderer: ClothRenderer, sheet: Any, *textures: Texture, **look: Any
     document = ClothDragRender.model_validate(LOOK | look)
     (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
     clip = renderer.clip(document, camera, sheet.track[list(document.instants)])
-    return clip.clips(clip.trace(), textures or (Texture.gingham,))[0]
+    return clip.clips(clip.trace(), [texture_image(texture) for texture in textures or (Texture.gingham,)])[0]
 
 
 def test_a_repeat_has_the_same_bytes(renderer: ClothRenderer, sheet: Any) -> None:
@@ -58,32 +60,51 @@ def test_a_repeat_has_the_same_bytes(renderer: ClothRenderer, sheet: Any) -> Non
 _FRESH = """
 import hashlib, sys
 import numpy as np
+from stickslip_blender import clips
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import Texture
 sheet = np.load(sys.argv[1])
 look = ClothDragRender.model_validate_json(sys.argv[2])
+clips.GATE = float(sys.argv[3])
 renderer = ClothRenderer(sheet["triangles"], sheet["rest"], Holders)
 import_bpy().context.scene.render.threads = 2
 clip = renderer.clip(look, load_rig("drag")[0], sheet["track"][[0, 3]])
-video, _ = clip.clips(clip.trace(), (Texture.gingham,))
-print(hashlib.sha256(video.tobytes()).hexdigest())
+video, labels = clip.clips(clip.trace(), [texture_image(Texture.gingham)])
+print(hashlib.sha256(video.tobytes()).hexdigest(), labels["composed"])
 """
 
 
+@pytest.mark.parametrize("gate", [clips.GATE, 99.0], ids=["composed", "direct"])
 def test_a_fresh_process_with_two_threads_makes_the_same_bytes(
-    renderer: ClothRenderer, sheet: Any, tmp_path: Path
+    renderer: ClothRenderer, sheet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gate: float
 ) -> None:
+    """Also where this process has rendered other clips before, and whether clips are composed or rendered directly."""
+    monkeypatch.setattr(clips, "GATE", gate)
     np.savez(tmp_path / "sheet.npz", triangles=sheet.triangles, rest=sheet.rest, track=sheet.track)
     look = ClothDragRender.model_validate(LOOK).model_dump_json()
     done = subprocess.run(
-        [sys.executable, "-c", _FRESH, str(tmp_path / "sheet.npz"), look], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _FRESH, str(tmp_path / "sheet.npz"), look, str(gate)],
+        capture_output=True,
+        text=True,
+        check=True,
     )
+    _render(renderer, sheet, Texture.dots, viewpoint="right", substrate="ceramic", instants=(0,))
     video = _render(renderer, sheet)
-    assert done.stdout.split()[-1:] == [hashlib.sha256(video.tobytes()).hexdigest()]
+    expected = [hashlib.sha256(video.tobytes()).hexdigest(), str(gate < 99.0)]
+    assert done.stdout.split()[-2:] == expected
+
+
+def test_what_stands_still_has_the_same_bytes_in_every_frame(renderer: ClothRenderer, sheet: Any) -> None:
+    """The levels of clips, which are not rounded, depend on their own frame alone."""
+    look, picture = ClothDragRender.model_validate(LOOK), texture_image(Texture.floral)
+    clip = renderer.clip(look, load_rig("drag")[0], np.repeat(sheet.track[:1], 2, axis=0))
+    (video,), _ = clip.clips(clip.trace(), [picture])
+    assert np.array_equal(video[0], video[1])
 
 
 @pytest.mark.parametrize("view", [0, 1, 2])

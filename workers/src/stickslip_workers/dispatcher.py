@@ -33,7 +33,7 @@ from stickslip_workers.heartbeat import HeartbeatThread
 from stickslip_workers.kinds import kind, kind_names
 from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
-from stickslip_workers.settings import Settings
+from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
 from stickslip_workers.stages.run import AnyTask, with_damaged_inputs
 from stickslip_workers.together import apart, together, trace_of
 
@@ -123,6 +123,7 @@ class Dispatcher:
             "num_cpus": share,
             "start_seconds": settings.start_seconds,
             "process_bytes": settings.process_bytes,
+            "environment": {RENDER_DEVICE: settings.render_device},
         }
         self._stage_pool = Pool(
             PoolSettings(
@@ -139,6 +140,7 @@ class Dispatcher:
                 factory=settings.render_actor,
                 tasks_per_process=settings.renders_per_process,
                 python=str(settings.blender_python),
+                num_gpus=0 if settings.render_device == CPU else 1,
                 **common,
             )
         )

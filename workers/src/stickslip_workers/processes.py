@@ -45,6 +45,10 @@ class PoolSettings:
     process_bytes: int
     python: str | None = None
     """Another interpreter than this one."""
+    environment: dict[str, str] = field(default_factory=dict)
+    """Variables that each process gets besides those of the cluster."""
+    num_gpus: float = 0.0
+    """GPUs that each process has for itself."""
     tells_frames: bool = False
     """Whether a process can be asked how far it is while it works: it then has a second thread."""
 
@@ -165,7 +169,8 @@ class Pool:
             elif time.monotonic() > process.started_at + self._settings.start_seconds:
                 raise StartError(
                     f"no {self._settings.sort} process could be started within {self._settings.start_seconds:g} s; "
-                    f"each needs {self._settings.num_cpus:g} CPUs, and the cluster has free {ray.available_resources()}"
+                    f"each needs {self._settings.num_cpus:g} CPUs and {self._settings.num_gpus:g} GPUs, and the "
+                    f"cluster has free {ray.available_resources()}"
                 )
             else:
                 self._starting.append(process)
@@ -174,11 +179,12 @@ class Pool:
         import ray
 
         ray.cloudpickle.register_pickle_by_value(host)
-        runtime_env: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
+        runtime_env: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1", **self._settings.environment}}
         if self._settings.python is not None:
             runtime_env["py_executable"] = self._settings.python
         actor_class = ray.remote(
             num_cpus=self._settings.num_cpus,
+            num_gpus=self._settings.num_gpus,
             max_restarts=0,
             max_task_retries=0,
             max_concurrency=2 if self._settings.tells_frames else 1,

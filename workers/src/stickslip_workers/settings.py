@@ -1,5 +1,6 @@
 """Settings of a dispatcher."""
 
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 from stickslip_schemas.states import Stage
 
 RENDER_ACTOR = "stickslip_blender.actor:RenderActor"
+RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
+"""Environment variable that names the device that pictures are rendered on, and what it is by default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +32,8 @@ class Settings:
     """An existing Ray cluster; by default one of its own on this machine, which ends with the dispatcher."""
 
     blender_python: Path = field(default_factory=lambda: default_blender_python())
+    render_device: str = field(default_factory=lambda: os.environ.get(RENDER_DEVICE) or CPU)
+    """What Cycles computes on: `cpu`, or a sort of GPU. A render process asks Ray for a whole GPU."""
     render_actor: str = RENDER_ACTOR
     """Class, in the Blender interpreter, that is made with the root of the store and has `describe` and `render`."""
     renders_per_process: int = 1000

@@ -5,17 +5,24 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from stickslip_schemas.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, ListAxis
+from stickslip_schemas.axes import SHORTHAND, ListAxis, quantity
 from stickslip_schemas.cloth import (
+    OWN_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
+    Lighting,
     LightingAxis,
+    Own,
+    OwnName,
+    Substrate,
     SubstrateAxis,
     TextureAxis,
+    name_schema,
 )
 from stickslip_schemas.jobs import SeedRule
 
@@ -43,6 +50,8 @@ class Viewpoint(StrEnum):
     elevation_plus_15 = "elevation-plus-15"
 
 
+ViewpointName = Annotated[OwnName, quantity("Viewpoint"), name_schema(Viewpoint)]
+
 TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
 HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)
 """`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
@@ -51,10 +60,18 @@ HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_V
 class ClothDragAxes(ClothAxes):
     """What a clip of dragged cloth depends on."""
 
-    texture: TextureAxis = Field(description="pattern of the cloth; those held out are to test with")
-    viewpoint: Annotated[ListAxis[Viewpoint], SHORTHAND] = Field(description="camera of the rig, by name")
-    lighting: LightingAxis | None = Field(default=None, description="which lamps to draw from; by default `drawn`")
-    substrate: SubstrateAxis | None = Field(default=None, description="finishes of the floor; by default `matt`")
+    texture: TextureAxis = Field(
+        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+    )
+    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
+        description="camera of the rig, or one of your own under `viewpoints`"
+    )
+    lighting: LightingAxis | None = Field(
+        default=None, description="which lamps to draw from, or one of your own under `lamps`; by default `drawn`"
+    )
+    substrate: SubstrateAxis | None = Field(
+        default=None, description="finishes of the floor, or one of your own under `substrates`; by default `matt`"
+    )
 
 
 class ClothDragSimulation(ClothSimulation):
@@ -67,7 +84,6 @@ class ClothDragRender(ClothRender):
     """How a dragged cloth is seen."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
-    viewpoint: Viewpoint
 
 
 class ClothDragSpec(ClothSpec):
@@ -83,9 +99,26 @@ class ClothDragSpec(ClothSpec):
     instants = 300
     instants_per_second = 2.4
     rig = "drag"
+    own = OWN_LOOKS | {
+        "viewpoint": Own("viewpoints", "camera", tuple(Viewpoint)),
+        "lighting": Own("lamps", "lamp", tuple(Lighting)),
+        "substrate": Own("substrates", "finish", tuple(Substrate)),
+    }
 
     kind: Literal["cloth_drag"]
     axes: ClothDragAxes
+    lamps: dict[OwnName, LampNumbers] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="lamps of your own, by the names that the axis `lighting` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
+    substrates: dict[OwnName, FloorNumbers] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="floors of your own, by the names that the axis `substrate` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of dragged cloth."""
@@ -94,7 +127,7 @@ class ClothDragSpec(ClothSpec):
             ("holder_force", "force of the holders on the cloth [N]"),
         )
         return (
-            *self.clip_arrays(tuple(Viewpoint)),
+            *self.clip_arrays(),
             *self.physical_arrays(),
             ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
             ArrayLayout(

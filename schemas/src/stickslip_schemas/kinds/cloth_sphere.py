@@ -7,7 +7,18 @@ from pydantic import Field
 
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.cloth import PHYSICAL_AXES, ClothAxes, ClothRender, ClothSimulation, ClothSpec, TextureAxis
+from stickslip_schemas.cloth import (
+    OWN_LOOKS,
+    PHYSICAL_AXES,
+    ClothAxes,
+    ClothRender,
+    ClothSimulation,
+    ClothSpec,
+    Own,
+    OwnName,
+    TextureAxis,
+    name_schema,
+)
 from stickslip_schemas.jobs import SeedRule
 
 AngularSpeed = Annotated[
@@ -33,12 +44,19 @@ class SphereViewpoint(StrEnum):
     high = "high"
 
 
+ViewpointName = Annotated[OwnName, quantity("SphereViewpoint"), name_schema(SphereViewpoint)]
+
+
 class ClothSphereAxes(ClothAxes):
     """What a clip of cloth on a turning sphere depends on."""
 
     angular_speed: AngularSpeedAxis = Field(description="of the sphere about its vertical axis [rad/s]")
-    texture: TextureAxis = Field(description="pattern of the cloth; those held out are to test with")
-    viewpoint: Annotated[ListAxis[SphereViewpoint], SHORTHAND] = Field(description="camera of the rig, by name")
+    texture: TextureAxis = Field(
+        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+    )
+    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
+        description="camera of the rig, or one of your own under `viewpoints`"
+    )
 
 
 class ClothSphereSimulation(ClothSimulation):
@@ -52,7 +70,6 @@ class ClothSphereRender(ClothRender):
     """How a cloth on a turning sphere is seen."""
 
     kind: Literal["cloth_sphere"] = "cloth_sphere"
-    viewpoint: SphereViewpoint
     angular_speed: float
 
 
@@ -69,6 +86,7 @@ class ClothSphereSpec(ClothSpec):
     instants = 150
     instants_per_second = 15.0
     rig = "sphere-3"
+    own = OWN_LOOKS | {"viewpoint": Own("viewpoints", "camera", tuple(SphereViewpoint))}
 
     kind: Literal["cloth_sphere"]
     axes: ClothSphereAxes
@@ -82,7 +100,7 @@ class ClothSphereSpec(ClothSpec):
         )
         bias = "what broke the symmetry: horizontal (x, y) over vertical gravity until the sphere turns"
         return (
-            *self.clip_arrays(tuple(SphereViewpoint)),
+            *self.clip_arrays(),
             *self.physical_arrays(),
             ArrayLayout("angular_speed", "float64", (), (), "of the sphere about its vertical axis [rad/s]", fill=NAN),
             ArrayLayout("bias", "float64", (2,), ("xy",), bias, fill=NAN),

@@ -24,6 +24,7 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
     errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),
     errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
+    errors.UnknownTextureError: (422, ProblemCode.validation_failed),
     errors.MissingArtifactError: (500, ProblemCode.storage_error),
 }
 
@@ -116,7 +117,7 @@ def _problem(request: Request, error: Exception) -> Response:
 def _stickslip_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, errors.StickslipError)
     status, code = _STATUS[type(error)]
-    fields = []
+    fields = error.fields if isinstance(error, errors.UnknownTextureError) else []
     if isinstance(error, errors.PresetNotCertifiedError):
         fields = [FieldError(pointer="/preset", rule=error.rule, value=json.dumps(error.preset))]
     if status >= 500:

@@ -12,6 +12,7 @@ from stickslip_services.cli.datasets import export, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
 from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.reindex import reindex
+from stickslip_services.cli.textures import upload
 from stickslip_services.cli.up import up
 from stickslip_services.cli.upkeep import gc, rm
 from stickslip_services.cli.workers import workers
@@ -36,6 +37,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "up": up,
     "workers": workers,
     "validate": validate,
+    "upload": upload,
     "submit": submit,
     "jobs": jobs,
     "show": show,

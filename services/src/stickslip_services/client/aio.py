@@ -19,6 +19,7 @@ from stickslip_schemas.responses import (
     Page,
     Preview,
     SampleState,
+    TextureEntry,
     Validation,
     WorkerEntry,
 )
@@ -84,6 +85,10 @@ class AsyncClient:
     ) -> JobDetail:
         """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
         return await self._ask(calls.submit(spec, idempotency_key, priority))
+
+    async def upload_texture(self, picture: bytes) -> TextureEntry:
+        """Upload a PNG or JPEG file as a texture, for specs to name under `textures`."""
+        return await self._ask(calls.upload_texture(picture))
 
     async def job(self, job_id: str) -> JobDetail:
         """Return a job."""

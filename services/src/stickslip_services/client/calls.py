@@ -29,6 +29,7 @@ from stickslip_schemas.responses import (
     Page,
     Preview,
     SampleState,
+    TextureEntry,
     Validation,
     WorkerEntry,
 )
@@ -217,6 +218,13 @@ def register(upload: CertificateUpload) -> Call[CertificateEntry]:
     """Register a certificate."""
     options = {"content": upload.model_dump_json(), "headers": {"Content-Type": "application/json"}}
     return Call("POST", "/v1/certificates", TypeAdapter(CertificateEntry), options)
+
+
+def upload_texture(picture: bytes) -> Call[TextureEntry]:
+    """Upload a texture."""
+    media_type = "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
+    options = {"content": picture, "headers": {"Content-Type": media_type}}
+    return Call("POST", "/v1/textures", TypeAdapter(TextureEntry), options)
 
 
 def next_page(call: Call[Page[T]], answer: Page[T] | None) -> Call[Page[T]] | None:

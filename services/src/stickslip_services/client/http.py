@@ -19,6 +19,7 @@ from stickslip_schemas.responses import (
     Page,
     Preview,
     SampleState,
+    TextureEntry,
     Validation,
     WorkerEntry,
 )
@@ -85,6 +86,10 @@ class Client:
     def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0) -> JobDetail:
         """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
         return self._ask(calls.submit(spec, idempotency_key, priority))
+
+    def upload_texture(self, picture: bytes) -> TextureEntry:
+        """Upload a PNG or JPEG file as a texture, for specs to name under `textures`."""
+        return self._ask(calls.upload_texture(picture))
 
     def job(self, job_id: str) -> JobDetail:
         """Return a job."""

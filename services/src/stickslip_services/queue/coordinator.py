@@ -29,6 +29,7 @@ from stickslip_schemas.worker_api import (
 )
 
 from stickslip_services.catalog.certificates import insert_certificate, store_certificate
+from stickslip_services.catalog.textures import check_textures
 from stickslip_services.catalog.versions import ManifestSummary, check_output, damaged_files, read_version
 from stickslip_services.clock import Clock
 from stickslip_services.database import migrate
@@ -138,6 +139,7 @@ class Coordinator:
 
     def submit(self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer."""
+        check_textures(self.store, spec)
         with collector_at_rest():
             return self._submit(spec, idempotency_key, priority)
 

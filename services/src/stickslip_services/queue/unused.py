@@ -51,7 +51,9 @@ def _needed(database: Database, store: Store) -> set[bytes]:
         for texts in connection.execute(select(tasks.c.output, tasks.c.payload)):
             for text in texts:
                 add(*_DIGEST.findall(text or ""))
-        add(*connection.scalars(select(previews.c.digest)), *connection.scalars(select(jobs.c.manifest)))
+        add(*connection.scalars(select(previews.c.digest)))
+        for manifest, spec in connection.execute(select(jobs.c.manifest, jobs.c.spec)):
+            add(manifest, *_DIGEST.findall(spec))  # a spec names textures, also before its tasks are planned
         for certificate in connection.execute(select(certificates.c.artifact, certificates.c.page)):
             add(*certificate)
         columns = dataset_versions.c

@@ -1,6 +1,7 @@
 """The commands `stickslip-train cloth ...`: friction and material of dragged cloth from video."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,7 @@ from stickslip_training.data.reader import DatasetReader
 if TYPE_CHECKING:
     from stickslip_training.cloth.evaluation import Errors, Scores
     from stickslip_training.cloth.runs import Runs
+    from stickslip_training.cloth.training import RenderedClips
 
 cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
 
@@ -35,10 +37,18 @@ def train(
     split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
+    clips: Annotated[
+        str | None,
+        typer.Option(help="train on these clips of Blender, too: a dataset, or a file of blender_clips.py (.npz)"),
+    ] = None,
+    start: Annotated[Path | None, typer.Option(help="a friction.safetensors whose weights are the first")] = None,
+    rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
     """Train a network that tells material and friction, on pictures rendered from simulations while it trains."""
-    from stickslip_training.cloth.training import ClothTraining, save_friction, train_friction
+    from stickslip_schemas.keys import sha256
+
+    from stickslip_training.cloth.training import ClothTraining, load_friction, save_friction, train_friction
     from stickslip_training.engine.fit import EpochReport
 
     console = Console()
@@ -48,11 +58,27 @@ def train(
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
     with errors_told():
-        settings = ClothTraining(steps=steps, seed=seed, threads=threads, device=check_device(device))
+        settings = ClothTraining(
+            steps=steps, learning_rate=rate, seed=seed, threads=threads, device=check_device(device)
+        )
+        first = None if start is None else load_friction(start)
+        if start is not None:
+            # The order of mu is known: the network is told as sharply as it was in the end.
+            settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
         source, parts = _splits(runs, split_seed)
         source["split_seed"] = split_seed
+        source["start"] = None if start is None else sha256(start.read_bytes())
+        source["clips"], rendered = (None, None) if clips is None else _clips(clips, runs, parts["train"], split_seed)
         model = train_friction(
-            parts["train"], parts["validation"], settings, out=out, identity=source, resume=resume, on_epoch=tell
+            parts["train"],
+            parts["validation"],
+            settings,
+            clips=rendered,
+            start=first,
+            out=out,
+            identity=source,
+            resume=resume,
+            on_epoch=tell,
         )
         model.card.update(source)
         save_friction(out / "friction.safetensors", model)
@@ -244,6 +270,30 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
             if len(reader.slots(_split(split)))
         }
         return named, splits
+
+
+def _clips(source: str, runs: str, train: "Runs", seed: int) -> "tuple[str, RenderedClips]":
+    """Return what names the clips, and those of the splits train and validation."""
+    import numpy as np
+    from stickslip_schemas.keys import sha256
+
+    from stickslip_training.cloth.clips import clips_of_file, read_clips
+    from stickslip_training.cloth.runs import load_runs, split_of_runs
+    from stickslip_training.cloth.training import RenderedClips
+
+    if not source.endswith(".npz"):
+        with DatasetReader(source) as reader:
+            learned, judged = (read_clips(reader, _split(part), train.materials)[0] for part in ("train", "validation"))
+            # Simulations have numbers by split.
+            return reader.manifest_digest, RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
+    if not runs.endswith(".npz"):
+        raise ValueError(f"runs must be the packed file that the clips are of, and are {runs}")
+    known, _ = clips_of_file(Path(source), train.materials)
+    split = split_of_runs(load_runs(runs), SHARES, seed)
+    if known.run.max() >= len(split) or (split[known.run] == 2).any():
+        raise ValueError(f"{source} must not show simulations to test with: it has some of the split test of {runs}")
+    learned, judged = (known[np.flatnonzero(split[known.run] == part)] for part in (0, 1))
+    return sha256(Path(source).read_bytes()), RenderedClips(learned, judged)
 
 
 def _split(name: str) -> Any:

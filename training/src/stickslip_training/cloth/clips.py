@@ -1,12 +1,17 @@
 """The clips of a dataset as a network sees them."""
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
+from stickslip_schemas.cameras import load_rig
 
 from stickslip_training.arrays import Array, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.runs import landed_side
-from stickslip_training.cloth.training import Clips, frames_at
+from stickslip_training.cloth.training import RIG, Clips, frames_at
 from stickslip_training.data.reader import DatasetReader, Split
 
 _CHUNK = 8  # clips in memory at once
@@ -39,6 +44,28 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
         torch.cat(crops), seen.rotation[:, 2], material, mu, _landed(reader, slots), simulations(reader, slots)
     )
     return clips, slots
+
+
+def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[dict[str, Any]]]:
+    """Return the crops of the clips that `benchmarks/training/blender_clips.py` wrote, and what is true of each.
+
+    `Clips.run` is the number of the simulation in the packed file that the clips are of.
+    """
+    with np.load(path) as file:
+        if not {"video", "instants", "about"} <= set(file.files):
+            raise ValueError(f"{path} must be a file of clips with video, instants and about: it has {file.files}")
+        video, shown = file["video"], tuple(map(int, file["instants"]))
+        about = [json.loads(str(line)) for line in file["about"]]
+    frames, instants = frames_at(shown)
+    named = {camera.name: camera for camera in load_rig(RIG)}
+    seen = Cameras.of([named[clip["viewpoint"]] for clip in about])
+    crops = [
+        cut(grey(torch.from_numpy(video[i : i + 1, frames])), holder_crops(seen[i : i + 1], instants))
+        for i in range(len(video))
+    ]
+    known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
+    told = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
+    return Clips(torch.cat(crops), seen.rotation[:, 2], np.array(known), *told), about
 
 
 def check_kind(reader: DatasetReader) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+from numpy.typing import NDArray
 from stickslip_schemas.cameras import Camera, load_rig
 from stickslip_schemas.store import write_durably
 from torch import nn
@@ -101,9 +102,39 @@ class Clips:
     def __len__(self) -> int:
         return len(self.mu)
 
+    def __getitem__(self, chosen: Integers | NDArray[np.bool_]) -> "Clips":
+        which = torch.from_numpy(np.asarray(chosen))
+        return Clips(
+            self.crops[which],
+            self.direction[which],
+            self.material[chosen],
+            self.mu[chosen],
+            self.landed[chosen],
+            self.run[chosen],
+        )
+
     def truth(self) -> Truth:
         """Return what is true of the clips, as scores ask for it."""
         return Truth(self.material, self.mu, self.landed, self.run)
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedClips:
+    """Clips of another renderer to train on besides the pictures that are rendered while training.
+
+    Half of each batch is then of `train`; `validation` chooses the weights and the temperature.
+    """
+
+    train: Clips
+    validation: Clips
+
+    def __post_init__(self) -> None:
+        for name in ("train", "validation"):
+            part: Clips = getattr(self, name)
+            if not len(part) or (part.material < 0).any():
+                raise ValueError(f"the clips for {name} must be some, and of materials of the runs: {len(part)} clips")
+        if shared := set(self.train.run.tolist()) & set(self.validation.run.tolist()):
+            raise ValueError(f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +174,8 @@ def train_friction(
     validation: Runs,
     settings: ClothTraining,
     *,
+    clips: RenderedClips | None = None,
+    start: FrictionModel | None = None,
     out: Path | None = None,
     identity: dict[str, Any] | None = None,
     resume: bool = False,
@@ -151,10 +184,11 @@ def train_friction(
 ) -> FrictionModel:
     """Train a network on runs, calibrate it on others, and return both as a model.
 
-    `identity` names the runs for a run that is resumed. Validation chooses the weights and the temperature.
+    `clips` are trained on, too; `start` is a model whose weights are the first. `identity` names the runs, and these,
+    for a run that is resumed. Validation chooses the weights and the temperature.
     """
     with torch_threads(settings.threads):
-        learner = _FrictionLearner(train, validation, settings)
+        learner = _FrictionLearner(train, validation, settings, clips, start)
         fitted = fit(
             learner,
             FitSettings(
@@ -185,6 +219,7 @@ def train_friction(
         "settings": asdict(settings),
         "training_runs": len(train),
         "validation_runs": len(validation),
+        "training_clips": 0 if clips is None else len(clips.train),
         "steps": fitted.steps,
         "best_step": fitted.best_step,
         "seconds": round(fitted.seconds, 1),
@@ -304,6 +339,21 @@ def render_clips(
     )
 
 
+def jittered(crops: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Return crops (B, F, H, W) with a gamma, gain, offset and shift of each clip's own, and noise.
+
+    They differ as other exposures and registrations would; values stay about 0 to 1.
+    """
+
+    def drawn(deviation: float) -> torch.Tensor:
+        return deviation * torch.randn(len(crops), 1, 1, 1, generator=generator)
+
+    changed = crops.clamp(1e-3, 1.0) ** torch.exp(drawn(0.25)) * torch.exp(drawn(0.15)) + drawn(0.05)
+    shifts = torch.randint(-1, 2, (len(crops), 2), generator=generator).tolist()
+    moved = [torch.roll(clip, shift, (1, 2)) for clip, shift in zip(changed, shifts, strict=True)]
+    return torch.stack(moved) + 0.01 * torch.randn(crops.shape, generator=generator)
+
+
 def _turned(cameras: Cameras, turn: tuple[float, float], spread: float, generator: torch.Generator) -> Cameras:
     drawn = spread * torch.randn(2, len(cameras.focal), generator=generator)
     azimuth, elevation = (torch.deg2rad(angle + random) for angle, random in zip(turn, drawn, strict=True))
@@ -313,7 +363,14 @@ def _turned(cameras: Cameras, turn: tuple[float, float], spread: float, generato
 class _FrictionLearner(Learner):
     """Every step draws runs, or meshes between two neighbours in mu, mirrors half of them, and renders them anew."""
 
-    def __init__(self, train: Runs, validation: Runs, settings: ClothTraining) -> None:
+    def __init__(
+        self,
+        train: Runs,
+        validation: Runs,
+        settings: ClothTraining,
+        clips: RenderedClips | None = None,
+        start: FrictionModel | None = None,
+    ) -> None:
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
@@ -324,12 +381,22 @@ class _FrictionLearner(Learner):
         widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
         self.rig = training_cameras()
-        self.validation = render_clips(validation, 6, settings.seed, spread=settings.turn)
+        self.clips = clips
+        self.validation = (
+            render_clips(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
+        )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
         with seeded(settings.seed):
             self.net = PosteriorNet(
                 materials=len(train.materials), bins=MU_BINS.count, frames=len(self.frames), width=settings.width
             )
+        if start is not None:
+            if start.materials != train.materials or start.nets[0].sizes != self.net.sizes:
+                raise ValueError(
+                    f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
+                    f"{', '.join(start.materials)}, and is {start.nets[0].sizes}"
+                )
+            self.net.load_state_dict(start.nets[0].state_dict())
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
@@ -367,7 +434,18 @@ class _FrictionLearner(Learner):
         crops = render_crops(meshes, cameras, self.instants, looks, generator)
         first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
         mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32))
-        return crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu
+        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu
+        if self.clips is None:
+            return rendered
+        some = self.clips.train[random.integers(len(self.clips.train), size=count // 2)]
+        told = (
+            jittered(some.crops, generator),
+            some.direction,
+            torch.from_numpy(some.material),
+            torch.from_numpy(some.mu.astype(np.float32)),
+        )
+        a, b, c, d = (torch.cat([own[: count - len(some)], given]) for own, given in zip(rendered, told, strict=True))
+        return a, b, c, d
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)

@@ -13,6 +13,7 @@ from typing import Any
 from stickslip_schemas.tasks import RenderTask
 
 from stickslip_blender.build import blender_version, build_digest
+from stickslip_blender.device import described
 from stickslip_blender.scenes import kind_names, renders
 from stickslip_blender.workshop import Workshop, check_rig
 
@@ -29,7 +30,10 @@ class RenderActor:
 
     def describe(self) -> dict[str, Any]:
         """Return the build of each kind and versions; the same for every process of one installation."""
-        return {"builds": {kind: build_digest(kind) for kind in kind_names()}, "versions": blender_version()}
+        return {
+            "builds": {kind: build_digest(kind) for kind in kind_names()},
+            "versions": blender_version() | {"device": " ".join(map(str, described().values()))},
+        }
 
     def render(self, task: dict[str, Any]) -> dict[str, Any]:
         """Render the sample of a `RenderTask`; return a `TaskResult`."""

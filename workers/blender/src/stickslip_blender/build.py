@@ -9,9 +9,10 @@ from stickslip_schemas.keys import content_key
 from stickslip_schemas.sources import UNCOUNTED, digests, sources
 
 from stickslip_blender.blender import import_bpy
+from stickslip_blender.device import described
 from stickslip_blender.raster._raster import BUILD_HASH
 
-_LIBRARIES = ("numcodecs", "google-crc32c", "numpy")
+_LIBRARIES = ("numcodecs", "google-crc32c", "numpy", "pillow")
 
 
 def blender_version() -> dict[str, str]:
@@ -34,5 +35,6 @@ def build_digest(kind: str) -> str:
         "raster": BUILD_HASH,
         "libraries": {library: metadata.version(library) for library in _LIBRARIES},
         **blender_version(),
+        **described(),
     }
     return content_key("build/render", content)

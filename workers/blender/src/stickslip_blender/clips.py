@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera, load_rig
 from stickslip_schemas.chunks import decode_chunk, encode_chunk
-from stickslip_schemas.keys import content_key
+from stickslip_schemas.keys import content_key, referred
 from stickslip_schemas.tasks import RenderOutput, TaskResult
 from stickslip_schemas.textures import Texture
 
@@ -25,12 +25,12 @@ from stickslip_blender.geometry import FLOOR, Geometry, Set
 from stickslip_blender.ground_truth import ground_truth
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import Look, grained, look_of
-from stickslip_blender.multiplexed import Sight, encode
+from stickslip_blender.multiplexed import Sight, settled
 from stickslip_blender.preview import moving
 from stickslip_blender.raster import Textures
 from stickslip_blender.stage import ClothStage, Shot
 from stickslip_blender.substrates import drawn_substrate, floor_factor
-from stickslip_blender.textures import texture_image
+from stickslip_blender.textures import own_texture, texture_image
 from stickslip_blender.workshop import Workshop, why_unfit
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ class ClothRenderer:
         track = self.geometry.checked(positions)
         fabric = look_of(look.material)
         self.geometry.surface.dress(hem=1e-3 * fabric.hem, creases=look.creases, seed=look.crease_seed)
-        light = drawn_light(look.lighting.value, look.light_seed)
-        substrate = drawn_substrate(look.substrate.value, look.light_seed)
+        light = drawn_light(look.lighting, look.light_seed, look.lamp)
+        substrate = drawn_substrate(look.substrate, look.light_seed, look.finish)
         self.stage.set_up(camera, light, substrate, fabric)
         shots = [self.stage.shot(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
         floor = floor_factor(substrate, camera, FLOOR)
@@ -96,8 +96,8 @@ class ClothRenderer:
             "light_seed": look.light_seed,
             "light": light.numbers,
             "floor": substrate.numbers,
-            "lighting": look.lighting.value,
-            "substrate": look.substrate.value,
+            "lighting": look.lighting,
+            "substrate": look.substrate,
             "creases": look.creases,
         }
         return ClipRenderer(self.stage, camera, shots, floor, fabric, chosen, look.light_seed, labels)
@@ -134,9 +134,12 @@ class ClipRenderer:
         self._compose(light, shot, Textures([picture]), composed)
         return block_decibels(composed[0][window.slices], direct)
 
-    def clips(self, trace: Trace, textures: Sequence[Texture]) -> tuple[Clip, dict[str, Any]]:
-        """Return the clips of textures (textures, frames, height, width, 3), and labels that they share."""
-        pictures = [grained(texture_image(texture), self.fabric) for texture in textures]
+    def clips(self, trace: Trace, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
+        """Return the clips of textures, and labels that they share.
+
+        Textures: pictures as `texture_image` returns them; clips: shape (textures, frames, height, width, 3).
+        """
+        pictures = [grained(texture, self.fabric) for texture in textures]
         packed = Textures(pictures)
         camera = self.camera
         videos = np.empty((len(pictures), len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
@@ -176,7 +179,7 @@ class ClipRenderer:
             )
 
     def _finished(self, light: npt.NDArray[np.float16], shot: Shot) -> Clip:
-        return encode(self.stage.composer.on_floor(light, shot.points, self.camera, self.floor))
+        return settled(self.stage.composer.on_floor(light, shot.points, self.camera, self.floor))
 
 
 def block_decibels(one: Clip, other: Clip) -> float:
@@ -194,7 +197,7 @@ def render_clips(
 
     `set_key` says what else the stage depends on.
     """
-    (camera,) = (camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
+    camera = look.camera or next(camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
     track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")
     if rejected := why_unfit("cloth", track, 0.0, (camera,)):
         return rejected
@@ -205,8 +208,8 @@ def render_clips(
     clip = renderer.clip(look, camera, track[list(look.instants)])
     trace = _trace(clip, look, task, workshop)
     known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}
-    wanted = [Texture(name) for name in task.textures] or [look.texture]
-    videos, labels = clip.clips(trace, wanted)
+    wanted = task.textures or (look.variant,)
+    videos, labels = clip.clips(trace, [_picture(name, workshop) for name in wanted])
     if not task.textures:
         preview = workshop.store.publish(moving(videos[0])) if task.preview else None
         chunks = {"video": workshop.clip(videos[0]), **known}
@@ -220,6 +223,12 @@ def render_clips(
         else {},
     )
     return TaskResult(outcome="succeeded", output=output)
+
+
+def _picture(texture: str, workshop: Workshop) -> Clip:
+    """Return the picture of a texture that is built in, or that a user has put into the store."""
+    digest = referred(texture)
+    return texture_image(Texture(texture)) if digest is None else own_texture(workshop.store.read(digest))
 
 
 def _trace(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Trace:

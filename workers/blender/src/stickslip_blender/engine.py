@@ -1,4 +1,4 @@
-"""Settings of the render engine that every scene shares: Cycles on the CPU, one thread, a fixed seed."""
+"""Settings of the render engine that every scene shares: Cycles on one device, one thread, a fixed seed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, Literal
 from stickslip_schemas.jobs import Quality
 
 from stickslip_blender.blender import import_bpy
+from stickslip_blender.device import CPU, device, use_device
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def _set_up_cycles(scene: Any) -> None:
     render.use_compositing = False
     render.use_sequencer = False
     render.resolution_percentage = 100
-    cycles.device = "CPU"
+    use_device(scene)
     cycles.use_animated_seed = False
     cycles.use_adaptive_sampling = False
     cycles.time_limit = 0.0
@@ -108,4 +109,4 @@ def set_sampling(scene: Any, sampling: Sampling) -> None:
         cycles.denoising_quality = "FAST"
         cycles.denoising_prefilter = "NONE"
         cycles.denoising_input_passes = "RGB" if sampling.denoiser == "plain" else "RGB_ALBEDO_NORMAL"
-        cycles.denoising_use_gpu = False
+        cycles.denoising_use_gpu = device() != CPU

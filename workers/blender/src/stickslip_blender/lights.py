@@ -6,8 +6,12 @@ One lamp follows the cloth along the stage [thesis, 4.2.3], so that the cloth is
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from stickslip_schemas.appearance import LampNumbers
 
 # azimuth, elevation [degree], power: what `drawn` trains on, and what no training light has.
 _RANGES: dict[str, tuple[tuple[float, float], ...]] = {
@@ -35,9 +39,13 @@ class Light:
         return list(astuple(self))
 
 
-def drawn_light(name: str, seed: int) -> Light:
-    """Draw a lamp from a named range."""
-    if name not in _RANGES:
+def drawn_light(name: str, seed: int, own: LampNumbers | None = None) -> Light:
+    """Draw a lamp from a named range, or from one of the user's own."""
+    if own is not None:
+        ranges: tuple[tuple[float, float], ...] = (own.azimuth, own.elevation, own.power)
+    elif name in _RANGES:
+        ranges = _RANGES[name]
+    else:
         raise ValueError(f"light must be one of {', '.join(LIGHTS)}; got {name!r}")
     uniform = np.random.Generator(np.random.PCG64(seed)).uniform
-    return Light(*(float(uniform(low, high)) for low, high in _RANGES[name]))
+    return Light(*(float(uniform(low, high)) for low, high in ranges))

@@ -11,6 +11,10 @@ A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture i
 
 in linear light, for each of the texture's colours. Off the cloth D is light that the cloth threw there: A is m, or what
 a floor that mirrors shows of the cloth, blurred as much as its roughness does.
+
+Pictures of clips are not rounded to the nearest levels. Each level is within TOLERANCE of the exact value, and chosen
+so that neighbours are equal where they may be: pixels in a row, and the colours of grey. Clips are a sixth smaller for
+it.
 """
 
 from __future__ import annotations
@@ -27,6 +31,9 @@ from stickslip_blender.substrates import Substrate
 
 ALBEDOS = (0.0, 0.5, 0.9)
 """The cloth's base colour in a trace."""
+
+TOLERANCE: int = _raster.TOLERANCE
+"""How far the pixels of a clip may be from their exact values [8-bit levels]; raster/composition.hpp chooses them."""
 
 _MIRROR_GRID = 8
 _LOBE = 1.9  # radius of a box, twice applied, over the width of the lobe that it stands for; compared with Cycles
@@ -53,6 +60,15 @@ def encode(light: Floats) -> npt.NDArray[np.uint8]:
     scaled += 0.5
     coded: npt.NDArray[np.uint8] = _ENCODED[scaled.astype(np.uint16)]
     return coded
+
+
+def settled(light: Floats) -> npt.NDArray[np.uint8]:
+    """Return linear light (height, width, 3) as the 8-bit sRGB of a clip: within `TOLERANCE`, with pixels alike.
+
+    It depends on nothing but this picture.
+    """
+    picture: npt.NDArray[np.uint8] = _raster.settled(np.ascontiguousarray(light, dtype=np.float32))
+    return picture
 
 
 @dataclass(frozen=True)
@@ -84,7 +100,7 @@ class Composer:
         """Compose one frame's trace (height, width, 3) with all textures, into `pictures`.
 
         Points: all vertices of the stage at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
-        8-bit sRGB, shape (textures, height, width, 3).
+        8-bit sRGB, chosen as in `settled`, shape (textures, height, width, 3).
         """
         seen = see(projected(camera, points), self._geometry.triangles, self._window(points, camera))
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)

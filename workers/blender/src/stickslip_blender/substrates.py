@@ -6,13 +6,16 @@ import tomllib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.cameras import Camera
 
 from stickslip_blender.raster import _raster
+
+if TYPE_CHECKING:
+    from stickslip_schemas.appearance import FloorNumbers
 
 GRAIN_SIZE = 512
 """Side of the picture of a floor's grain [texels]."""
@@ -65,17 +68,17 @@ def substrate_names() -> tuple[str, ...]:
     return (*_ranges(), "any")
 
 
-def drawn_substrate(name: str, seed: int) -> Substrate:
-    """Draw a substrate of a finish."""
-    if name not in substrate_names():
+def drawn_substrate(name: str, seed: int, own: FloorNumbers | None = None) -> Substrate:
+    """Draw a substrate of a finish, or of one of the user's own."""
+    if own is None and name not in substrate_names():
         raise ValueError(f"substrate must be one of {', '.join(substrate_names())}; got {name!r}")
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     finish = str(random.choice(["matt", *HARD])) if name == "any" else name
-    ranges = _ranges()[finish]
-    tint = (1.0, 1.0, 1.0)
+    ranges = _ranges()[finish] if own is None else own.model_dump()
+    color = np.array(ranges.get("tint", (1.0, 1.0, 1.0)))
     if finish == "cloth":
         color = 0.15 + 0.85 * random.random(3)
-        tint = tuple((color / color.mean()).tolist())
+    r, g, b = (color / color.mean()).tolist()
     return Substrate(
         name=finish,
         albedo=float(random.uniform(*ranges["albedo"])),
@@ -84,7 +87,7 @@ def drawn_substrate(name: str, seed: int) -> Substrate:
         specular=ranges["specular"],
         grain=ranges["grain"],
         seed=int(random.integers(2**31)),
-        tint=tint,
+        tint=(r, g, b),
     )
 
 

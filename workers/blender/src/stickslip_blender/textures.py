@@ -10,6 +10,8 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
+from stickslip_schemas.pictures import read_picture
 from stickslip_schemas.textures import Texture
 
 SIZE = 512
@@ -31,6 +33,16 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     mean: npt.NDArray[np.uint8] = np.rint(boxes.mean(axis=(1, 3))).astype(np.uint8)
     mean.flags.writeable = False  # it is kept for the next who asks
     return mean
+
+
+def own_texture(data: bytes) -> npt.NDArray[np.uint8]:
+    """Return the picture in a file of the user's own, as `texture_image` does; its upper edge is the held one.
+
+    Raises:
+        UnfitPictureError: It is no picture that a cloth can be printed with.
+    """
+    picture = Image.fromarray(np.flipud(read_picture(data))).resize((SIZE, SIZE), Image.Resampling.BILINEAR)
+    return np.asarray(picture, dtype=np.uint8)
 
 
 def _mix(where: npt.NDArray[np.bool_] | Field, there: Rgb | Field, elsewhere: Rgb | Field) -> Field:

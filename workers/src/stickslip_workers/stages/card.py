@@ -108,11 +108,15 @@ def _pictures(manifest: Manifest) -> list[str]:
         f"The pictures have the quality `{pictures.quality}`: {pictures.psnr_db:g} dB over the pixels of what they "
         "show, against pictures of 256 samples with another noise, as measured when the quality was set."
     )
+    if pictures.device != "cpu":
+        text += f" They were rendered on a GPU ({pictures.device})."
     if pictures.gate_db is not None:
         text += (
             f" One trace serves all textures; the image gate found {pictures.gate_db:.1f} dB or more. "
             f"Samples that it had rendered directly instead: {len(pictures.direct_slots)}."
         )
+    if pictures.frame_share is not None:
+        text += f" The cloth fills {100 * pictures.frame_share:.1f} % of a frame, in the mean."
     return [text]
 
 

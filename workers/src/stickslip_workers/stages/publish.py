@@ -1,5 +1,6 @@
 """Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from stickslip_schemas.samples import SPLITS, dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store
 from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskResult
 
+from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, card
 from stickslip_workers.stages.metadata import metadata_files
 from stickslip_workers.stages.preview import PREVIEW_NAME, pictured, preview
@@ -107,16 +109,19 @@ def _pictures(task: PublishTask, store: Store) -> Pictures | None:
     measured = task.spec.picture_decibels()
     if measured is None:
         return None
-    gate, direct = None, np.empty(0, dtype=int)
+    gate, share, direct = None, None, np.empty(0, dtype=int)
     if any(array.name == "gate_db" for array in layout(task.spec)):
         valid = _column("valid", task, store)
-        found = _column("gate_db", task, store)[valid]
-        gate = round(float(found.min()), 2) if found.size else None
+        if valid.any():
+            gate = round(float(_column("gate_db", task, store)[valid].min()), 2)
+            share = round(float(_column("frame_share", task, store)[valid].mean()), 4)
         direct = np.flatnonzero(valid & ~_column("composed", task, store))
     return Pictures(
         quality=task.spec.quality,
         psnr_db=measured,
         gate_db=gate,
+        frame_share=share,
+        device=os.environ.get(RENDER_DEVICE) or CPU,  # all workers of this version's builds have the same
         direct_slots=tuple(direct.tolist()),
     )
 

@@ -13,6 +13,7 @@ from stickslip_services.api.files import matches
 from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
 from stickslip_services.api.sse import OPENAPI as STREAM
 from stickslip_services.api.sse import Feeds
+from stickslip_services.catalog.textures import check_textures
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.jobs import Replay, etag, find_job, list_jobs, list_previews, list_samples
 from stickslip_services.queue.validating import validate
@@ -76,6 +77,7 @@ def post_job(
 @router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
 def validate_job(spec: SpecBody, coordinator: CoordinatorDep) -> Validation:
     """Tell what a job would be, without making one."""
+    check_textures(coordinator.store, spec)
     return validate(coordinator.database, spec)
 
 

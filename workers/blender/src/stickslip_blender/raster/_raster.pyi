@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 _Part = tuple[int, int, int, int]
 
 BUILD_HASH: str
+TOLERANCE: int
 
 def visible(
     points: NDArray[np.float64], triangles: NDArray[np.int32], window: _Part, grid: int
@@ -34,6 +35,7 @@ def compose(
     reflectance: float,
     pictures: NDArray[np.uint8],
 ) -> None: ...
+def settled(light: NDArray[np.float32]) -> NDArray[np.uint8]: ...
 def tiled(
     picture: NDArray[np.float64],
     density: float,

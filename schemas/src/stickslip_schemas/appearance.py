@@ -1,0 +1,143 @@
+"""How things look that a user brings along: pictures, cameras, lamps and floors, for a spec to name."""
+
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, Strict, model_validator
+
+from stickslip_schemas.base import WHOLE, Document, Float
+from stickslip_schemas.cameras import Camera
+
+CLIP_SIZE = 224
+"""Width and height of a clip [px]."""
+
+FARTHEST = 4.0
+"""How far a camera may be from the middle of the stage along each axis [m]: the floor ends at 8 m."""
+LOWEST = 0.02
+"""How high a camera has to be above the floor [m]."""
+
+_TOLERANCE = 1e-9
+
+Azimuth = Annotated[Float, Field(ge=-180, le=180)]
+Elevation = Annotated[Float, Field(ge=5, le=90)]
+Power = Annotated[Float, Field(ge=0.05, le=10)]
+Share = Annotated[Float, Field(ge=0, le=1)]
+Roughness = Annotated[Float, Field(ge=0.01, le=1)]
+Tint = Annotated[Float, Field(ge=0.05, le=1)]
+Pixels = Annotated[int, Strict(), Field(ge=16, le=16384), WHOLE]
+Row = tuple[Float, Float, Float]
+
+
+class _Ranges(Document):
+    """Pairs are ranges that a seed draws from, `[low, high]`."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) == 2 and not value[0] <= value[1]:
+                raise ValueError(f"{name} must be [low, high], low at most high, and it is {list(value)}")
+        return self
+
+
+class LampNumbers(_Ranges):
+    """A lamp of your own.
+
+    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation.
+    """
+
+    azimuth: tuple[Azimuth, Azimuth] = Field(
+        description="direction of the lamp, seen from the cloth, from +x towards +y [degree], from -180 to 180"
+    )
+    elevation: tuple[Elevation, Elevation] = Field(
+        description="direction of the lamp above the floor [degree], from 5 to 90"
+    )
+    power: tuple[Power, Power] = Field(description="power over the nominal, from 0.05 to 10; `drawn` has 0.8 to 1.25")
+
+
+class FloorNumbers(_Ranges):
+    """A floor of your own.
+
+    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation. The image gate says how
+    well a floor can be composed, and clips are rendered directly where it cannot.
+    """
+
+    albedo: tuple[Share, Share] = Field(
+        description="share of the light that it scatters, or that a metal reflects, 0 to 1"
+    )
+    roughness: tuple[Roughness, Roughness] = Field(description="of its gloss, from 0.01 to 1; 0.02 is a mirror")
+    metallic: Share = Field(default=0.0, description="1 for a metal")
+    specular: Share = Field(default=0.5, description="gloss of what is no metal; 0.5 has an index of refraction of 1.5")
+    grain: Share = Field(default=0.1, description="contrast of its marks; without any, motion over it does not show")
+    tint: tuple[Tint, Tint, Tint] = Field(
+        default=(1.0, 1.0, 1.0),
+        description="its colour, linear red, green and blue, from 0.05 to 1; only their ratios count",
+    )
+
+
+class Calibration(Document):
+    """A camera of your own, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
+
+    The world's z axis points up from the floor, which is z = 0. A dragged cloth stays within x = -0.1 to 0.4, y = -0.1
+    to 0.1 and z = 0 to 0.25 m. A clip shows the largest square in the middle of the image, scaled to 224 x 224 pixels.
+    """
+
+    image_size: tuple[Pixels, Pixels] = Field(description="width and height of the calibrated image [px]")
+    camera_matrix: tuple[Row, Row, Row] = Field(description="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px]")
+    distortion: tuple[Float, ...] = Field(
+        default=(), max_length=14, description="distortion coefficients: all 0, for pictures have no lens distortion"
+    )
+    rvec: Row = Field(description="rotation from the world to the camera, as a Rodrigues vector [rad]")
+    tvec: Row = Field(description="the world's origin in the camera's axes [m]")
+
+    @model_validator(mode="after")
+    def _can_be_rendered(self) -> Self:
+        if any(self.distortion):
+            raise ValueError(
+                "distortion must be 0: the renderer has no lens distortion. Undistort your pictures (cv2.undistort), "
+                f"and give the camera matrix of what you get; it is {list(self.distortion)}"
+            )
+        (fx, skew, _), (zero, fy, _), last = self.camera_matrix
+        if skew != 0 or zero != 0 or last != (0.0, 0.0, 1.0) or fx <= 0 or fy <= 0:
+            raise ValueError(
+                "camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0: the renderer has "
+                f"no skew; it is {[list(row) for row in self.camera_matrix]}"
+            )
+        x, y, z = self.camera("own").position.tolist()
+        if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
+            raise ValueError(
+                f"rvec and tvec must put the camera within {FARTHEST:g} m of the stage's middle and {LOWEST:g} m or "
+                f"more above the floor, and it is at ({x:.3g}, {y:.3g}, {z:.3g}) m"
+            )
+        return self
+
+    def camera(self, name: str) -> Camera:
+        """Return the camera of the clip: of the square in the middle of the image, scaled to `CLIP_SIZE`."""
+        width, height = self.image_size
+        side = min(width, height)
+        scale = CLIP_SIZE / side
+        (fx, _, cx), (_, fy, cy), _ = self.camera_matrix
+        # Pixel centres are whole numbers: the left edge of the square is at (width - side) / 2 - 1/2.
+        left, top = (width - side) / 2, (height - side) / 2
+        return Camera(
+            name=name,
+            width=CLIP_SIZE,
+            height=CLIP_SIZE,
+            fx=fx * scale,
+            fy=fy * scale,
+            cx=(cx - left + 0.5) * scale - 0.5,
+            cy=(cy - top + 0.5) * scale - 0.5,
+            rotation=_rotation(self.rvec),
+            translation=self.tvec,
+        )
+
+
+def _rotation(rvec: Row) -> tuple[Row, Row, Row]:
+    """Return the rotation by a = |r| about r: I + sin(a) K + (1 - cos(a)) K^2, K v = r / a x v [Rodrigues]."""
+    r = np.asarray(rvec)
+    angle = float(np.linalg.norm(r))
+    x, y, z = r / angle if angle > _TOLERANCE else r
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    R = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
+    a, b, c = (tuple(row) for row in R.tolist())
+    return a, b, c

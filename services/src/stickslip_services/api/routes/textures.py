@@ -1,0 +1,48 @@
+"""Textures of users: uploading them."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+from stickslip_schemas.pictures import UnfitPictureError
+from stickslip_schemas.problems import FieldError, ProblemCode
+from stickslip_schemas.responses import TextureEntry
+
+from stickslip_services.api.problems import ProblemError
+from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses
+from stickslip_services.catalog.textures import store_texture
+from stickslip_services.queue.coordinator import Coordinator
+
+router = APIRouter(tags=["textures"])
+
+MEDIA_TYPES = {"image/png": b"\x89PNG", "image/jpeg": b"\xff\xd8\xff"}
+"""What may be sent, and how such files begin."""
+
+_PICTURE: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+_BODY = {"requestBody": {"required": True, "content": dict.fromkeys(MEDIA_TYPES, _PICTURE)}}
+
+
+@router.post("/v1/textures", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_BODY)
+async def post_texture(request: Request, coordinator: Annotated[Coordinator, Depends(coordinator_of)]) -> TextureEntry:
+    """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side. It may be sent twice.
+
+    A picture that no job names is deleted by `stickslip gc` after a day.
+    """
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type not in MEDIA_TYPES:
+        detail = f"Content-Type must be {' or '.join(MEDIA_TYPES)}, and it is {media_type[:100]!r}"
+        raise ProblemError(415, ProblemCode.malformed_body, detail)
+    try:
+        data = await request.body()
+    except ClientDisconnect as error:
+        raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+    try:
+        if not data.startswith(MEDIA_TYPES[media_type]):
+            raise UnfitPictureError(
+                f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}"
+            )
+        return await run_in_threadpool(store_texture, coordinator.store, data)
+    except UnfitPictureError as error:
+        field = FieldError(pointer="", rule=str(error), value=f'"{len(data)} bytes"')
+        raise ProblemError(422, ProblemCode.validation_failed, str(error), fields=[field]) from error
