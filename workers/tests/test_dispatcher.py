@@ -384,7 +384,7 @@ def test_work_that_nothing_can_be_found_for_is_told(
 
 
 def test_a_gpu_that_the_cluster_does_not_have_is_told(
-    double: CoordinatorDouble, store: Store, cluster: Cluster
+    double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster
 ) -> None:
     """Nothing is rendered on the CPU instead."""
     import ray
