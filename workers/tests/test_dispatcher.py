@@ -60,6 +60,18 @@ def double() -> Iterator[CoordinatorDouble]:
 Start = Callable[..., Running]
 
 
+def _settings(double: CoordinatorDouble, store: DirectoryStore, **changes: Any) -> Settings:
+    settings = {
+        "url": f"http://127.0.0.1:{double.port}",
+        "store": store.root,
+        "name": "test",
+        "slots": 1,
+        "blender_python": Path(sys.executable),
+        "render_actor": "fake_renderer:RenderActor",
+    }
+    return Settings(**{**settings, **changes})
+
+
 @pytest.fixture
 def start(double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster) -> Iterator[Start]:
     """Start a dispatcher; it is stopped after the test."""
@@ -67,17 +79,8 @@ def start(double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster) ->
     started: list[Running] = []
 
     def make(**changes: Any) -> Running:
-        settings = {
-            "url": f"http://127.0.0.1:{double.port}",
-            "store": store.root,
-            "name": "test",
-            "slots": 2,
-            "blender_python": Path(sys.executable),
-            "render_actor": "fake_renderer:RenderActor",
-            "drop_seconds": 0.2,
-            "stop_seconds": 0.5,
-        }
-        started.append(Running(Settings(**{**settings, **changes}), cluster))
+        quick = {"slots": 2, "drop_seconds": 0.2, "stop_seconds": 0.5}
+        started.append(Running(_settings(double, store, **{**quick, **changes}), cluster))
         return started[-1]
 
     yield make
@@ -366,18 +369,8 @@ def test_a_renderer_that_does_not_start_is_told(start: Start, double: Coordinato
     assert double.registrations == []
 
 
-def test_work_that_nothing_can_be_found_for_is_told(
-    double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster
-) -> None:
-    settings = Settings(
-        url=f"http://127.0.0.1:{double.port}",
-        store=store.root,
-        name="test",
-        slots=1,
-        blender_python=Path(sys.executable),
-        render_actor="fake_renderer:RenderActor",
-        start_seconds=1.0,
-    )
+def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster) -> None:
+    settings = _settings(double, store, start_seconds=1.0)
     # As if the cluster had promised more CPUs than it has.
     with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 25 CPUs"):
         Dispatcher(settings, Cluster(100)).run()
@@ -391,16 +384,7 @@ def test_a_gpu_that_the_cluster_does_not_have_is_told(
 
     if ray.cluster_resources().get("GPU"):
         pytest.skip("the cluster has a GPU")
-    settings = Settings(
-        url=f"http://127.0.0.1:{double.port}",
-        store=store.root,
-        name="test",
-        slots=1,
-        blender_python=Path(sys.executable),
-        render_actor="fake_renderer:RenderActor",
-        render_device="optix",
-        start_seconds=8.0,
-    )
+    settings = _settings(double, store, render_device="optix", start_seconds=8.0)
     with pytest.raises(StartError, match=r"no render process could be started within 8 s; .* CPUs and 1 GPUs"):
         Dispatcher(settings, cluster).run()
     assert double.registrations == []
