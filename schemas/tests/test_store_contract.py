@@ -1,6 +1,7 @@
 """What every store promises, wherever it keeps its bytes."""
 
 import itertools
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,15 @@ import pytest
 import zarr
 import zarr.storage
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.store import CorruptArtifactError, DirectoryStore, Span, Store, artifact_name, open_store
+from stickslip_schemas.store import (
+    CorruptArtifactError,
+    DirectoryStore,
+    Span,
+    Store,
+    artifact_name,
+    open_store,
+    store_place,
+)
 from zarr.abc.store import Store as ZarrStore
 
 if TYPE_CHECKING:
@@ -67,18 +76,12 @@ def bucket(proxy: "Proxy", name: str, monkeypatch: pytest.MonkeyPatch) -> Place:
     import obstore.store
     import stickslip_schemas.store.bucket
     from stickslip_schemas.store.bucket import BucketStore
-    from stickslip_schemas.testing_s3 import make_bucket, no_fault
+    from stickslip_schemas.testing_s3 import make_bucket, no_fault, variables
 
     proxy.fault = no_fault
     monkeypatch.setattr(stickslip_schemas.store.bucket, "PATIENCE", 5.0)
     make_bucket(proxy, name)
-    for variable, value in {
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.port}",
-        "AWS_ALLOW_HTTP": "true",
-        "AWS_REGION": "us-east-1",
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-    }.items():
+    for variable, value in variables(proxy).items():
         monkeypatch.setenv(variable, value)
     root = obstore.store.S3Store(name, prefix="a lab/store")
 
@@ -317,7 +320,33 @@ def test_stores_are_opened_by_path_and_by_url(tmp_path: Path) -> None:
         assert open_store(place).read(digest) == b"data"
 
 
-@pytest.mark.parametrize("url", ["ftp://host/store", "file://host/store", "http://host/store"])
-def test_other_urls_are_refused(url: str) -> None:
-    with pytest.raises(ValueError, match=r"store must be .*got"):
+@pytest.mark.parametrize(
+    "url",
+    ["ftp://host/store", "file://host/store", "http://host/store", "", "s3:", "s3:/bucket", "s3:///store", "S3://bucket",
+     "s3://user@bucket", "s3://bucket?region=x", "s3://[", "file:store", "name:of a directory"],
+)  # fmt: skip
+def test_other_urls_are_refused(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"store must be a directory, .*; got '.*'\. Write \./NAME"):
         open_store(url)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_is_the_same_for_every_process_of_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    here = str(tmp_path / "a store")
+    for place in ("a store", Path("a store"), here, Path(here).as_uri()):
+        assert store_place(place) == here
+    for place in ("s3://lab/a b", "s3://lab/a%20b/", "s3://lab//a b"):
+        assert store_place(place) == "s3://lab/a%20b"
+    assert store_place("s3://lab") == store_place("s3://lab/") == "s3://lab"
+    assert store_place("./name:of a directory") == str(tmp_path / "name:of a directory")
+
+
+def test_a_bucket_without_obstore_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "stickslip_schemas.store.bucket", raising=False)
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    with pytest.raises(
+        ValueError, match=r"needs obstore, which is not installed: pip install 'stickslip-schemas\[s3\]'"
+    ):
+        open_store("s3://bucket/store")

@@ -15,7 +15,7 @@ pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[ser
 import obstore
 import obstore.exceptions
 from stickslip_schemas.store.bucket import BucketStore
-from stickslip_schemas.testing_s3 import Proxy, make_bucket, no_fault, s3_proxy
+from stickslip_schemas.testing_s3 import Proxy, make_bucket, no_fault, s3_proxy, variables
 
 SMALL = np.random.default_rng(1).bytes(100_000)
 LARGE = np.random.default_rng(2).bytes(3_000_000)
@@ -31,11 +31,8 @@ def server() -> Iterator[Proxy]:
 
 @pytest.fixture
 def proxy(server: Proxy, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.port}")
-    monkeypatch.setenv("AWS_ALLOW_HTTP", "true")
-    monkeypatch.setenv("AWS_REGION", "us-east-1")
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "key")
-    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    for variable, value in variables(server).items():
+        monkeypatch.setenv(variable, value)
     server.fault = no_fault
     server.counts.clear()
     yield server

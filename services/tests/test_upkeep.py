@@ -76,12 +76,12 @@ def run(settings: Settings, *arguments: object) -> Ended:
 
 
 def artifacts(settings: Settings) -> dict[str, int]:
-    return {path.name: path.stat().st_size for path in (settings.store_root / "artifacts").glob("*/*")}
+    return {path.name: path.stat().st_size for path in (Path(settings.store_place) / "artifacts").glob("*/*")}
 
 
 def age(settings: Settings, seconds: float) -> None:
     """Let all files of the store be as old as that."""
-    for path in settings.store_root.rglob("*"):
+    for path in Path(settings.store_place).rglob("*"):
         if path.is_file():
             os.utime(path, (time.time() - seconds,) * 2)
 
@@ -113,7 +113,7 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
     result = run(settings, "rm", f"{first}:v1")
     assert result.exit_code == 0, result.stderr
     assert "with 1 jobs" in result.stdout
-    assert not (settings.store_root / "datasets" / first).exists()
+    assert not (Path(settings.store_place) / "datasets" / first).exists()
     assert artifacts(settings) == before
     dry = run(settings, "gc", "--older-than", 0)
     assert "may be deleted: add --delete" in dry.stdout
@@ -132,7 +132,7 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
 
 
 def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) -> None:
-    manifest = settings.store_root / "datasets" / made[0] / "v1" / MANIFEST_NAME
+    manifest = Path(settings.store_place) / "datasets" / made[0] / "v1" / MANIFEST_NAME
     content = manifest.read_bytes()
     run(settings, "rm", f"{made[0]}:v1")
     run(settings, "gc", "--delete", "--older-than", 0)
@@ -150,7 +150,7 @@ def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) ->
 
 
 def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
-    stray = settings.store_root / "artifacts" / "ab" / ("ab" + "0" * 62)
+    stray = Path(settings.store_place) / "artifacts" / "ab" / ("ab" + "0" * 62)
     scratch = stray.with_name(f".{stray.name}.0123.tmp")
     for path in (stray, scratch):
         path.parent.mkdir(exist_ok=True)
@@ -166,7 +166,7 @@ def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
 
 def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(settings: Settings, made: list[str]) -> None:
     """As after a database was restored from an old backup."""
-    directory = settings.store_root / "datasets" / made[0] / "v1"
+    directory = Path(settings.store_place) / "datasets" / made[0] / "v1"
     away = settings.data / "away"
     directory.rename(away)
     run(settings, "rm", f"{made[0]}:v1")
@@ -176,7 +176,7 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
     with opened(settings, Role.upkeep) as database:
-        found = reindex(database, DirectoryStore(settings.store_root))
+        found = reindex(database, DirectoryStore(settings.store_place))
         assert sorted(version.is_new for version in found) == [False, True]
 
 
@@ -201,7 +201,7 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
     result = run(settings, "rm", f"{made[0]}:v1")
     assert result.exit_code == 1
     assert f"the job {again.id} is" in result.stderr
-    assert (settings.store_root / "datasets" / made[0] / "v1" / MANIFEST_NAME).exists()
+    assert (Path(settings.store_place) / "datasets" / made[0] / "v1" / MANIFEST_NAME).exists()
 
 
 @pytest.mark.parametrize(

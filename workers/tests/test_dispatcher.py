@@ -63,7 +63,7 @@ Start = Callable[..., Running]
 def _settings(double: CoordinatorDouble, store: DirectoryStore, **changes: Any) -> Settings:
     settings = {
         "url": f"http://127.0.0.1:{double.port}",
-        "store": store.root,
+        "store": store.place,
         "name": "test",
         "slots": 1,
         "blender_python": Path(sys.executable),
@@ -185,7 +185,7 @@ def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
 
 
 def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
-    start(exec_seconds={**Settings(url="", store=store.root, name="x").exec_seconds, Stage.render: 0.5})
+    start(exec_seconds={**Settings(url="", store=store.place, name="x").exec_seconds, Stage.render: 0.5})
     double.offer(slow=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
     double.until(lambda: "slow" in double.results)
@@ -369,7 +369,9 @@ def test_a_renderer_that_does_not_start_is_told(start: Start, double: Coordinato
     assert double.registrations == []
 
 
-def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster) -> None:
+def test_work_that_nothing_can_be_found_for_is_told(
+    double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster
+) -> None:
     settings = _settings(double, store, start_seconds=1.0)
     # As if the cluster had promised more CPUs than it has.
     with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 25 CPUs"):

@@ -29,7 +29,9 @@ def test_a_render_runs_in_the_other_interpreter(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("PYTHONPATH", str(Path(fake_renderer.__file__).parent))
     look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
     task = RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
-    result = replay(task, store=tmp_path, blender_python=Path(sys.executable), render_actor="fake_renderer:RenderActor")
+    result = replay(
+        task, store=str(tmp_path), blender_python=Path(sys.executable), render_actor="fake_renderer:RenderActor"
+    )
     if what == fake_renderer.FINE:
         assert result.outcome == "succeeded"
     else:
@@ -50,3 +52,17 @@ def test_a_task_that_is_none_is_said_in_a_line(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / "other.json").write_text("{}")
     assert main(["replay", str(tmp_path / "other.json"), "--store", str(tmp_path)]) == 2
     assert "other.json is not a task" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command", [["replay", "task.json"], ["dispatch", "--url", "http://127.0.0.1:1", "--name", "x"]]
+)
+def test_a_place_that_is_no_store_is_refused(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--store", "s3:/lab/store"])
+    assert ended.value.code == 2
+    assert "argument --store: store must be a directory, file:///DIRECTORY or s3://BUCKET" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -151,6 +151,17 @@ def _wait(port: int, process: "subprocess.Popen[bytes]") -> None:
         time.sleep(0.05)
 
 
+def variables(proxy: Proxy) -> dict[str, str]:
+    """Return the environment of a process that is to use a server through its proxy."""
+    return {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.port}",
+        "AWS_ALLOW_HTTP": "true",
+        "AWS_REGION": "us-east-1",
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+    }
+
+
 def make_bucket(proxy: Proxy, name: str) -> None:
     """Make a bucket on the server itself."""
     connection = http.client.HTTPConnection("127.0.0.1", proxy.server, timeout=60)

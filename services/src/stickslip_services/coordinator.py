@@ -137,7 +137,7 @@ def reindex(settings: Settings) -> int:
     """Find the datasets in the store again; return the exit status."""
     counts = Counter[str]()
     with locked(settings.data), opened(settings, Role.upkeep) as database:
-        for found in find_versions(database, open_store(settings.store_root)):
+        for found in find_versions(database, open_store(settings.store_place)):
             if found.fault:
                 sys.stderr.write(f"left out: {found.name}: {found.fault}\n")
             elif found.is_new:
@@ -154,7 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until a signal comes; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
     parser.add_argument("--data", type=Path, help="directory of the database and the store")
-    parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
+    parser.add_argument("--store", help="directory of the store, or s3://BUCKET/PREFIX (DATA/store)")
     parser.add_argument("--database", help="URL of a PostgreSQL database; STICKSLIP_DATABASE hides its password better")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")

@@ -118,7 +118,7 @@ class Dispatcher:
         # Both pools full take all CPUs of the cluster, so that neither can keep the other from starting.
         share = int(0.5 * max(cluster.cpus, 1) / most * 1000) / 1000
         common: dict[str, Any] = {
-            "store": str(settings.store.resolve()),
+            "store": settings.store,
             "size": most,
             "num_cpus": share,
             "start_seconds": settings.start_seconds,

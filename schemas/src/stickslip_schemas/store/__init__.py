@@ -13,7 +13,7 @@ from stickslip_schemas.store.base import (
     version_name,
 )
 from stickslip_schemas.store.directory import DirectoryStore, sync, write_durably
-from stickslip_schemas.store.opening import open_store
+from stickslip_schemas.store.opening import open_store, store_place
 
 __all__ = [
     "CorruptArtifactError",
@@ -27,6 +27,7 @@ __all__ = [
     "is_unavailable",
     "open_store",
     "shown_name",
+    "store_place",
     "sync",
     "version_name",
     "write_durably",

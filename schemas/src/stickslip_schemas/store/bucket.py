@@ -40,6 +40,9 @@ from stickslip_schemas.store.base import (
 PATIENCE = 60.0
 """How long a request is tried again while the server is busy or away [s]."""
 
+PROBE_PATIENCE = 5.0
+"""The same of a probe [s], which is to tell at once."""
+
 BLOCK = 1 << 22
 """How much of an artifact one request of a stream asks for [bytes]."""
 
@@ -58,12 +61,16 @@ class BucketStore:
     def __init__(self, bucket: str, prefix: str = "", *, patience: float | None = None) -> None:
         """Open a store; raise ValueError where variables of the environment contradict each other."""
         self.place = f"s3://{bucket}/{prefix}".rstrip("/")
+        self._bucket, self._prefix = bucket, prefix
         self._patience = PATIENCE if patience is None else patience
         try:
             self._objects = obstore.store.S3Store(
                 bucket,
                 prefix=prefix or None,
-                client_options={"timeout": _REQUEST_TIMEOUT, "allow_http": _allows_http()},
+                client_options={
+                    "timeout": min(_REQUEST_TIMEOUT, timedelta(seconds=self._patience * 5)),
+                    "allow_http": _allows_http(),
+                },
                 retry_config={"retry_timeout": timedelta(seconds=self._patience)},
             )
         except obstore.exceptions.BaseError as error:
@@ -239,9 +246,12 @@ class BucketStore:
 
     def probe(self) -> None:
         """See `Store`."""
+        if self._patience > PROBE_PATIENCE:
+            return BucketStore(self._bucket, self._prefix, patience=PROBE_PATIENCE).probe()
         name = f".probe-{random.randbytes(8).hex()}"
         self._put(name, b"probe", mode="overwrite")
         self._delete([name])
+        return None
 
     def _head(self, name: str) -> Any:
         return self._tried(lambda: obstore.head(self._objects, name))

@@ -20,6 +20,9 @@ DatabaseOption = Annotated[
     str | None,
     typer.Option("--database", help="URL of a PostgreSQL database; give one with a password as STICKSLIP_DATABASE"),
 ]
+StoreOption = Annotated[
+    str | None, typer.Option(help="directory of the store, or s3://BUCKET/PREFIX, if it is not DATA/store")
+]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
 
 

@@ -1,13 +1,13 @@
 """Running a coordinator and a dispatcher on this machine."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
-from stickslip_services.cli.common import DatabaseOption, console
+from stickslip_services.cli.common import DatabaseOption, StoreOption, console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 
@@ -23,6 +23,7 @@ def up(
     host: Annotated[
         str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
     ] = "127.0.0.1",
+    store: StoreOption = None,
     database: DatabaseOption = None,
     slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
     allow_host: Annotated[
@@ -51,9 +52,8 @@ def up(
         "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
-    given = {name: value for name, value in doors.items() if value}
-    if database is not None:
-        given["database"] = database
+    given: dict[str, Any] = {name: value for name, value in doors.items() if value}
+    given |= {name: value for name, value in (("store", store), ("database", database)) if value is not None}
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(

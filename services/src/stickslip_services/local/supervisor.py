@@ -185,6 +185,7 @@ def print_line(stream: IO[str], message: str) -> None:
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     module = "stickslip_services.coordinator"
     place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
+    place += [] if settings.store is None else ["--store", settings.store]
     doors = [f"--allow-host={host}" for host in settings.allowed_hosts]
     doors += ["--require-keys"] if settings.require_keys else []
     doors += ["--behind-proxy"] if settings.behind_proxy else []
@@ -205,7 +206,7 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
         "--url",
         settings.url,
         "--store",
-        str(settings.store_root),
+        settings.store_place,
         "--name",
         "local",
         "--key-file",

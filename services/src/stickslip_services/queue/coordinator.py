@@ -108,7 +108,7 @@ class Coordinator:
     def __post_init__(self, given_clock: Clock | None) -> None:
         self.database = connect(self.settings)
         self.clock = given_clock or self.database.clock
-        self.store = open_store(self.settings.store_root)
+        self.store = open_store(self.settings.store_place)
         self.store_watch = StoreWatch(
             self.store,
             self.settings.data,

@@ -11,6 +11,9 @@ from stickslip_schemas.store import DirectoryStore, Store
 HOLD_SECONDS = 10.0
 """How long a worker's word counts where the coordinator itself finds nothing wrong [s]."""
 
+PROBE_SECONDS = 10.0
+"""Time between two looks at a bucket that takes results [s]: each look costs requests."""
+
 
 class StoreWatch:
     """Looks at the store and at the directory of the database."""
@@ -21,6 +24,7 @@ class StoreWatch:
         self._clock = clock
         self._reported = ""
         self._reported_until = float("-inf")
+        self._next_probe = float("-inf")
         self.trouble = ""
         """What is wrong, in words; empty where nothing is."""
 
@@ -43,6 +47,10 @@ class StoreWatch:
                 room = looked_at.room()
                 if room is not None and room.free < least:
                     return f"{looked_at.place} has {_mib(room.free)} MiB left, and {_mib(least)} MiB must stay free"
+                if room is None and not self.trouble:
+                    if self._clock() < self._next_probe:
+                        continue
+                    self._next_probe = self._clock() + PROBE_SECONDS
                 looked_at.probe()
             except OSError as error:
                 return f"{looked_at.place} cannot be written: {error.strerror or error}"
