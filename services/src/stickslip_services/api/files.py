@@ -36,8 +36,8 @@ def picture_format(store: Store, digest: Sha256) -> str:
     return "webp" if head[:4] == b"RIFF" and head[8:] == b"WEBP" else "png"
 
 
-def serve(request: Request, store: Store, digest: Sha256, *, name: str) -> Response:
-    """Answer with an artifact, or the part of it that the request asks for."""
+def serve(request: Request, store: Store, digest: Sha256, *, name: str, size: int | None = None) -> Response:
+    """Answer with an artifact, of `size` bytes where that is known, or the part of it that the request asks for."""
     etag = f'"{digest}"'
     headers = {
         "ETag": etag,
@@ -48,7 +48,7 @@ def serve(request: Request, store: Store, digest: Sha256, *, name: str) -> Respo
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     try:
-        size = store.size(digest)
+        size = store.size(digest) if size is None else size
     except OSError as error:
         raise MissingArtifactError(f"artifact {digest} is not in the store") from error
     media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")

@@ -7,7 +7,7 @@ from stickslip_schemas.keys import Sha256, sha256
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal, seal_text
 from stickslip_schemas.responses import DatasetRef
 from stickslip_schemas.samples import dataset_id
-from stickslip_schemas.store import CorruptArtifactError, Store
+from stickslip_schemas.store import CorruptArtifactError, Store, is_unavailable
 from stickslip_schemas.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 
 from stickslip_services.database.tables import dataset_versions, datasets
@@ -130,6 +130,7 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> froze
     """Return the digests of the files of a version that are not whole, in the store or in the version's directory.
 
     None where the three files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
+    Raises OSError where the store is out of reach.
     """
     if group is None:
         return None
@@ -137,7 +138,9 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> froze
     try:
         document = Manifest.model_validate_json(store.read(manifest))
         check_seal(store.read(manifest), store.read(group), store.read(seal))
-    except (OSError, ValueError):
+    except (OSError, ValueError) as error:
+        if isinstance(error, OSError) and is_unavailable(error):
+            raise
         return None
     own = {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: seal}
     files = own | {file.path: file.sha256 for file in document.files}

@@ -1,7 +1,9 @@
 """Running a coordinator and a dispatcher on this machine."""
 
+import re
 from pathlib import Path
-from typing import Annotated, Any
+from socket import gethostname
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -11,9 +13,17 @@ from stickslip_services.cli.common import DatabaseOption, StoreOption, console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 
+if TYPE_CHECKING:
+    from stickslip_services.settings import Settings
+
 
 def _url_option(url: str) -> str:
     return "" if url == DEFAULT_URL else f" --url {url}"
+
+
+def _name(settings: "Settings") -> str:
+    """Return a name that no other dispatcher has: one of the same name would take its tasks away."""
+    return "local" if settings.database is None else re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname()).lstrip("_.-")[:63]
 
 
 @shows_errors
@@ -25,6 +35,10 @@ def up(
     ] = "127.0.0.1",
     store: StoreOption = None,
     database: DatabaseOption = None,
+    name: Annotated[
+        str | None,
+        typer.Option(help="name of the dispatcher; `local`, or this machine's where the database is PostgreSQL"),
+    ] = None,
     slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
     allow_host: Annotated[
         list[str] | None, typer.Option(help="name that the coordinator may be asked by; repeatable")
@@ -57,7 +71,7 @@ def up(
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
-        supervisor.LocalService(settings, slots=slots, dispatcher=dispatcher),
+        supervisor.LocalService(settings, name or _name(settings), slots, dispatcher),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"

@@ -46,6 +46,8 @@ class LocalService:
 
     settings: Settings
     """Of the coordinator. `data` is an absolute path."""
+    name: str = "local"
+    """Name of the dispatcher among all that have the same database."""
     slots: int | None = None
     dispatcher: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
@@ -208,7 +210,7 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
         "--store",
         settings.store_place,
         "--name",
-        "local",
+        service.name,
         "--key-file",
         str(settings.worker_key_path),
         *pinned,

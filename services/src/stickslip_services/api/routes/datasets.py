@@ -118,4 +118,4 @@ def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> Fi
 
 def _serve(request: Request, coordinator: CoordinatorDep, dataset: str, version: int, path: str) -> Response:
     file = _find(coordinator, dataset, version, path)
-    return serve(request, coordinator.store, file.sha256, name=path)
+    return serve(request, coordinator.store, file.sha256, name=path, size=file.size)
