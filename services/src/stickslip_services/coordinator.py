@@ -48,6 +48,7 @@ from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex as find_versions
 from stickslip_services.settings import Settings
+from stickslip_services.webhooks import Messenger
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ GRACE_SECONDS = 3
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
     coordinator = Coordinator(settings, clock)
+    messenger = Messenger(coordinator.database, coordinator.clock)
     metrics = Metrics(coordinator.database, coordinator.store, coordinator.alive_workers, coordinator.eta_watch.held)
 
     @asynccontextmanager
@@ -67,9 +69,11 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         keepers = [
             asyncio.create_task(_for_ever(coordinator.sweep, every)),
             asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+            asyncio.create_task(_for_ever(messenger.deliver, every)),
             asyncio.create_task(coordinator.database.listen(coordinator.bell.ring)),
         ]
         yield
+        messenger.stop()
         for keeper in keepers:
             keeper.cancel()
         await asyncio.gather(*keepers, return_exceptions=True)

@@ -15,6 +15,7 @@ from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.textures import upload
 from stickslip_services.cli.up import up
 from stickslip_services.cli.upkeep import gc, rm
+from stickslip_services.cli.webhooks import app as webhooks
 from stickslip_services.cli.workers import workers
 
 app = typer.Typer(
@@ -62,3 +63,4 @@ for _name, _command in _COMMANDS.items():
 
 app.add_typer(datasets, name="datasets")
 app.add_typer(keys, name="keys")
+app.add_typer(webhooks, name="webhooks")
