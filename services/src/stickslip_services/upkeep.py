@@ -16,6 +16,7 @@ from stickslip_schemas.store import Store, open_store
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import ConflictError, DatabaseRefusedError, NotFoundError, SettingsError
+from stickslip_services.journal import acting, this_user
 from stickslip_services.local.locking import locked
 from stickslip_services.queue.removing import remove
 from stickslip_services.queue.unused import unused
@@ -56,7 +57,7 @@ def _data(data: Path, place: str | None) -> Iterator[tuple[Database, Store]]:
             f"the database {settings.database_name} does not exist or is empty: name the "
             f"{settings.database_option} of a coordinator"
         )
-    with locked(data), opened(settings, Role.upkeep) as database:
+    with locked(data), acting(this_user()), opened(settings, Role.upkeep) as database:
         yield database, open_store(settings.store_place)
 
 

@@ -25,6 +25,7 @@ from stickslip_services.clock import Clock, as_datetime
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError
+from stickslip_services.journal import note
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +69,7 @@ def create_webhook(connection: Connection, url: str, now: float) -> tuple[Webhoo
             id=name, url=url, secret=secret, position=last, next_at=now, failures=0, fault="", created_at=now
         )
     )
+    note(connection, "webhook.create", name, now, url=url)
     return Webhook(name, url, 0, None, "", as_datetime(now), is_given_up=False), secret
 
 
@@ -92,12 +94,14 @@ def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     _find(connection, webhook_id)
     values = {"next_at": now, "failures": 0, "failing_since": None}
     connection.execute(update(webhooks).where(webhooks.c.id == webhook_id).values(values))
+    note(connection, "webhook.retry", webhook_id, now)
 
 
-def delete_webhook(connection: Connection, webhook_id: str) -> None:
+def delete_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     """Forget a webhook; raise NotFoundError."""
     _find(connection, webhook_id)
     connection.execute(delete(webhooks).where(webhooks.c.id == webhook_id))
+    note(connection, "webhook.delete", webhook_id, now)
 
 
 class Messenger:

@@ -43,7 +43,10 @@ def writing(command: str, data: Path, database_url: str | None) -> Iterator["Con
     from stickslip_services.settings import Settings
 
     chosen = {"data": data} if database_url is None else {"data": data, "database": database_url}
-    with opened(Settings.chosen(**chosen), Role.visitor) as database, database.write() as connection:
+    from stickslip_services.journal import acting, this_user
+
+    settings = Settings.chosen(**chosen)
+    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
         yield connection
 
 

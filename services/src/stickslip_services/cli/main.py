@@ -10,6 +10,7 @@ from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import app as datasets
 from stickslip_services.cli.datasets import export, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
+from stickslip_services.cli.journal import journal
 from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.textures import upload
@@ -56,6 +57,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "certify": certify,
     "register": register,
     "certificates": certificates,
+    "journal": journal,
 }
 
 for _name, _command in _COMMANDS.items():

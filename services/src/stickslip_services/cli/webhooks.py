@@ -64,5 +64,5 @@ def delete(webhook: IdArgument, data: DataOption = DEFAULT_DATA, database: Datab
     with writing("webhooks", data, database) as connection:
         from stickslip_services.webhooks import delete_webhook
 
-        delete_webhook(connection, webhook)
+        delete_webhook(connection, webhook, time.time())
     typer.echo(f"{webhook} is deleted")

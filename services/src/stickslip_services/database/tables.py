@@ -290,6 +290,18 @@ api_keys = Table(
     sqlite_autoincrement=True,
 )
 
+journal = Table(  # triggers of the migration refuse to change or to delete its rows
+    "journal",
+    metadata,
+    Column("seq", _Wide, primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("actor", String, nullable=False),
+    Column("action", String, nullable=False),
+    Column("subject", String, nullable=False),
+    Column("details", Text, nullable=False),  # JSON
+    sqlite_autoincrement=True,
+)
+
 webhooks = Table(
     "webhooks",
     metadata,

@@ -36,6 +36,7 @@ from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
 from stickslip_services.database.opening import connect
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.journal import note
 from stickslip_services.keys import admit_local_worker
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
@@ -162,6 +163,15 @@ class Coordinator:
                 with ledger(connection, now) as book:
                     job = insert_job(book, spec, plan, priority=priority)
                 shown = self.show(connection, job)
+                note(
+                    connection,
+                    "job.submit",
+                    shown.id,
+                    now,
+                    name=spec.name,
+                    samples=spec.sample_count,
+                    priority=priority,
+                )
                 if idempotency_key:
                     keep_replay(connection, idempotency_key, print_, job, shown.model_dump_json(), now)
             self.bell.ring()
@@ -173,6 +183,7 @@ class Coordinator:
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = cancel_job(book, job_id)
+            note(book.connection, "job.cancel", job_id, book.now)
         return self._shown(job)
 
     def prioritise(self, job_id: str, priority: int, *, if_match: Collection[str] | None = None) -> JobDetail:
@@ -180,6 +191,7 @@ class Coordinator:
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = prioritise_job(book, job_id, priority)
+            note(book.connection, "job.prioritise", job_id, book.now, priority=priority)
         return self._shown(job)
 
     def pause(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
@@ -187,6 +199,7 @@ class Coordinator:
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = pause_job(book, job_id)
+            note(book.connection, "job.pause", job_id, book.now)
         return self._shown(job)
 
     def resume(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
@@ -199,6 +212,7 @@ class Coordinator:
         with self._book() as book:
             self._check_unchanged(book.connection, job_id, if_match)
             job = resume_job(book, job_id)
+            note(book.connection, "job.resume", job_id, book.now)
         self.plan_waiting_jobs()
         self._note_stranded()
         return self._shown(job)
@@ -223,7 +237,11 @@ class Coordinator:
         """Register a certificate."""
         stored = store_certificate(self.store, upload)
         with self.database.write() as connection:
-            return insert_certificate(connection, upload, stored, self.clock())
+            entry = insert_certificate(connection, upload, stored, self.clock())
+            note(
+                connection, "certificate.register", entry.digest, self.clock(), preset=entry.preset, passed=entry.passed
+            )
+            return entry
 
     # --- workers --------------------------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 The files stay in the store, where other versions may use them; what nothing refers to any more, `unused` finds.
 """
 
+import time
 from collections import Counter
 from dataclasses import dataclass
 
@@ -28,6 +29,7 @@ from stickslip_services.database.tables import (
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
+from stickslip_services.journal import note
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,7 @@ def remove(database: Database, store: Store, dataset: str, version: int) -> Remo
             connection.execute(delete(dataset_versions).where(*own))
             if connection.scalar(select(columns.version).where(columns.dataset == dataset).limit(1)) is None:
                 connection.execute(delete(datasets).where(datasets.c.id == dataset))
+        note(connection, "version.remove", f"{dataset}:v{version}", time.time(), jobs=removed.jobs, tasks=removed.tasks)
     store.hide(dataset, version)  # last: a version that is in the database is always in the store
     return removed
 
