@@ -1,8 +1,6 @@
 """A store by its URL: everything that takes `--store` uses a bucket, or refuses in a sentence."""
 
-import itertools
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +22,9 @@ from stickslip_services.testing import ManualClock, PretendWorker, list_datasets
 from typer.testing import CliRunner
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
-pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
 
 import obstore.store
-from stickslip_schemas.testing_s3 import Proxy, make_bucket, no_fault, s3_proxy, variables
+from stickslip_schemas.testing_s3 import Proxy, no_fault
 
 REFUSAL = r"store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3:/lab/store'"
 
@@ -56,26 +53,6 @@ def test_the_environment_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setenv("STICKSLIP_STORE", "s3:/lab/store")
     with pytest.raises(SettingsError, match=REFUSAL):
         Settings.chosen(data=tmp_path)
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[Proxy]:
-    with s3_proxy() as proxy:
-        yield proxy
-
-
-_numbers = itertools.count()
-
-
-@pytest.fixture
-def bucket(s3: Proxy, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The URL of an empty store in a bucket."""
-    s3.fault = no_fault
-    for variable, value in variables(s3).items():
-        monkeypatch.setenv(variable, value)
-    name = f"services-{next(_numbers)}"
-    make_bucket(s3, name)
-    return f"s3://{name}/lab"
 
 
 @pytest.fixture
