@@ -88,7 +88,7 @@ class Service:
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )
-        self.url = wait_for("the coordinator", self._ready_url, 60)
+        self.url = wait_for("the coordinator", self._ready_url, 180)
 
     def _ready_url(self) -> str | None:
         assert self.process is not None

@@ -32,9 +32,11 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
             monkeypatch.setenv(name, value)
         make_bucket(proxy, "lab")
         running = Service(tmp_path / "data", "--store", "s3://lab/one")
-        running.start()
-        yield running
-        running.stop()
+        try:
+            running.start()
+            yield running
+        finally:
+            running.stop()
 
 
 def test_a_dataset_is_made_read_and_collected_in_a_bucket(service: Service, tmp_path: Path) -> None:

@@ -327,11 +327,13 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ser
         for name, value in (variables(proxy) | {"STICKSLIP_DATABASE": server.empty()}).items():
             monkeypatch.setenv(name, value)
         both = tuple(Service(tmp_path / name, "--store", BUCKET, "--name", name, "--slots", "1") for name in ("a", "b"))
-        for node in both:
-            node.start()
-        yield both[0], both[1]
-        for node in both:
-            node.stop()
+        try:
+            for node in both:
+                node.start()
+            yield both[0], both[1]
+        finally:
+            for node in both:
+                node.stop()
 
 
 @pytest.mark.slow

@@ -82,7 +82,7 @@ def made(coordinator: Coordinator, url: str) -> tuple[str, str]:
 
 
 def run_job(coordinator: Coordinator, worker: PretendWorker, gamma: float) -> None:
-    coordinator.submit(parsed(rods(gamma=(gamma,), name="of a test")), None)
+    coordinator.submit(parsed(rods(gamma=(gamma,), name="of-a-test")), None)
     worker.work()
 
 
@@ -107,7 +107,7 @@ def test_what_happens_is_told_in_order_and_signed(
         assert headers["webhook-signature"] == Verifier(secret).sign(headers["webhook-id"], at, body)
         assert headers["webhook-id"].startswith(f"msg_{name}_")
         document = json.loads(body)
-        assert document["data"]["name"] == "of a test"
+        assert document["data"]["name"] == "of-a-test"
         assert document["data"]["job"].startswith("job-")
     published = json.loads(receiver.received[-2][1])["data"]["dataset"]
     assert published["version"] == 1

@@ -3,10 +3,8 @@
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from pydantic import BaseModel
@@ -14,10 +12,6 @@ from rich.console import Console
 from rich.table import Table
 
 from stickslip_services.addresses import DATABASE_VARIABLE
-from stickslip_services.installed import require_server
-
-if TYPE_CHECKING:
-    from sqlalchemy import Connection
 
 UrlOption = Annotated[str, typer.Option("--url", envvar="STICKSLIP_URL", help="where the coordinator is")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
@@ -32,22 +26,6 @@ StoreOption = Annotated[
 DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
 DEFAULT_DATA = Path("stickslip-data")
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
-
-
-@contextmanager
-def writing(command: str, data: Path, database_url: str | None) -> Iterator["Connection"]:
-    """Open the database of a coordinator, which may run, to write a row or two."""
-    require_server(command)
-    from stickslip_services.database.database import Role  # the server's packages may be missing
-    from stickslip_services.database.opening import opened
-    from stickslip_services.settings import Settings
-
-    chosen = {"data": data} if database_url is None else {"data": data, "database": database_url}
-    from stickslip_services.journal import acting, this_user
-
-    settings = Settings.chosen(**chosen)
-    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
-        yield connection
 
 
 def with_database(database: str | None) -> dict[str, str]:

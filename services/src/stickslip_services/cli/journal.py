@@ -1,13 +1,26 @@
 """The journal of a data directory: who changed what, and when."""
 
 import json
-from typing import Annotated
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, table, writing
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, table
 from stickslip_services.cli.errors import shows_errors
+from stickslip_services.installed import require_server
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
+
+def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+    require_server("journal")
+    from stickslip_services.database.opening import visited  # the server's packages may be missing
+
+    return visited(data, database)
 
 
 @shows_errors
@@ -21,7 +34,7 @@ def journal(
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON document a line, for programs")] = False,
 ) -> None:
     """Show who changed what, and when, newest first."""
-    with writing("journal", data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.journal import read_journal
 
         lines = read_journal(connection, subject=subject, limit=limit)

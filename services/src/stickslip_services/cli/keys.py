@@ -4,16 +4,29 @@ Whoever may write the data directory may make keys: no key is needed for that, a
 """
 
 import time
-from typing import Annotated
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table, writing
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
+from stickslip_services.installed import require_server
 from stickslip_services.scopes import Scope
 
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
 app = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
+
+
+def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+    require_server("keys")
+    from stickslip_services.database.opening import visited  # the server's packages may be missing
+
+    return visited(data, database)
 
 
 @app.command()
@@ -25,7 +38,7 @@ def create(
     database: DatabaseOption = None,
 ) -> None:
     """Make a key and print it. It is shown this once: only its digest is kept."""
-    with writing("keys", data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.keys import create_key
 
         key, secret = create_key(connection, name, scope, time.time())
@@ -38,7 +51,7 @@ def create(
 @shows_errors
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
-    with writing("keys", data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.keys import list_keys
 
         found = list_keys(connection)
@@ -62,7 +75,7 @@ def revoke(
     database: DatabaseOption = None,
 ) -> None:
     """Let a key open nothing any more; a running coordinator knows it within a second."""
-    with writing("keys", data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.keys import revoke_key
 
         revoke_key(connection, key_id, time.time())

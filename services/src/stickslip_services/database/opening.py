@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, text
+from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError
 from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.store import open_store
@@ -16,6 +16,7 @@ from stickslip_services.database import migrate
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.journal import acting, this_user
 from stickslip_services.settings import Settings
 
 
@@ -48,6 +49,14 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
         yield database
     finally:
         database.close()
+
+
+@contextmanager
+def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
+    """Open the database of a coordinator, which may run, for a command of this machine that writes a row or two."""
+    settings = Settings.chosen(data=data, **({} if database_url is None else {"database": database_url}))
+    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
+        yield connection
 
 
 def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
