@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from stickslip_training.cloth.crop import Cameras
 from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.nets import PosteriorNet
-from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
+from stickslip_training.cloth.posterior import MU_BINS, SHARE, Bins, Posterior, estimates
 from stickslip_training.cloth.render import Style, draw_style, render_crops, turned
 from stickslip_training.cloth.runs import Runs, between
 from stickslip_training.engine.fit import (
@@ -70,6 +70,8 @@ class ClothTraining:
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    instants: tuple[int, ...] = INSTANTS
+    """Of the frames that the network sees, of 300."""
     seed: int = 0
     width: int = 96
     threads: int = 1
@@ -113,6 +115,12 @@ class Clips:
             self.run[chosen],
         )
 
+    @staticmethod
+    def joined(parts: "Sequence[Clips]") -> "Clips":
+        """Return the clips of all parts."""
+        columns = [[getattr(part, field.name) for part in parts] for field in fields(Clips)]
+        return Clips(*(torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each) for each in columns))
+
     def truth(self) -> Truth:
         """Return what is true of the clips, as scores ask for it."""
         return Truth(self.material, self.mu, self.landed, self.run)
@@ -146,7 +154,7 @@ class FrictionModel:
     instants: tuple[int, ...]
     bins: Bins
     temperature: tuple[float, float]
-    """By which log p(m) and log p(mu | m) are divided: see `calibrated`."""
+    """By which log p(m) and log p(mu | m) are divided: see `calibrated` and `covering`."""
     familiarity: tuple[Familiarity, ...]
     """Of each network: what it was trained on."""
     card: dict[str, Any]
@@ -213,7 +221,8 @@ def train_friction(
         seen = learner.validation
         found = features(net, seen)
         temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
-        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
+        temperature = (temperature[0], covering(net, seen, temperature[0], train.materials, settings.seed))
+        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
         familiarity = Familiarity.of(features(net, known), known.material, found, len(train.materials))
     card = {
         "settings": asdict(settings),
@@ -226,7 +235,7 @@ def train_friction(
         "history": [asdict(report) for report in fitted.history],
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
     }
-    instants = frames_at(train.instants)[1]
+    instants = frames_at(train.instants, settings.instants)[1]
     return FrictionModel((net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card)
 
 
@@ -314,13 +323,14 @@ def render_clips(
     turn: tuple[float, float] = (0.0, 0.0),
     spread: float = 0.0,
     style: Callable[[Style], Style] | None = None,
+    wanted: tuple[int, ...] = INSTANTS,
 ) -> Clips:
-    """Render every run `renders` times, each with a look of its own, by the cameras in turn.
+    """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
 
     `turn` turns all cameras (about the vertical, up) [degree]; `spread` adds random turns of this deviation; `style`
     changes the looks that were drawn.
     """
-    frames, instants = frames_at(runs.instants)
+    frames, instants = frames_at(runs.instants, wanted)
     rig = training_cameras() if cameras is None else cameras
     number = np.repeat(np.arange(len(runs)), renders)
     crops, directions = [], []
@@ -374,7 +384,7 @@ class _FrictionLearner(Learner):
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
-        self.frames, self.instants = frames_at(train.instants)
+        self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
         self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
@@ -383,7 +393,9 @@ class _FrictionLearner(Learner):
         self.rig = training_cameras()
         self.clips = clips
         self.validation = (
-            render_clips(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
+            render_clips(validation, 6, settings.seed, spread=settings.turn, wanted=settings.instants)
+            if clips is None
+            else clips.validation
         )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
         with seeded(settings.seed):
@@ -494,6 +506,26 @@ def _posterior(
 def _softmax(logits: SingleFloats) -> Floats:
     shifted = np.exp((logits - logits.max(axis=-1, keepdims=True)).astype(np.float64))
     return np.asarray(shifted / shifted.sum(axis=-1, keepdims=True))
+
+
+def covering(
+    net: PosteriorNet, clips: Clips, of_material: float, materials: tuple[str, ...], seed: int, share: float = SHARE
+) -> float:
+    """Return the temperature of mu at which the intervals that should hold `share` hold that share of the truths.
+
+    The most likely temperature is another one where a few clips are far off: it makes all intervals wider. The clips
+    are seen with exposures and registrations that differ as those of new clips may.
+    """
+    generator = torch.Generator().manual_seed(seed_of_step(seed, _VALIDATION, 1))
+    answers = answer(net, features(net, replace(clips, crops=jittered(clips.crops, generator))))
+    tried = np.geomspace(0.4, 6.0, 55)
+
+    def held(temperature: float) -> float:
+        posterior = _posterior(*answers, materials, MU_BINS, (of_material, temperature))
+        found = estimates(posterior.mu, MU_BINS, share)
+        return float(((found.low <= clips.mu) & (clips.mu <= found.high)).mean())
+
+    return float(tried[int(np.argmin([abs(held(each) - share) for each in tried]))])
 
 
 def calibrated(
