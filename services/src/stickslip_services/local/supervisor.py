@@ -30,7 +30,7 @@ from stickslip_services.local.sockets import listen
 from stickslip_services.settings import Settings
 
 START_SECONDS = 180.0
-"""How long the coordinator may take until it answers [s]; a migration may be slow, and simulations may have all cores."""
+"""How long the coordinator may take until it answers [s]: migrations may be slow, and simulations have all cores."""
 SOON_SECONDS = 5.0
 """A child that dies within this time of its start has failed to start [s]."""
 MAX_FAILED_STARTS = 5
