@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from stickslip_training.cloth.evaluation import measure, score
 from stickslip_training.cloth.interpolation import Observation, oracle
-from stickslip_training.cloth.posterior import Posterior, estimates
+from stickslip_training.cloth.posterior import Bins, Posterior, estimates
 from stickslip_training.cloth.runs import Runs, load_runs, split_runs
 from stickslip_training.cloth.training import ClothTraining, render_clips, train_friction, training_cameras
 
@@ -26,6 +26,9 @@ INSTANTS = (50, 60)
 
 NOISE = 0.05
 """Of a vertex [px]: little, for the registration's noise would hide what the simulator does."""
+
+BINS = Bins(0.0, 1.6, 1600)
+"""Of the oracle: what a simulator does to friction is less than a bin of the networks."""
 
 VALIDATION = 0.125
 """Share of the runs of TRAIN that choose a network's weights and temperature."""
@@ -80,7 +83,7 @@ def main() -> None:
         low, high = np.array(ends)[test.material].T
         asked = test[(test.mu >= np.maximum(low, LOWEST)) & (test.mu <= high)]
         side = min(known.side, asked.side)
-        seen = oracle(coarse(known, side), coarse(asked, side), camera, Observation(noise=NOISE), 0, INSTANTS)
+        seen = oracle(coarse(known, side), coarse(asked, side), camera, Observation(noise=NOISE), 0, INSTANTS, BINS)
         name = f"{path.stem} ({len(known)} runs)"
         records.append(told(name, "oracle", seen, asked, 1))
         if args.steps:

@@ -3,7 +3,8 @@
     python benchmarks/training/thesis_networks.py NET SPLIT CLIPS.npz ... --test CLIPS.npz [--steps 1200] [--size 56]
         [--records FILE.jsonl]
 
-NET is `baseline` (blind to the material), `conditional` (told the true one) or `material` [thesis, Tables 4.3 and 4.4].
+NET is `baseline` (blind to the material), `conditional` (told the true one) or `material` [thesis, Tables 4.3 and 4.4],
+or `posterior`: our `PosteriorNet`, on the same clips and nothing else.
 With SPLIT `by_clip` a tenth of the clips is to test with, as in the thesis: every simulation of the test was seen in
 training, with other textures. With `by_simulation` all clips are trained on, and those of `--test` show other
 simulations. All are of `blender_clips.py`. Three things are smaller than in the thesis: clips have `--frames` frames,
@@ -14,7 +15,7 @@ but the true mu lie anywhere between 0 and 1.6.
 import argparse
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,13 @@ from typing import Any
 import numpy as np
 import torch
 from stickslip_training.arrays import Array
-from stickslip_training.cloth.evaluation import errors, measure
-from stickslip_training.cloth.nets import BaselineNet, ConditionalNet
-from stickslip_training.cloth.posterior import Estimates
-from stickslip_training.engine.fit import EpochReport, FitSettings, Learner, fit, seed_of_step
+from stickslip_training.cloth.clips import clips_of_file
+from stickslip_training.cloth.evaluation import Errors, Measure, errors, measure
+from stickslip_training.cloth.nets import BaselineNet, ConditionalNet, PosteriorNet
+from stickslip_training.cloth.posterior import MU_BINS, Estimates, estimates
+from stickslip_training.cloth.training import Clips as Crops
+from stickslip_training.cloth.training import answer, features, jittered, load_friction
+from stickslip_training.engine.fit import EpochReport, FitSettings, Learner, cosine_rate, fit, seed_of_step
 from torch import nn
 
 CLASSES = 17
@@ -70,7 +74,7 @@ class ThesisLearner(Learner):
         torch.manual_seed(seed)
         classes = len(materials) if kind == "material" else CLASSES
         net = ConditionalNet(classes, len(materials)) if kind == "conditional" else BaselineNet(classes)
-        self.net = net.to(memory_format=torch.channels_last)
+        self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stub lacks it
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.Adadelta(parameters, lr=1.0, rho=0.95)
@@ -89,10 +93,95 @@ class ThesisLearner(Learner):
             return torch.as_tensor(net(x, *told)).float()
 
 
+class PosteriorLearner(Learner):
+    """`PosteriorNet` on the crops of clips, without pictures that are rendered while it trains."""
+
+    def __init__(self, clips: Crops, chosen: Array, count: int, settings: FitSettings) -> None:
+        """Take the clips `chosen` of `clips`, of `count` materials."""
+        assert settings.steps is not None
+        self.clips, self.chosen, self.seed, self.steps = clips, chosen, settings.seed, settings.steps
+        torch.manual_seed(settings.seed)
+        self.net = PosteriorNet(materials=count, bins=MU_BINS.count, frames=clips.crops.shape[1])
+        place = np.clip((clips.mu / (MU_BINS.edges[1] - MU_BINS.edges[0])).astype(int), 0, MU_BINS.count - 1)
+        self.place, self.material = torch.from_numpy(place), torch.from_numpy(clips.material)
+
+    def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(parameters, lr=1e-3, weight_decay=0.02)
+
+    def learning_rate(self, step: int) -> float | None:
+        return cosine_rate(1e-3, step, self.steps, 100)
+
+    def loss(self, net: nn.Module, step: int) -> torch.Tensor:
+        seed = seed_of_step(self.seed, 0, step)
+        batch = self.chosen[np.random.default_rng(seed).integers(len(self.chosen), size=BATCH)]
+        crops = jittered(self.clips.crops[batch], torch.Generator().manual_seed(seed))
+        log_material, log_mu = net(crops, self.clips.direction[batch])
+        material, rows = self.material[batch], torch.arange(BATCH)
+        return torch.as_tensor(-(log_material[rows, material] + log_mu[rows, material, self.place[batch]]).mean())
+
+
+def posterior(args: argparse.Namespace) -> None:
+    """Train and test `PosteriorNet`, print and record."""
+    materials = load_friction().materials
+    clips = Crops.joined([clips_of_file(path, materials)[0] for path in args.clips])
+    train, asked = parted(len(clips), args)
+    test = clips[asked] if args.split == "by_clip" else clips_of_file(args.test, materials)[0]
+    settings = FitSettings(steps=args.steps, epoch=500, seed=args.seed, averaging=0.99, clip=1.0, threads=1)
+    started = time.process_time()
+    net = fit(PosteriorLearner(clips, train, len(materials), settings), settings, on_epoch=tell(args.steps)).net
+    assert isinstance(net, PosteriorNet)
+    log_material, log_mu = answer(net, features(net, test))
+    joint = np.exp(log_material)[:, :, None] * np.exp(log_mu)
+    found = errors(estimates(joint.sum(axis=1), MU_BINS), test.mu, test.run)
+    right = measure((log_material.argmax(axis=1) == test.material).astype(float), test.run)
+    finish(args, len(train), time.process_time() - started, found, right)
+
+
+def parted(count: int, args: argparse.Namespace) -> tuple[Array, Array]:
+    """Return the numbers of the clips to train on, and of the tenth to test with where the split is by clip."""
+    order = np.random.default_rng(args.seed).permutation(count)
+    tenth = count // 10 if args.split == "by_clip" else 0
+    return order[tenth:], order[:tenth]
+
+
+def tell(steps: int) -> Callable[[EpochReport], None]:
+    """Return what prints how far a run is."""
+    return lambda epoch: print(
+        f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}, {epoch.seconds:.0f} s", flush=True
+    )
+
+
+def finish(args: argparse.Namespace, trained: int, seconds: float, found: Errors | None, right: Measure | None) -> None:
+    """Print and record what a network got right."""
+    record: dict[str, Any] = {
+        **{key: getattr(args, key) for key in ("net", "split", "steps", "size", "frames")},
+        "epochs": round(args.steps * BATCH / trained, 2),
+        "trained_on": trained,
+        "cpu_s": round(seconds),
+        "errors": None if found is None else asdict(found),
+        "top_1": None if right is None else asdict(right),
+    }
+    if args.net == "posterior":  # it has crops of all six frames
+        record |= {"size": None, "frames": 6}
+    told = (
+        []
+        if found is None
+        else [
+            f"{found.clips} clips of {found.simulations} simulations, mean error {found.mae}, < 0.1 / < 0.2 "
+            f"{found.within_01.value:.1%} / {found.within_02.value:.1%}"
+        ]
+    )
+    told += [] if right is None else [f"material {right.value:.1%}"]
+    print(f"{args.net}, {args.split}: {', '.join(told)}, {seconds:.0f} CPU s")
+    if args.records is not None:
+        with args.records.open("a") as file:
+            file.write(json.dumps(record) + "\n")
+
+
 def main() -> None:
     """Train, test, print and record."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("net", choices=("baseline", "conditional", "material"))
+    parser.add_argument("net", choices=("baseline", "conditional", "material", "posterior"))
     parser.add_argument("split", choices=("by_clip", "by_simulation"))
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--test", type=Path, required=True)
@@ -102,51 +191,28 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--records", type=Path)
     args = parser.parse_args()
+    if args.net == "posterior":
+        posterior(args)
+        return
     clips = Clips(args.clips, args.size, args.frames)
     materials = sorted(set(clips.names))
-    order = np.random.default_rng(args.seed).permutation(len(clips.mu))
-    tenth = len(order) // 10
-    by_clip = args.split == "by_clip"
-    train = order[tenth:] if by_clip else order
-    test = clips if by_clip else Clips([args.test], args.size, args.frames)
-    asked = order[:tenth] if by_clip else np.arange(len(test.mu))
+    train, asked = parted(len(clips.mu), args)
+    test = clips if args.split == "by_clip" else Clips([args.test], args.size, args.frames)
+    asked = asked if args.split == "by_clip" else np.arange(len(test.mu))
     learner = ThesisLearner(args.net, clips, train, materials, args.seed)
     started = time.process_time()
-
-    def tell(epoch: EpochReport) -> None:
-        print(f"step {epoch.step} of {args.steps}: loss {epoch.train_loss:.3f}, {epoch.seconds:.0f} s", flush=True)
-
-    settings = FitSettings(steps=args.steps, epoch=100, seed=args.seed, clip=None, threads=1)
-    net = fit(learner, settings, on_epoch=tell).net
+    settings = FitSettings(steps=args.steps, epoch=100, seed=args.seed, threads=1)
+    net = fit(learner, settings, on_epoch=tell(args.steps)).net
     seconds = time.process_time() - started
     with torch.inference_mode():
         parts = [learner.logits(net, test, asked[at : at + _CHUNK]) for at in range(0, len(asked), _CHUNK)]
-    answer = torch.cat(parts).argmax(dim=1).numpy()
-    record: dict[str, Any] = {
-        "net": args.net,
-        "split": args.split,
-        "steps": args.steps,
-        "size": args.size,
-        "frames": args.frames,
-        "epochs": round(args.steps * BATCH / len(train), 2),
-        "trained_on": len(train),
-        "cpu_s": round(seconds),
-    }
+    code = torch.cat(parts).argmax(dim=1).numpy()
     if args.net == "material":
-        right = (answer == test.materials(materials)[asked].numpy()).astype(float)
-        record["top_1"] = asdict(measure(right, test.run[asked]))
-        print(f"{args.net}, {args.split}: right {measure(right, test.run[asked])}, {seconds:.0f} CPU s")
+        right = (code == test.materials(materials)[asked].numpy()).astype(float)
+        finish(args, len(train), seconds, None, measure(right, test.run[asked]))
     else:
-        mu = answer / 10
-        found = errors(Estimates(mu, mu, mu), test.mu[asked], test.run[asked])
-        record["errors"] = asdict(found)
-        print(
-            f"{args.net}, {args.split}: {found.clips} clips of {found.simulations} simulations, mean error "
-            f"{found.mae}, < 0.1 / < 0.2 {found.within_01.value:.1%} / {found.within_02.value:.1%}, {seconds:.0f} CPU s"
-        )
-    if args.records is not None:
-        with args.records.open("a") as file:
-            file.write(json.dumps(record) + "\n")
+        mu = code / 10
+        finish(args, len(train), seconds, errors(Estimates(mu, mu, mu), test.mu[asked], test.run[asked]), None)
 
 
 if __name__ == "__main__":

@@ -109,7 +109,13 @@ def tracks(runs: Runs, camera: Camera, wanted: tuple[int, ...] = INSTANTS) -> Fl
 
 
 def oracle(
-    known: Runs, test: Runs, camera: Camera, seen: Observation, seed: int, wanted: tuple[int, ...] = INSTANTS
+    known: Runs,
+    test: Runs,
+    camera: Camera,
+    seen: Observation,
+    seed: int,
+    wanted: tuple[int, ...] = INSTANTS,
+    bins: Bins = MU_BINS,
 ) -> Posterior:
     """Return what the vertices of `test`, seen by `camera` at the instants `wanted` as `seen` says, tell of material
     and mu."""
@@ -123,7 +129,7 @@ def oracle(
         side = test.side
         corners = [side * (side - 1), side * side - 1]
         observed = _registered(observed, observed[:, :, corners], x[:, :, corners])
-    curves = Curves.through(tracks(known, camera, wanted).reshape(len(known), -1), known)
+    curves = Curves.through(tracks(known, camera, wanted).reshape(len(known), -1), known, bins)
     # The registration's error is shared by all vertices of a frame, and so is the interpolation's: the noise is not
     # all.
     variance = seen.noise**2 + (seen.noise**2 / 2 if seen.registered else 0.0) + 0.1**2

@@ -80,7 +80,12 @@ def load_runs(path: str | Path) -> Runs:
 
 
 def write_packed(
-    path: Path, positions: Floats, rest: Floats, triangles: Integers, instants: Sequence[int], about: Sequence[str]
+    path: Path,
+    positions: Floats | SingleFloats,
+    rest: Floats | SingleFloats,
+    triangles: Array,
+    instants: Sequence[int],
+    about: Sequence[str],
 ) -> None:
     """Write positions (runs, frames, V, 3) [m] at instants, and what is true of each run as JSON, as `load_runs` reads
     them.
