@@ -225,22 +225,14 @@ def score(
     split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
 ) -> None:
     """Score a file of predictions, of any method, on the clips of a dataset."""
-    from stickslip_training.cloth.clips import check_kind, simulations
+    from stickslip_training.benchmark.records import read_answers
+    from stickslip_training.cloth.clips import check_kind, truth_of_slots
     from stickslip_training.cloth.evaluation import score_predictions
 
     with errors_told(), DatasetReader(dataset) as reader:
         check_kind(reader)
-        slots = reader.slots(_split(split))
-        labels = zip(reader.label("material")[slots].tolist(), reader.label("mu")[slots].tolist(), strict=True)
-        groups = simulations(reader, slots).tolist()
-        truth = {
-            slot: (int(material), float(mu), group)
-            for slot, (material, mu), group in zip(slots.tolist(), labels, groups, strict=True)
-        }
-        answers = json.loads(predictions.read_text(encoding="utf-8"))
-        if not isinstance(answers, list):
-            raise ValueError(f"{predictions} must hold a list of answers, and holds a {type(answers).__name__}")
-        scores = score_predictions(answers, reader.categories("material"), truth)
+        truth = truth_of_slots(reader, reader.slots(_split(split)))
+        scores = score_predictions(read_answers(predictions)[0], reader.categories("material"), truth)
     Console().print(_scores(scores))
 
 

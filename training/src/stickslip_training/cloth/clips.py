@@ -81,6 +81,13 @@ def simulations(reader: DatasetReader, slots: Integers) -> Integers:
     return np.unique(np.concatenate(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
+def truth_of_slots(reader: DatasetReader, slots: Integers) -> dict[int, tuple[int, float, int]]:
+    """Return the code of the material, mu and the number of the simulation of slots, as `score_predictions` asks."""
+    material, mu = (reader.label(name)[slots].tolist() for name in ("material", "mu"))
+    groups = simulations(reader, slots).tolist()
+    return {slot: (m, x, run) for slot, m, x, run in zip(slots.tolist(), material, mu, groups, strict=True)}
+
+
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:
     """Return the side to which each cloth fell; where no vertices are stored, the side to which it was pushed."""
     if "positions" not in reader.arrays:
