@@ -21,10 +21,10 @@ ROOT = Path(__file__).parents[3]
 RECORDS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))
 
 
-def add_set(folder, name, dataset):
+def add_set(folder, name, dataset, split="test"):
     spec = json.loads(dataset.spec.model_dump_json(exclude_defaults=True)) | {"kind": dataset.spec.kind}
     with DatasetReader(dataset.root) as reader:
-        document, seen = frozen(name, "a set to test with", spec, reader)
+        document, seen = frozen(name, "a set to test with", spec, split, reader)
     (folder / f"{name}.json").write_bytes(document)
     (folder / f"{name}.npz").write_bytes(seen)
 
@@ -68,7 +68,7 @@ def rod_answers(dataset, factor=1.0, gamma=None):
 def test_the_labels_of_a_committed_set_follow_from_its_spec(name):
     chosen = load_set(name)
     builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
-    planned = [sample for sample in samples(chosen.parsed_spec, builds) if SPLITS[sample.split] == "test"]
+    planned = [sample for sample in samples(chosen.parsed_spec, builds) if chosen.split in (None, SPLITS[sample.split])]
     always = {"lighting": "drawn"} if chosen.spec["kind"] == "cloth_drag" else {}
     labels = [{"slot": sample.slot, **sample.labels, **always} for sample in planned]
     assert sha256(canonical_json(labels).encode()) == chosen.labels
@@ -90,7 +90,7 @@ def test_another_dataset_is_refused(rod_set, make_rods, monkeypatch):
     with pytest.raises(ValueError, match="must be the test set some-rods, and is not: its spec is another one"):
         checked("some-rods", make_rods(seed=3, rejected=(5, 59)).root)
     tested = int(checked("some-rods", rod_set.root)[0][0])
-    with pytest.raises(ValueError, match=r"the labels of its .* test samples have SHA-256"):
+    with pytest.raises(ValueError, match=r"the labels of its .* samples to answer have SHA-256"):
         checked("some-rods", make_rods(rejected=(5, 59, tested)).root)
     # Another machine's rods, further off than rounding.
     read = DatasetReader.read
@@ -106,8 +106,8 @@ def test_numpy_must_draw_the_same_noise(rod_set, monkeypatch):
 
 
 def test_clips_that_look_different_are_refused(folder, make_clips, monkeypatch):
-    clips = make_clips(splits={"train": 0.0, "validation": 0.0, "test": 1.0}, frames=4)
-    add_set(folder, "some-clips", clips)
+    clips = make_clips(frames=4)
+    add_set(folder, "some-clips", clips, None)
     assert checked("some-clips", clips.root)[1] == "published"
     read = DatasetReader.read
 
@@ -177,22 +177,16 @@ def test_what_a_method_is_given_is_the_noisy_centreline(rod_set, tmp_path):
         assert off.std(axis=(1, 2, 3)) == pytest.approx(np.array(NOISES), rel=0.05)
 
 
-def test_scores_of_clips_are_told_by_what_was_unseen(folder, make_clips, tmp_path):
-    axes = {
-        "material": ["gray-interlock", "royal-target"],
-        "mu": [0.1, 0.4],
-        "texture": ["plaid", "argyle"],
-        "viewpoint": "calibrated",
-    }
-    clips = make_clips(axes=axes, splits={"train": 0.0, "validation": 0.0, "test": 1.0}, samples_per_shard=16)
-    add_set(folder, "some-clips", clips)
+def test_scores_of_known_answers_about_clips(folder, clips, tmp_path):
+    add_set(folder, "some-clips", clips, None)
     with DatasetReader(clips.root) as reader:
-        labels = load_set("some-clips").task.labels(reader, reader.slots("test"))
+        labels = load_set("some-clips").task.labels(reader, reader.slots())
+    assert len(labels) == 10
     answers = [
         {
             "slot": label["slot"],
             "material": {label["material"]: 1.0},
-            "mu": {"low": 0.0, "high": 1.0, "median": label["mu"] + 0.3 * (label["texture"] == "argyle")},
+            "mu": {"low": 0.0, "high": 1.0, "median": label["mu"] + 0.3 * (label["mu"] == 0.4)},
         }
         for label in labels
     ]
@@ -200,9 +194,9 @@ def test_scores_of_clips_are_told_by_what_was_unseen(folder, make_clips, tmp_pat
     done = runner.invoke(app, ["benchmark", "score", "some-clips", str(tmp_path / "answers.json"), str(clips.root)])
     assert done.exit_code == 0, done.output
     cells = [cell.strip() for cell in done.stdout.splitlines()[-1].split("|")]
-    assert cells[3:8] == ["50% / 50%", "100%", "100%", "0.000", "0.300"]
+    assert cells[3:10] == ["50% / 50%", "100%", "100%", "0.000", "0.300", "", ""]
     with pytest.raises(ValueError, match="a method is given the clips themselves"), DatasetReader(clips.root) as reader:
-        load_set("some-clips").task.inputs(reader, reader.slots("test"))
+        load_set("some-clips").task.inputs(reader, reader.slots())
 
 
 # --- the command and the table --------------------------------------------------------------------------------

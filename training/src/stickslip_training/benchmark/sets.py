@@ -1,7 +1,7 @@
 """Which named test sets there are, and whether a dataset is one of them.
 
-A set is a spec, of whose dataset the split test is to be answered. Builds of the code differ between machines, and so
-do manifests. What identifies a set is therefore what its test split holds:
+A set is a spec, and the split of its dataset that is to be answered, or all of it. Builds of the code differ between
+machines, and so do manifests. What identifies a set is therefore what its samples hold:
 
   * the labels that follow from the spec, slot by slot, to the last bit: a digest;
   * a little of what methods see, and of truths that are computed, to within a tolerance: an array.
@@ -25,7 +25,7 @@ from stickslip_training.arrays import Array, Integers
 from stickslip_training.benchmark.cloth import ClothTask
 from stickslip_training.benchmark.rods import RodTask
 from stickslip_training.benchmark.task import Task
-from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.reader import DatasetReader, Split
 
 TASKS: dict[str, Task] = {"cloth_drag": ClothTask(), "rod_hang": RodTask()}
 """By kind of dataset."""
@@ -42,7 +42,9 @@ class NamedSet:
     spec: dict[str, Any]
     """As a user writes it; `stickslip submit` takes it."""
     labels: str
-    """SHA-256 of the labels of the test split."""
+    """SHA-256 of the labels of the samples to answer."""
+    split: Split | None
+    """Of the samples to answer; None: all."""
     published: tuple[str, ...]
     """Digests of the manifests of versions that were published."""
     seen: dict[str, Array]
@@ -67,10 +69,10 @@ class NamedSet:
             raise ValueError(
                 f"{refused}its spec is another one. `stickslip-train benchmark spec {self.name}` prints it"
             )
-        slots = reader.slots("test")
+        slots = reader.slots(self.split)
         if (found := labels_digest(self.task, reader, slots)) != self.labels:
             raise ValueError(
-                f"{refused}the labels of its {len(slots)} test samples have SHA-256 {found}, and those of the set "
+                f"{refused}the labels of its {len(slots)} samples to answer have SHA-256 {found}, and those of the set "
                 f"{self.labels}. Samples were rejected here, or the dataset is in parts"
             )
         for name, found_here in self.task.seen(reader, slots).items():
@@ -100,19 +102,22 @@ def load_set(name: str) -> NamedSet:
         about=document["about"],
         spec=document["spec"],
         labels=document["labels"],
+        split=document["split"],
         published=tuple(document["published"]),
         seen=seen,
     )
 
 
-def frozen(name: str, about: str, spec: dict[str, Any], reader: DatasetReader) -> tuple[bytes, bytes]:
+def frozen(
+    name: str, about: str, spec: dict[str, Any], split: Split | None, reader: DatasetReader
+) -> tuple[bytes, bytes]:
     """Return the files NAME.json and NAME.npz of a new set, whose published version the reader has open."""
     task = TASKS[reader.kind]
-    slots = reader.slots("test")
+    slots = reader.slots(split)
     seen = task.seen(reader, slots)
-    new = NamedSet(name, about, spec, labels_digest(task, reader, slots), (reader.manifest_digest,), seen)
+    new = NamedSet(name, about, spec, labels_digest(task, reader, slots), split, (reader.manifest_digest,), seen)
     new.check(reader)
-    document = {"about": about, "labels": new.labels, "published": list(new.published), "spec": spec}
+    document = {"about": about, "split": split, "labels": new.labels, "published": [*new.published], "spec": spec}
     packed = BytesIO()
     np.savez_compressed(packed, **seen)  # type: ignore[arg-type]  # its stub takes no dictionary
     return (json.dumps(document, indent=2) + "\n").encode(), packed.getvalue()

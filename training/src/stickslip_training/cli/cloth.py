@@ -50,6 +50,7 @@ def train(
 
     from stickslip_training.cloth.training import ClothTraining, load_friction, save_friction, train_friction
     from stickslip_training.engine.fit import EpochReport
+    from stickslip_training.engine.ranks import current_rank, joined
 
     console = Console()
 
@@ -57,10 +58,8 @@ def train(
         validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
-    with errors_told():
-        settings = ClothTraining(
-            steps=steps, learning_rate=rate, seed=seed, threads=threads, device=check_device(device)
-        )
+    with errors_told(), joined(check_device(device)) as own_device:
+        settings = ClothTraining(steps=steps, learning_rate=rate, seed=seed, threads=threads, device=own_device)
         first = None if start is None else load_friction(start)
         if start is not None:
             # The order of mu is known: the network is told as sharply as it was in the end.
@@ -80,6 +79,8 @@ def train(
             resume=resume,
             on_epoch=tell,
         )
+        if not current_rank().is_first:
+            return
         model.card.update(source)
         save_friction(out / "friction.safetensors", model)
         (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")

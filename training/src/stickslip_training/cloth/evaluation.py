@@ -4,8 +4,8 @@ Clips of one simulation are not independent. Every uncertainty here is over simu
 replacement [bootstrap], and all their clips with them.
 """
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -69,8 +69,6 @@ class Scores:
     sides: dict[str, Errors]
     reliability: dict[str, float]
     """Share of the clips whose truth lies in the central interval of each level."""
-    slices: dict[str, Errors] = field(default_factory=dict)
-    """Of parts of the clips that have names, such as those with an unseen texture."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values."""
@@ -174,15 +172,12 @@ def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, An
 
 
 def score_predictions(
-    answers: Sequence[Any],
-    materials: Sequence[str],
-    truth: Mapping[int, tuple[int, float, int]],
-    slices: Mapping[str, Collection[int]] | None = None,
+    answers: Sequence[Any], materials: Sequence[str], truth: dict[int, tuple[int, float, int]]
 ) -> Scores:
     """Score a file of predictions, anybody's: `truth` has material, mu and simulation of each slot.
 
-    `slices` names slots whose errors are told apart, too. Every slot of `truth` must be answered once. Raises
-    ValueError, which names the answer, where one is not what `predictions` returns.
+    Every slot of `truth` must be answered once. Raises ValueError, which names the answer, where one is not what
+    `predictions` returns.
     """
     found: dict[int, tuple[dict[str, float], tuple[float, float, float]]] = {}
     for place, answer in enumerate(answers):
@@ -214,7 +209,6 @@ def score_predictions(
     certain = np.array([[found[slot][0].get(name, 0.0) for name in materials] for slot in slots])
     rank = (certain >= certain[np.arange(len(slots)), material][:, None]).sum(axis=1) - 1
     bands = {f"{a:g} to {b:g}": (true_mu >= a) & (true_mu < b + (b == BANDS[-1][1])) for a, b in BANDS}
-    parts = {name: np.isin(slots, list(chosen)) for name, chosen in (slices or {}).items()}
     return Scores(
         blind=errors(told, true_mu, run),
         given=None,
@@ -224,5 +218,4 @@ def score_predictions(
         bands={n: errors(_some(told, c), true_mu[c], run[c]) for n, c in bands.items() if c.any()},
         sides={},
         reliability={f"{SHARE:g}": float(((low <= true_mu) & (true_mu <= high)).mean())},
-        slices={n: errors(_some(told, c), true_mu[c], run[c]) for n, c in parts.items() if c.any()},
     )

@@ -36,6 +36,7 @@ from stickslip_training.engine.fit import (
     seeded,
     torch_threads,
 )
+from stickslip_training.engine.ranks import Rank
 
 RIG = "drag"
 
@@ -374,6 +375,7 @@ class _FrictionLearner(Learner):
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
+        self.rank = Rank()
         self.frames, self.instants = frames_at(train.instants)
         self.train = train
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
@@ -398,6 +400,13 @@ class _FrictionLearner(Learner):
                 )
             self.net.load_state_dict(start.nets[0].state_dict())
 
+    def share(self, rank: Rank) -> None:
+        if self.settings.batch_size % rank.count:
+            raise ValueError(
+                f"batch_size must be a multiple of the {rank.count} processes, and is {self.settings.batch_size}"
+            )
+        self.rank = rank
+
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
 
@@ -418,10 +427,11 @@ class _FrictionLearner(Learner):
         return torch.as_tensor(loss)
 
     def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the crops, directions of view, materials and mu of a step."""
-        random = np.random.default_rng((self.settings.seed, _TRAINING, step))
-        generator = torch.Generator().manual_seed(seed_of_step(self.settings.seed, _TRAINING, step))
-        count = self.settings.batch_size
+        """Return the crops, directions of view, materials and mu of this process's share of a step."""
+        seeds = (self.settings.seed, _TRAINING, step, *self.rank.seeds)
+        random = np.random.default_rng(seeds)
+        generator = torch.Generator().manual_seed(seed_of_step(*seeds))
+        count = self.settings.batch_size // self.rank.count
         chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
         share = random.random(count, dtype=np.float32)
         near = torch.from_numpy(share)[:, None, None, None, None]
