@@ -29,7 +29,9 @@ def main() -> None:
     parser.add_argument("--textures", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, nargs="+", help="numbers of the runs; all, if not given")
-    parser.add_argument("--instants", type=int, nargs="+", default=[60, 80, 130, 150, 210, 220])
+    parser.add_argument(
+        "--instants", nargs="+", default=["60", "80", "130", "150", "210", "220"], help="or all that the runs hold"
+    )
     parser.add_argument("--quality", default="draft")
     parser.add_argument("--held-out-textures", action="store_true")
     parser.add_argument("--held-out-viewpoints", action="store_true")
@@ -40,7 +42,8 @@ def main() -> None:
         positions = np.cumsum(np.stack([low, high], axis=-1).view(np.int16)[..., 0], axis=1, dtype=np.int16) * 1e-5
         rest, triangles, instants = file["rest"], file["triangles"].astype(np.int32), file["instants"].tolist()
         about = [json.loads(str(line)) for line in file["about"]]
-    frames = [instants.index(instant) for instant in args.instants]
+    shown = instants if args.instants == ["all"] else [int(instant) for instant in args.instants]
+    frames = [instants.index(instant) for instant in shown]
     runs = list(range(len(about))) if args.only is None else args.only
     textures = [t for t in Texture if (t in HELD_OUT_TEXTURES) == args.held_out_textures]
     views = HELD_OUT_VIEWPOINTS if args.held_out_viewpoints else TRAINING_VIEWPOINTS
@@ -61,7 +64,7 @@ def main() -> None:
                     "quality": Quality(args.quality),
                     "rig": "drag",
                     "rig_digest": "0" * 64,
-                    "instants": tuple(args.instants),
+                    "instants": tuple(shown),
                     "light_seed": int(random.integers(2**31)),
                     "crease_seed": int(random.integers(2**31)),
                 }
@@ -76,7 +79,7 @@ def main() -> None:
     np.savez_compressed(
         args.out,
         video=np.stack(videos),
-        instants=np.array(args.instants, np.int16),
+        instants=np.array(shown, np.int16),
         about=np.array([json.dumps(line) for line in told]),
     )
 

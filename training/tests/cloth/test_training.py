@@ -12,6 +12,7 @@ from stickslip_training.cloth.runs import split_of_runs, split_runs
 from stickslip_training.cloth.training import (
     INSTANTS,
     WEIGHTS,
+    Clips,
     ClothTraining,
     RenderedClips,
     _FrictionLearner,
@@ -190,6 +191,9 @@ def test_a_file_of_clips_is_read_and_its_test_simulations_are_refused(runs, pack
     clips, about = clips_of_file(tmp_path / "clips.npz", runs.materials)
     assert clips.crops.shape == (2, 6, 72, 88)
     assert clips.run.tolist() == kept == [clip["run"] for clip in about]
+    twice = Clips.joined([clips, clips[np.array([1])]])
+    assert twice.run.tolist() == [*kept, kept[1]]
+    assert torch.equal(twice.crops[2], clips.crops[1])
     file_of_clips(tmp_path / "tested.npz", [*kept, tested])
     done = CliRunner().invoke(
         app, ["cloth", "train", str(packed), "--out", str(tmp_path / "out"), "--clips", str(tmp_path / "tested.npz")]

@@ -38,8 +38,8 @@ def train(
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
     clips: Annotated[
-        str | None,
-        typer.Option(help="train on these clips of Blender, too: a dataset, or a file of blender_clips.py (.npz)"),
+        list[str] | None,
+        typer.Option(help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"),
     ] = None,
     start: Annotated[Path | None, typer.Option(help="a friction.safetensors whose weights are the first")] = None,
     rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
@@ -67,7 +67,7 @@ def train(
         source, parts = _splits(runs, split_seed)
         source["split_seed"] = split_seed
         source["start"] = None if start is None else sha256(start.read_bytes())
-        source["clips"], rendered = (None, None) if clips is None else _clips(clips, runs, parts["train"], split_seed)
+        source["clips"], rendered = _clips(clips, runs, parts["train"], split_seed) if clips else (None, None)
         model = train_friction(
             parts["train"],
             parts["validation"],
@@ -265,28 +265,34 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
         return named, splits
 
 
-def _clips(source: str, runs: str, train: "Runs", seed: int) -> "tuple[str, RenderedClips]":
+def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[list[str], RenderedClips]":
     """Return what names the clips, and those of the splits train and validation."""
     import numpy as np
     from stickslip_schemas.keys import sha256
 
     from stickslip_training.cloth.clips import clips_of_file, read_clips
     from stickslip_training.cloth.runs import load_runs, split_of_runs
-    from stickslip_training.cloth.training import RenderedClips
+    from stickslip_training.cloth.training import Clips, RenderedClips
 
-    if not source.endswith(".npz"):
-        with DatasetReader(source) as reader:
+    if not all(source.endswith(".npz") for source in sources):
+        if len(sources) > 1:
+            raise ValueError(f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}")
+        with DatasetReader(sources[0]) as reader:
             learned, judged = (read_clips(reader, _split(part), train.materials)[0] for part in ("train", "validation"))
             # Simulations have numbers by split.
-            return reader.manifest_digest, RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
+            return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
     if not runs.endswith(".npz"):
         raise ValueError(f"runs must be the packed file that the clips are of, and are {runs}")
-    known, _ = clips_of_file(Path(source), train.materials)
     split = split_of_runs(load_runs(runs), SHARES, seed)
-    if known.run.max() >= len(split) or (split[known.run] == 2).any():
-        raise ValueError(f"{source} must not show simulations to test with: it has some of the split test of {runs}")
+    files = []
+    for source in sources:
+        shown, _ = clips_of_file(Path(source), train.materials)
+        if shown.run.max() >= len(split) or (split[shown.run] == 2).any():
+            raise ValueError(f"{source} must not show simulations to test with: it has some of the test split")
+        files.append(shown)
+    known = Clips.joined(files)
     learned, judged = (known[np.flatnonzero(split[known.run] == part)] for part in (0, 1))
-    return sha256(Path(source).read_bytes()), RenderedClips(learned, judged)
+    return [sha256(Path(source).read_bytes()) for source in sources], RenderedClips(learned, judged)
 
 
 def _split(name: str) -> Any:

@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,8 @@ class ClothTraining:
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    instants: tuple[int, ...] = INSTANTS
+    """Of the frames that the network sees, of 300."""
     seed: int = 0
     width: int = 96
     threads: int = 1
@@ -113,6 +115,12 @@ class Clips:
             self.landed[chosen],
             self.run[chosen],
         )
+
+    @staticmethod
+    def joined(parts: "Sequence[Clips]") -> "Clips":
+        """Return the clips of all parts."""
+        columns = [[getattr(part, field.name) for part in parts] for field in fields(Clips)]
+        return Clips(*(torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each) for each in columns))
 
     def truth(self) -> Truth:
         """Return what is true of the clips, as scores ask for it."""
@@ -214,7 +222,7 @@ def train_friction(
         seen = learner.validation
         found = features(net, seen)
         temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
-        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
+        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
         familiarity = Familiarity.of(features(net, known), known.material, found, len(train.materials))
     card = {
         "settings": asdict(settings),
@@ -227,7 +235,7 @@ def train_friction(
         "history": [asdict(report) for report in fitted.history],
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
     }
-    instants = frames_at(train.instants)[1]
+    instants = frames_at(train.instants, settings.instants)[1]
     return FrictionModel((net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card)
 
 
@@ -315,13 +323,14 @@ def render_clips(
     turn: tuple[float, float] = (0.0, 0.0),
     spread: float = 0.0,
     style: Callable[[Style], Style] | None = None,
+    wanted: tuple[int, ...] = INSTANTS,
 ) -> Clips:
-    """Render every run `renders` times, each with a look of its own, by the cameras in turn.
+    """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
 
     `turn` turns all cameras (about the vertical, up) [degree]; `spread` adds random turns of this deviation; `style`
     changes the looks that were drawn.
     """
-    frames, instants = frames_at(runs.instants)
+    frames, instants = frames_at(runs.instants, wanted)
     rig = training_cameras() if cameras is None else cameras
     number = np.repeat(np.arange(len(runs)), renders)
     crops, directions = [], []
@@ -376,7 +385,7 @@ class _FrictionLearner(Learner):
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
         self.rank = Rank()
-        self.frames, self.instants = frames_at(train.instants)
+        self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
         self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
@@ -385,7 +394,9 @@ class _FrictionLearner(Learner):
         self.rig = training_cameras()
         self.clips = clips
         self.validation = (
-            render_clips(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
+            render_clips(validation, 6, settings.seed, spread=settings.turn, wanted=settings.instants)
+            if clips is None
+            else clips.validation
         )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
         with seeded(settings.seed):
