@@ -73,7 +73,10 @@ def main() -> None:
     for path in args.train:
         known = load_runs(path)
         # Nothing is known beyond the least and the largest mu of a fabric.
-        ends = [(known.mu[known.material == code].min(), known.mu[known.material == code].max()) for code in range(len(known.materials))]
+        ends = [
+            (known.mu[known.material == code].min(), known.mu[known.material == code].max())
+            for code in range(len(known.materials))
+        ]
         low, high = np.array(ends)[test.material].T
         asked = test[(test.mu >= np.maximum(low, LOWEST)) & (test.mu <= high)]
         side = min(known.side, asked.side)
