@@ -39,7 +39,8 @@ class Bins:
 
     def place(self, values: Floats) -> Integers:
         """Return the bin of each value, (n,); the first or the last one beyond the ends."""
-        return np.clip(((values - self.low) / (self.edges[1] - self.low)).astype(int), 0, self.count - 1)
+        places = ((values - self.low) / (self.edges[1] - self.low)).astype(np.int64)
+        return np.asarray(np.clip(places, 0, self.count - 1))
 
 
 MU_BINS = Bins(0.0, 1.6, 64)
