@@ -36,6 +36,7 @@ def main() -> None:
     parser.add_argument("--held-out-textures", action="store_true")
     parser.add_argument("--held-out-viewpoints", action="store_true")
     parser.add_argument("--lighting", default="drawn", help="drawn or held-out")
+    parser.add_argument("--segmentation", action="store_true", help="write what is seen at every pixel, too")
     args = parser.parse_args()
     with np.load(args.runs) as file:
         low, high = file["differences"]
@@ -50,7 +51,7 @@ def main() -> None:
     cameras = {camera.name: camera for camera in load_rig("drag")}
     random = np.random.default_rng(args.seed)
     renderer = ClothRenderer(triangles, rest, Holders)
-    videos, told = [], []
+    videos, seen, told = [], [], []
     try:
         for clip in range(args.clips):
             run, view = runs[clip % len(runs)], views[clip % len(views)]
@@ -71,6 +72,8 @@ def main() -> None:
             )
             made = renderer.clip(look, cameras[view.value], positions[run][frames])
             videos += list(made.clips(made.trace(), [texture_image(texture) for texture in chosen])[0])
+            if args.segmentation:
+                seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
             for texture in chosen:
                 told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **about[run]})
                 print(json.dumps(told[-1]), flush=True)
@@ -81,6 +84,7 @@ def main() -> None:
         video=np.stack(videos),
         instants=np.array(shown, np.int16),
         about=np.array([json.dumps(line) for line in told]),
+        **({"segmentation": np.stack(seen)} if seen else {}),
     )
 
 

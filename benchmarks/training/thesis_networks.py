@@ -6,9 +6,9 @@
 NET is `baseline` (blind to the material), `conditional` (told the true one) or `material` [thesis, Tables 4.3 and 4.4].
 With SPLIT `by_clip` a tenth of the clips is to test with, as in the thesis: every simulation of the test was seen in
 training, with other textures. With `by_simulation` all clips are trained on, and those of `--test` show other
-simulations. All are of `blender_clips.py`. Smaller than the thesis's in three things: clips have as many frames as the
-files, pictures are `--size` px wide, and training is short. Friction has classes of 0.1, as in the thesis, but the true
-mu lie anywhere between 0 and 1.6.
+simulations. All are of `blender_clips.py`. Three things are smaller than in the thesis: clips have `--frames` frames,
+not 30, pictures are `--size` px wide, not 224, and training is short. Friction has classes of 0.1, as in the thesis,
+but the true mu lie anywhere between 0 and 1.6.
 """
 
 import argparse
@@ -38,14 +38,15 @@ _CHUNK = 32
 class Clips:
     """Clips in memory, and what is true of them."""
 
-    def __init__(self, files: list[Path], size: int) -> None:
-        """Read files, and make pictures `size` px wide by means over pixels."""
+    def __init__(self, files: list[Path], size: int, frames: int) -> None:
+        """Read `frames` frames of each clip, evenly spread, and make pictures `size` px wide by means over pixels."""
         pictures, about = [], []
         for path in files:
             with np.load(path) as file:
                 about += [json.loads(str(line)) for line in file["about"]]
+                shown = np.linspace(0, len(file["instants"]) - 1, frames).round().astype(int)
                 for clip in file["video"]:
-                    levels = torch.from_numpy(clip).permute(0, 3, 1, 2).float()
+                    levels = torch.from_numpy(clip[shown]).permute(0, 3, 1, 2).float()
                     pictures.append(nn.functional.adaptive_avg_pool2d(levels, size).round().to(torch.uint8))
         self.pictures = torch.stack(pictures)
         """(clips, F, 3, size, size)"""
@@ -97,16 +98,17 @@ def main() -> None:
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--size", type=int, default=56)
+    parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--records", type=Path)
     args = parser.parse_args()
-    clips = Clips(args.clips, args.size)
+    clips = Clips(args.clips, args.size, args.frames)
     materials = sorted(set(clips.names))
     order = np.random.default_rng(args.seed).permutation(len(clips.mu))
     tenth = len(order) // 10
     by_clip = args.split == "by_clip"
     train = order[tenth:] if by_clip else order
-    test = clips if by_clip else Clips([args.test], args.size)
+    test = clips if by_clip else Clips([args.test], args.size, args.frames)
     asked = order[:tenth] if by_clip else np.arange(len(test.mu))
     learner = ThesisLearner(args.net, clips, train, materials, args.seed)
     started = time.process_time()
@@ -125,6 +127,7 @@ def main() -> None:
         "split": args.split,
         "steps": args.steps,
         "size": args.size,
+        "frames": args.frames,
         "epochs": round(args.steps * BATCH / len(train), 2),
         "trained_on": len(train),
         "cpu_s": round(seconds),

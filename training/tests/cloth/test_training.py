@@ -17,6 +17,7 @@ from stickslip_training.cloth.training import (
     RenderedClips,
     _FrictionLearner,
     calibrated,
+    covering,
     jittered,
     load_friction,
     render_clips,
@@ -100,6 +101,13 @@ def test_temperatures_mend_what_is_too_sure():
     found = calibrated(material, mu, code, truth, MU_BINS)
     assert found[0] == pytest.approx(1.0, abs=0.1)
     assert found[1] == pytest.approx(4.0, rel=0.1)
+
+
+def test_wider_intervals_take_a_higher_temperature(few):
+    model = train_friction(*few[:2], SMALL, epoch=6)
+    clips = render_clips(few[0], 4, 3)
+    half, most = (covering(model.nets[0], clips, 1.0, model.materials, 0, share) for share in (0.5, 0.95))
+    assert 0.4 <= half <= most <= 6.0
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.fabric import FABRIC, Quantity
 from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.nets import PosteriorNet
-from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
+from stickslip_training.cloth.posterior import MU_BINS, SHARE, Bins, Posterior, estimates
 from stickslip_training.cloth.render import Style, draw_style, render_crops, turned
 from stickslip_training.cloth.runs import Runs, between
 from stickslip_training.engine.fit import (
@@ -162,7 +162,7 @@ class FrictionModel:
     instants: tuple[int, ...]
     bins: Bins
     temperature: tuple[float, float]
-    """By which log p(m) and log p(mu | m) are divided: see `calibrated`."""
+    """By which log p(m) and log p(mu | m) are divided: see `calibrated` and `covering`."""
     familiarity: tuple[Familiarity, ...]
     """Of each network: what it was trained on."""
     card: dict[str, Any]
@@ -244,6 +244,7 @@ def train_friction(
         seen = learner.validation
         found = features(net, seen)
         temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
+        temperature = (temperature[0], covering(net, seen, temperature[0], train.materials, settings.seed))
         quantities = learner.quantities
         temperatures = calibrated_quantities(quantities, tell(net, found), seen.fabric)
         known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
@@ -575,6 +576,26 @@ def _posterior(
 def _softmax(logits: SingleFloats) -> Floats:
     shifted = np.exp((logits - logits.max(axis=-1, keepdims=True)).astype(np.float64))
     return np.asarray(shifted / shifted.sum(axis=-1, keepdims=True))
+
+
+def covering(
+    net: PosteriorNet, clips: Clips, of_material: float, materials: tuple[str, ...], seed: int, share: float = SHARE
+) -> float:
+    """Return the temperature of mu at which the intervals that should hold `share` hold that share of the truths.
+
+    The most likely temperature is another one where a few clips are far off: it makes all intervals wider. The clips
+    are seen with exposures and registrations that differ as those of new clips may.
+    """
+    generator = torch.Generator().manual_seed(seed_of_step(seed, _VALIDATION, 1))
+    answers = answer(net, features(net, replace(clips, crops=jittered(clips.crops, generator))))
+    tried = np.geomspace(0.4, 6.0, 55)
+
+    def held(temperature: float) -> float:
+        posterior = _posterior(*answers, materials, MU_BINS, (of_material, temperature))
+        found = estimates(posterior.mu, MU_BINS, share)
+        return float(((found.low <= clips.mu) & (clips.mu <= found.high)).mean())
+
+    return float(tried[int(np.argmin([abs(held(each) - share) for each in tried]))])
 
 
 def calibrated(
