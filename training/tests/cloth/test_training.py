@@ -152,7 +152,7 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_p
 def test_half_of_each_batch_is_of_the_clips(few):
     black = replace(some_clips(few).train, mu=np.full(18, 9.0))
     learner = _FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
-    crops, direction, material, mu = learner.batch(0)
+    crops, direction, material, mu, _ = learner.batch(0)
     assert len(crops) == len(direction) == len(material) == 6
     assert (mu == 9.0).tolist() == [False] * 3 + [True] * 3
 

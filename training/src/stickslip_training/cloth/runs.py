@@ -7,7 +7,7 @@ it); a dataset that stores its meshes holds them, too.
 import json
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from zipfile import BadZipFile
@@ -15,6 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
+from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.data.reader import DatasetReader, Split
 
 STEP = 1e-5
@@ -41,6 +42,8 @@ class Runs:
     """(runs,)"""
     landed: Integers
     """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on the first leg."""
+    fabric: Floats
+    """(runs, 3): log10 of `fabric.FABRIC`; NaN where they are not known."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -54,14 +57,22 @@ class Runs:
             self.material[chosen],
             self.mu[chosen],
             self.landed[chosen],
+            self.fabric[chosen],
         )
+
+    def named(self, materials: tuple[str, ...]) -> "Runs":
+        """Return the runs with the codes of other names; raise ValueError where one of theirs is missing."""
+        if missing := set(self.materials) - set(materials):
+            raise ValueError(f"materials must have those of the runs, and lack {', '.join(sorted(missing))}")
+        codes = np.array([materials.index(name) for name in self.materials])
+        return replace(self, materials=materials, material=codes[self.material])
 
     @staticmethod
     def joined(first: "Runs", second: "Runs") -> "Runs":
         """Return the runs of both, which must have the same instants and materials."""
         if (first.instants, first.materials) != (second.instants, second.materials):
             raise ValueError("runs that are joined must have the same instants and materials")
-        names = ("positions", "material", "mu", "landed")
+        names = ("positions", "material", "mu", "landed", "fabric")
         both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
         return Runs(instants=first.instants, materials=first.materials, **both)
 
@@ -114,7 +125,8 @@ def _load(path: str | Path) -> Runs:
         rest, instants = file["rest"], tuple(map(int, file["instants"]))
     materials = tuple(sorted({run["material"] for run in about}))
     material = np.array([materials.index(run["material"]) for run in about])
-    return _runs(positions, rest, instants, materials, material, np.array([run["mu"] for run in about]))
+    mu = np.array([run["mu"] for run in about])
+    return _runs(positions, rest, instants, materials, material, mu, numbers_of_runs(about))
 
 
 def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
@@ -140,7 +152,9 @@ def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequen
     rest = reader.read("rest", chosen[:1])[0]
     material = reader.label("material")[chosen].astype(np.int64)
     materials = reader.categories("material")
-    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, reader.label("mu")[chosen]), chosen
+    fabric = fabric_numbers(*(reader.label(name)[chosen] for name in ("areal_density", "bending_rigidity")))
+    mu = reader.label("mu")[chosen]
+    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, mu, fabric), chosen
 
 
 def split_runs(runs: Runs, shares: tuple[float, float], seed: int) -> tuple[Runs, Runs, Runs]:
@@ -173,10 +187,11 @@ def _runs(
     materials: tuple[str, ...],
     material: Integers,
     mu: Floats,
+    fabric: Floats,
 ) -> Runs:
     grid = positions[:, :, grid_order(rest)].astype(np.float32)
     landed = _landed(grid[:, _first(instants)])
-    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
+    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed, fabric)
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
