@@ -4,7 +4,7 @@
     $BLENDER_PY benchmarks/training/blender_clips.py MESHES.npz FILMS.npz --textures 1 --instants all --clips N
     python benchmarks/training/phone_video.py measure FILMS.npz [--model MODEL] [--records FILE.jsonl]
 
-RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: six a second, from before
+RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: five a second, from before
 the stage starts, at times that no clip shows. After them come the instants of a clip. Blender renders both with one
 look. `measure` makes an H.264 film of the former, as a hand holds a phone, imports it by `cloth import`'s own code, and
 compares.
@@ -25,7 +25,7 @@ from stickslip_training.cloth.training import INSTANTS, RIG, WEIGHTS, Clips, Fri
 from stickslip_training.cloth.video import RATE, Calibration, VideoError, import_video, load_clip, save_clip
 from stickslip_training.testing import meshes_at, write_film
 
-START, FRAMES_A_SECOND, DISTORTION = 1.7, 6, (-0.12, 0.05, 0.001, -0.0005, 0.0)
+START, FRAMES_A_SECOND, DISTORTION = 1.7, 5, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 SHAKE = 0.05
 """Standard deviation of a hand's steps from frame to frame, a walk [px]: 1 px after 67 s."""
 
