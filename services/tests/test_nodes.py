@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 KILLS = int(os.environ.get("STICKSLIP_KILLS", "30"))
 PATIENCE = 300.0
-"""How long an answer or progress may take [s]: both coordinators may be starting, on a machine with other work to do."""
+"""How long an answer or progress may take [s]: both coordinators may be starting, on a busy machine."""
 SAMPLES = 60
 """Samples of each of the jobs that run while processes are killed."""
 FAULTS = {"503": 0.02, "late": 0.01, "lost answer": 0.01}
