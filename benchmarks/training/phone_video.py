@@ -13,6 +13,7 @@ compares.
 import argparse
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from stickslip_schemas.cameras import load_rig
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import predictions
 from stickslip_training.cloth.runs import grid_order, load_runs, write_packed
-from stickslip_training.cloth.training import INSTANTS, RIG, WEIGHTS, Clips, FrictionModel, load_friction
+from stickslip_training.cloth.training import INSTANTS, RIG, WEIGHTS, FrictionModel, load_friction
 from stickslip_training.cloth.video import RATE, Calibration, VideoError, import_video, load_clip, save_clip
 from stickslip_training.testing import meshes_at, write_film
 
@@ -68,8 +69,7 @@ def measure(films: Path, model: FrictionModel, records: Path | None) -> None:
             imported = load_clip(Path(folder) / "clip.npz")
         seen = Cameras.of([camera])
         direct = cut(grey(torch.from_numpy(clip[None])), holder_crops(seen, INSTANTS))
-        unknown = np.array([-1])
-        pictures = Clips(direct, seen.rotation[:, 2], unknown, np.array([true["mu"]]), unknown, np.array([0]))
+        pictures = replace(imported, crops=direct, direction=seen.rotation[:, 2])
         film_mu, clip_mu = (predictions(model.estimate(each), [0])[0]["mu"]["median"] for each in (imported, pictures))
         answers.append({**true, "film": film_mu, "clip": clip_mu, "start": found.start, "residual": found.residual})
         print(
