@@ -1,12 +1,15 @@
 #include "bindings/cloth.hpp"
 
 #include <nanobind/eigen/dense.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/function.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <functional>
 #include <tuple>
 
@@ -44,6 +47,13 @@ void bind_cloth(nb::module_& m) {
       "check_mesh", [](const Points2& rest, const Triangles& triangles) { ClothMesh(rest, triangles); }, "rest"_a,
       "triangles"_a,
       "Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.");
+  m.def(
+      "sheet_count",
+      [](const Points2& rest, const Triangles& triangles) {
+        const std::vector<int> sheets = ClothMesh(rest, triangles).sheets();
+        return 1 + *std::max_element(sheets.begin(), sheets.end());
+      },
+      "rest"_a, "triangles"_a, "Internal: number of pieces of a mesh that hang together.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def("cloth_kernels", &cloth_kernels, "Internal: cloth kernels this processor can run, narrowest first.");
@@ -59,7 +69,10 @@ void bind_cloth(nb::module_& m) {
       .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
       .def_ro("halvings", &StepReport::halvings)
       .def_ro("contacts", &StepReport::contacts)
-      .def_ro("sliding", &StepReport::sliding);
+      .def_ro("sliding", &StepReport::sliding)
+      .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear.")
+      .def_ro("least_distance", &StepReport::least_distance,
+              "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
       .def(
           "__init__",
@@ -67,15 +80,17 @@ void bind_cloth(nb::module_& m) {
              const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
              const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
              int refactor_after, int patience, int halvings_max, double step_error, int coarsest, int finest,
-             const std::string& kernel) {
+             const std::string& kernel, double thickness, const std::optional<Eigen::MatrixXd>& mu) {
             new (self) ClothSolver(
                 rest, triangles, {density, {stretching}, rigidity}, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                {step_error, coarsest, finest}, kernel);
+                {step_error, coarsest, finest}, kernel,
+                mu ? std::optional<PairSettings>({thickness, *mu}) : std::nullopt);
           },
           "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
           "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a,
-          "halvings_max"_a, "step_error"_a, "coarsest"_a, "finest"_a, "kernel"_a = "")
+          "halvings_max"_a, "step_error"_a, "coarsest"_a, "finest"_a, "kernel"_a = "", "thickness"_a = 0.0,
+          "mu"_a = nb::none())
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a)
       .def(
           "step",
@@ -106,6 +121,11 @@ void bind_cloth(nb::module_& m) {
       .def("reactions", &ClothSolver::reactions)
       .def("contacts", &ClothSolver::contacts)
       .def("sliding", &ClothSolver::sliding)
+      .def("pair_forces",
+           [](const ClothSolver& self) {
+             const ClothSolver::PairForces p = self.pair_forces();
+             return std::make_tuple(p.vertices, p.weights, p.forces, p.distance, p.sliding);
+           })
       .def("masses", &ClothSolver::masses)
       .def(
           "energies",

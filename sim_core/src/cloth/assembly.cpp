@@ -48,7 +48,8 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Cl
             numbering.membrane.node.data(),
             blocks_.data(),
             diagonal_.data(),
-            &folds_};
+            &folds_,
+            nullptr};
   reserve_folds();
 }
 
@@ -110,6 +111,7 @@ ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbe
   out.bending_node = numbering.compact_bending.node.data();
   out.bending = numbers.scalars.data();
   out.folds = &no_folds_;
+  out.pairs = nullptr;
   return out;
 }
 

@@ -60,7 +60,7 @@ Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils
   const std::vector<int> free_vertices = free_of(vertices, held_vertices);
   free_nodes = static_cast<int>(free_vertices.size());
   std::vector<int> local(vertices, -1);
-  Points2 points(free_nodes, 2);
+  Eigen::MatrixXd points(free_nodes, 2);
   for (int i = 0; i < free_nodes; ++i) {
     local[free_vertices[i]] = i;
     points.row(i) = mesh.rest.row(free_vertices[i]);

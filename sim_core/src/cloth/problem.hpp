@@ -59,7 +59,15 @@ struct FoldData {
   float* coefficients;  // (triangles, 2): aa, ab
 };
 
-// K = mass + bending (x) 1 + membrane + folds, over the free nodes.
+// Pairs of cloth with cloth that bear: each takes its force from the motion v = sum w_i dx_i of its four nodes.
+struct PairData {
+  int count;
+  const int* nodes;        // (count, 4), -1 for held ones
+  const float* weights;    // (count, 4)
+  const float* stiffness;  // (count, 3, 4): columns, N/m
+};
+
+// K = mass + bending (x) 1 + membrane + folds + pairs, over the free nodes.
 struct ClothMatrix {
   int nodes;
   const int* bending_begin;  // (nodes + 1)
@@ -70,6 +78,7 @@ struct ClothMatrix {
   float* membrane;  // (blocks, 3, 4): columns
   float* diagonal;  // (nodes): mass / dt^2 and damping, N/m
   const FoldData* folds;
+  const PairData* pairs;  // may be null
 };
 
 // State of a node in the linear problem of contact.
@@ -114,6 +123,8 @@ struct Factor {
   float* panel;  // the front that is being made
   float* updates;
   float* local;  // one front's right-hand side
+  const int* order;  // nodes by their place in a factor of its own order, or null
+  float* ordered;    // a vector in that order
 };
 
 // A node keeps its own stiffness, and in contact some more: the factor need not be exact.

@@ -5,6 +5,7 @@
 #include <numeric>
 
 #include "cloth/control.hpp"
+#include "cloth/intersections.hpp"
 #include "cloth/kernels/choice.hpp"
 #include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
@@ -34,9 +35,43 @@ struct LinearSolve {
   }
 };
 
+// How far nodes move before pairs are looked for anew, over the side of a cell.
+constexpr double margin_share = 0.15;
+
+// Throws std::invalid_argument, naming the field, where the cloth would feel itself at rest.
+std::unique_ptr<Pairs> pairs_of(const ClothMesh& mesh, const Numbering& numbering, const PairSettings& settings) {
+  const std::vector<int> sheets = mesh.sheets();
+  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
+  if (!(settings.thickness > 0.0) || !std::isfinite(settings.thickness)) refuse("thickness: must be finite and > 0");
+  if (settings.mu.rows() != count || settings.mu.cols() != count || settings.mu != settings.mu.transpose() ||
+      !(settings.mu.minCoeff() >= 0.0) || !settings.mu.allFinite()) {
+    refuse(text("mu: must be a symmetric matrix of numbers >= 0 for ", count, " sheets"));
+  }
+  std::vector<int> sheet_of_node(numbering.nodes, -1);
+  Buffer<double> rest(4L * numbering.nodes, 0.0);
+  for (int i = 0; i < numbering.vertices; ++i) {
+    sheet_of_node[numbering.node[i]] = sheets[i];
+    at_node(rest, numbering.node[i]).head<2>() = mesh.rest.row(i).transpose();
+  }
+  std::vector<std::array<int, 3>> triangles;
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    triangles.push_back({numbering.node[mesh.triangles(t, 0)], numbering.node[mesh.triangles(t, 1)],
+                         numbering.node[mesh.triangles(t, 2)]});
+  }
+  Surface surface(std::move(triangles), std::move(sheet_of_node));
+  for (const Candidate& pair : candidates(surface, rest, settings.thickness)) {
+    if (surface.sheet_of_node[pair.node[0]] != surface.sheet_of_node[pair.node[3]]) continue;
+    refuse(text("thickness: must be less than the distance at rest of vertices and edges that do not meet, and vertex ",
+                numbering.vertex[pair.node[0]], " is nearer to one than ", settings.thickness, " m"));
+  }
+  const double cell = std::sqrt(2.0 * mesh.area.mean());
+  return std::make_unique<Pairs>(std::move(surface), settings, margin_share * cell, numbering.free_nodes);
+}
+
 }  // namespace
 
 struct ClothSolver::Impl {
+  const ClothMesh mesh;
   Assembly assembly;
   Stepper stepper;
   StepController controller;
@@ -45,12 +80,15 @@ struct ClothSolver::Impl {
 
   Impl(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
        const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-       const StepControl& control, const std::string& kernel)
-      : assembly(cloth_kernel_named(kernel), ClothMesh(rest, triangles), properties, held, clamped),
+       const StepControl& control, const std::string& kernel, const std::optional<PairSettings>& self)
+      : mesh(rest, triangles),
+        assembly(cloth_kernel_named(kernel), mesh, properties, held, clamped),
         stepper(assembly, settings),
         controller(stepper, control),
         newton(stepper.newton),
-        numbering(assembly.numbering) {}
+        numbering(assembly.numbering) {
+    if (self) newton.pairs = pairs_of(mesh, numbering, *self);
+  }
 
   void load(const Points3& positions, const Points3& slopes, Buffer<double>& into) const {
     if (positions.rows() != numbering.vertices) refuse("positions: must have a row for each vertex");
@@ -71,12 +109,15 @@ struct ClothSolver::Impl {
 
 ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
                          const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-                         const StepControl& control, const std::string& kernel)
-    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, control, kernel)) {}
+                         const StepControl& control, const std::string& kernel, const std::optional<PairSettings>& self)
+    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, control, kernel, self)) {}
 ClothSolver::~ClothSolver() = default;
 
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes) {
   impl_->load(positions, slopes, impl_->stepper.x);
+  if (impl_->newton.pairs && self_intersections(positions, impl_->mesh.triangles) > 0) {
+    refuse("positions: cloth that feels itself must not cross itself");
+  }
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
   impl_->stepper.restart();
   impl_->controller.restart();
@@ -110,6 +151,25 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   std::vector<std::int32_t> out(numbering.vertices, 0);
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
+  }
+  return out;
+}
+
+ClothSolver::PairForces ClothSolver::pair_forces() const {
+  std::vector<const Pair*> some;
+  if (impl_->newton.pairs) {
+    for (const Pair& pair : impl_->newton.pairs->list()) {
+      if (!pair.sight.force.isZero(0.0)) some.push_back(&pair);
+    }
+  }
+  const auto count = static_cast<Eigen::Index>(some.size());
+  PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), {}};
+  for (Eigen::Index p = 0; p < count; ++p) {
+    for (int c = 0; c < 4; ++c) out.vertices(p, c) = impl_->numbering.vertex[some[p]->who.node[c]];
+    out.weights.row(p) = some[p]->weights.transpose();
+    out.forces.row(p) = some[p]->sight.force.transpose();
+    out.distance[p] = some[p]->sight.gap + impl_->newton.pairs->near.thickness;
+    out.sliding.push_back(some[p]->row.mode == contact_slip);
   }
   return out;
 }

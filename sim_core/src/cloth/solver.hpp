@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -13,16 +14,18 @@
 #include "cloth/properties.hpp"
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
+#include "contact/pairs.hpp"
 
 namespace sim_core {
 
 class ClothSolver {
  public:
   // `kernel`: level of the kernels, "" for the widest that this processor runs. `held`: vertices whose positions are
-  // prescribed; `clamped`: boundary edges whose outward slope is prescribed.
+  // prescribed; `clamped`: boundary edges whose outward slope is prescribed; `self`: how the cloth feels itself, if it does.
   ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-              const StepControl& control, const std::string& kernel = "");
+              const StepControl& control, const std::string& kernel = "",
+              const std::optional<PairSettings>& self = std::nullopt);
   ~ClothSolver();
 
   void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes);
@@ -45,6 +48,16 @@ class ClothSolver {
   // Which body each vertex touches (-1: none), and whether it slides.
   std::vector<std::int32_t> contacts() const;
   std::vector<std::int32_t> sliding() const;
+
+  // Pairs of cloth with cloth that bear a force at the end of the last step.
+  struct PairForces {
+    Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
+    Eigen::Matrix<double, Eigen::Dynamic, 4, Eigen::RowMajor> weights;
+    Points3 forces;            // N: on sum w_i x_i
+    Eigen::VectorXd distance;  // m
+    std::vector<std::int32_t> sliding;
+  };
+  PairForces pair_forces() const;
 
   struct Energies {
     double membrane, bending;

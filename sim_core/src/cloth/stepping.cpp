@@ -29,6 +29,7 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings)
 void Stepper::restart() {
   started_ = false;
   newton.contact.forget();
+  if (newton.pairs) newton.pairs->restart();
 }
 
 // Sets where inertia leads, and the ends of what is held, for the part from `begin` to `end` of the step.
@@ -92,6 +93,10 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
 // Makes the state that was solved for that of the cloth.
 void Stepper::take(double dt, double residual, StepReport& report) {
   newton.contact.keep(dt);
+  if (newton.pairs) {
+    newton.pairs->keep();
+    report.least_distance = std::min(report.least_distance, newton.pairs->least_distance());
+  }
   ++report.substeps;
   if (!(residual <= report.residual)) report.residual = residual;  // a NaN stays
   momentum_rate_.setZero();
@@ -137,6 +142,7 @@ void Stepper::count_contacts(StepReport& report) const {
     report.contacts += mode != contact_open;
     report.sliding += mode == contact_slip;
   }
+  if (newton.pairs) report.pairs = newton.pairs->bearing();
 }
 
 void Stepper::check(double dt, const Drive& drive) {

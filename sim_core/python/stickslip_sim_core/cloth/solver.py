@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh
+from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.meshes import Mesh
@@ -78,6 +78,62 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
     return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
 
 
+@dataclass(frozen=True, eq=False)
+class SelfContact:
+    """How cloth feels itself and other cloth: nothing crosses, with exact Coulomb friction.
+
+    Raises:
+        ValueError: A number breaks its rule.
+    """
+
+    mu: float | Floats
+    """Coefficient of friction, 0 ... 10; of several sheets, those of each two: (S, S), symmetric. Sheets are the pieces
+    of the mesh that hang together, in the order of their first vertices."""
+
+    thickness: float = 5e-4
+    """Least distance of two surfaces [m]; less than that of any vertices and edges at rest that do not meet."""
+
+    def __post_init__(self) -> None:
+        mu = np.asarray(self.mu, float)
+        if not ((mu >= 0.0) & (mu <= MU_MAX)).all():
+            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {mu.tolist()}")
+        if mu.ndim and not (mu.ndim == 2 and mu.shape[0] == mu.shape[1] and (mu == mu.T).all()):
+            raise ValueError(f"mu: must be a number or a symmetric matrix, got {mu.tolist()}")
+        if not (np.isfinite(self.thickness) and self.thickness > 0.0):
+            raise ValueError(f"thickness: must be finite and > 0, got {self.thickness}")
+
+    def of_sheets(self, sheets: int) -> Floats:
+        """Return mu of each two of so many sheets (S, S).
+
+        Raises:
+            ValueError: There are others in `mu`.
+        """
+        mu = np.asarray(self.mu, float)
+        if mu.ndim and mu.shape != (sheets, sheets):
+            raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
+        return np.broadcast_to(mu, (sheets, sheets)).copy()
+
+
+@dataclass(frozen=True, eq=False)
+class PairForces:
+    """Forces of cloth on cloth: P pairs of closest points."""
+
+    vertices: NDArray[np.int32]
+    """(P, 4)"""
+
+    weights: Floats
+    """(P, 4): the force acts on each vertex by its weight."""
+
+    forces: Floats
+    """(P, 3) [N]"""
+
+    distance: Floats
+    """(P,) [m]"""
+
+    sliding: NDArray[np.bool_]
+    """(P,)"""
+
+
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
 """What drives a cloth at a time [s]: gravity (V, 3), positions of held vertices (K, 3), bodies."""
 
@@ -92,6 +148,7 @@ class Cloth:
         held: (K,) vertices whose positions are prescribed.
         clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
             outward normal of the rest plane.
+        self_contact: How it feels itself, and its sheets each other; None: it does not, and passes through itself.
         force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the cloth.
         kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
             that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
@@ -108,6 +165,7 @@ class Cloth:
         *,
         held: ArrayLike = (),
         clamped: ArrayLike | None = None,
+        self_contact: SelfContact | None = None,
         force_scale: float | None = None,
         kernel: str | None = None,
     ) -> None:
@@ -138,7 +196,12 @@ class Cloth:
             coarsest=preset.coarsest,
             finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
+            thickness=self_contact.thickness if self_contact else 0.0,
+            mu=self_contact.of_sheets(sheet_count(mesh.rest, mesh.triangles)) if self_contact else None,
         )
+        self.self_contact = self_contact
+        self.least_distance = np.inf
+        """Of pieces of cloth that do not hang together, at the ends of all steps [m]; inf where none came near."""
         self.time = 0.0
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
@@ -182,6 +245,12 @@ class Cloth:
     def sliding(self) -> NDArray[np.bool_]:
         """(V,): whether a vertex slides on its body."""
         return np.asarray(self._solver.sliding(), dtype=bool)
+
+    @property
+    def pair_forces(self) -> PairForces:
+        """Forces of cloth on cloth at the end of the last step."""
+        vertices, weights, forces, distance, sliding = self._solver.pair_forces()
+        return PairForces(vertices, weights, forces, distance, np.asarray(sliding, dtype=bool))
 
     def set_state(
         self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
@@ -263,6 +332,7 @@ class Cloth:
         self.factorizations += report.factorizations
         self.flips += report.flips
         self.halvings += report.halvings
+        self.least_distance = min(self.least_distance, report.least_distance)
         return report
 
     def softest(self) -> float:

@@ -1,0 +1,278 @@
+#include "contact/pairs.hpp"
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <tuple>
+#include <utility>
+
+namespace sim_core {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+using Eigen::Vector4d;
+
+// Stiffness of the law, and of the proximal term, over that of a pair's nodes.
+constexpr double law_share = 0.1, proximal_share = 10.0;
+// A pair whose predicted gap is below minus so much of the thickness is made to bear.
+constexpr double predicted_gap = 0.02;
+// Edges whose squared sine is smaller have no pair: their ends have.
+constexpr double crossing_least = 0.01;
+// Cosine up to which a force is handed on from one normal to another.
+constexpr double hand_on_cosine = 0.5;
+
+auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
+
+// Axes that turn with a pair's triangle, or with its edges.
+Matrix3d axes(PairKind kind, const FourPoints& x) {
+  const Vector3d a = kind == PairKind::vertex_triangle ? Vector3d(x[2] - x[1]) : Vector3d(x[1] - x[0]);
+  const Vector3d b = kind == PairKind::vertex_triangle ? Vector3d(x[3] - x[1]) : Vector3d(x[3] - x[2]);
+  Matrix3d out;
+  out.col(0) = a.normalized();
+  out.col(2) = a.cross(b).normalized();
+  out.col(1) = out.col(2).cross(out.col(0));
+  return out;
+}
+
+}  // namespace
+
+Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
+  Vector3d out = Vector3d::Zero();
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] < free_nodes) out += weights[c] * at_node(change, who.node[c]).cast<double>();
+  }
+  return out;
+}
+
+Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
+    : near(std::move(surface), settings.thickness, margin),
+      settings_(settings),
+      free_nodes_(free_nodes),
+      least_distance_(std::numeric_limits<double>::infinity()),
+      softness_(near.surface.sheet_of_node.size(), 0.0) {}
+
+void Pairs::restart() {
+  kept_.clear();
+  pairs_.clear();
+}
+
+void Pairs::begin(const Buffer<double>& start, const std::vector<double>& stiffness, double share) {
+  start_ = &start;
+  for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
+  base_ = kept_;
+}
+
+void Pairs::keep() {
+  kept_.clear();
+  for (const Pair& pair : pairs_) {
+    if (pair.sight.force.isZero(0.0)) continue;
+    kept_.push_back(pair);
+    kept_.back().change.setZero();
+  }
+}
+
+void Pairs::look(const Buffer<double>& x, double share, Buffer<double>& residual) {
+  select(x);
+  hand_on(base_, share);
+  for (Pair& pair : pairs_) {
+    pair.row = pair_row(pair.sight);
+    if (pair.sight.force.isZero(0.0)) continue;
+    for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.sight.force;
+  }
+}
+
+// The pairs of closest points at x. A vertex may be closest to an edge or a corner of a triangle: the pair counts once,
+// and where all triangles around agree, since else there is a point in one of them that is closer.
+void Pairs::select(const Buffer<double>& x) {
+  struct Found {
+    int feature, candidate;
+    Vector4d weights;
+  };
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
+  const std::vector<Candidate>& candidates = near.pairs(x);
+  pairs_.clear();
+  least_distance_ = std::numeric_limits<double>::infinity();
+  std::vector<Found> found;
+  std::size_t c = 0;
+  while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
+    const int vertex = candidates[c].first;
+    found.clear();
+    for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
+         ++c) {
+      const Candidate& who = candidates[c];
+      const Vector4d weights = closest_weights(who.kind, points_of(who, x));
+      int corners = 0, corner = 0, opposite = 0;
+      for (int i = 0; i < 3; ++i) {
+        if (weights[1 + i] != 0.0) {
+          ++corners;
+          corner = i;
+        } else {
+          opposite = i;
+        }
+      }
+      const int feature = corners == 3   ? who.second
+                          : corners == 2 ? triangles + surface.triangle_edges[who.second][opposite]
+                                         : triangles + edges + who.node[1 + corner];
+      found.push_back({feature, static_cast<int>(c), weights});
+    }
+    std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
+      return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
+    });
+    for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
+      const int feature = found[i].feature;
+      while (next < found.size() && found[next].feature == feature) ++next;
+      const int around = feature < triangles           ? 1
+                         : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
+                                                       : surface.triangles_of_node[feature - triangles - edges];
+      if (static_cast<int>(next - i) == around) add(candidates[found[i].candidate], feature, found[i].weights, x);
+    }
+  }
+  for (; c < candidates.size(); ++c) {
+    const Candidate& who = candidates[c];
+    const FourPoints at = points_of(who, x);
+    const Vector4d weights = closest_weights(who.kind, at);
+    if ((weights.array() == 0.0).any()) continue;  // at an end: a vertex has that pair
+    if (crossing_squared(at) < crossing_least) continue;
+    add(who, who.second, weights, x);
+  }
+}
+
+void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, const Buffer<double>& x) {
+  const FourPoints at = points_of(who, x), before = points_of(who, *start_);
+  const Vector3d rho = between_closest(weights, at);
+  const double distance = rho.norm();
+  least_distance_ = std::min(least_distance_, distance);
+  double softness = 0.0;
+  for (int c = 0; c < 4; ++c) softness += weights[c] * weights[c] * softness_[who.node[c]];
+  if (!(softness > 0.0) || !(distance > 0.0)) return;
+  const Vector3d n = rho / distance;
+  // The way of the first over the second, less that by which rho turns with them.
+  const Matrix3d turn = axes(who.kind, at) * axes(who.kind, before).transpose();
+  Vector3d slip = rho - turn * between_closest(weights, before);
+  slip -= slip.dot(n) * n;
+  const std::vector<int>& sheet = near.surface.sheet_of_node;
+  const double mu = settings_.mu(sheet[who.node[0]], sheet[who.node[3]]);
+  pairs_.push_back({who, feature, weights,
+                    {distance - settings_.thickness, n, slip, Vector3d::Zero(), mu, law_share / softness,
+                     proximal_share / softness}});
+}
+
+// Pairs take the forces they had. The force of one that is gone goes to the most alike of those that are new and have
+// the vertex, or an edge, in common: the closest feature has changed.
+void Pairs::hand_on(const std::vector<Pair>& before, double share) {
+  std::vector<const Pair*> orphans;
+  std::vector<std::size_t> fresh;
+  std::size_t o = 0;
+  for (std::size_t i = 0; i < pairs_.size(); ++i) {
+    for (; o < before.size() && key(before[o]) < key(pairs_[i]); ++o) orphans.push_back(&before[o]);
+    if (o < before.size() && key(before[o]) == key(pairs_[i])) {
+      pairs_[i].sight.force = before[o].sight.force + share * before[o].change;
+      ++o;
+    } else {
+      fresh.push_back(i);
+    }
+  }
+  for (; o < before.size(); ++o) orphans.push_back(&before[o]);
+  for (const Pair* orphan : orphans) {
+    const Vector3d force = orphan->sight.force + share * orphan->change;
+    if (force.isZero(0.0)) continue;
+    std::size_t heir = pairs_.size();
+    double best = hand_on_cosine;
+    for (std::size_t i : fresh) {
+      const Candidate &a = pairs_[i].who, &b = orphan->who;
+      if (a.kind != b.kind) continue;
+      const bool common = a.kind == PairKind::vertex_triangle ? a.first == b.first
+                                                              : a.first == b.first || a.second == b.second ||
+                                                                    a.first == b.second || a.second == b.first;
+      if (!common) continue;
+      const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
+      if (alike > best) best = alike, heir = i;
+    }
+    if (heir < pairs_.size()) pairs_[heir].sight.force += force;
+  }
+}
+
+void Pairs::count_errors(Norms& norms) const {
+  for (const Pair& pair : pairs_) {
+    const double error = pair_error_squared(pair.sight);
+    if (error != 0.0) norms.count(error);
+  }
+}
+
+bool Pairs::active() const {
+  return std::any_of(pairs_.begin(), pairs_.end(),
+                     [](const Pair& pair) { return pair.bears() || !pair.sight.force.isZero(0.0); });
+}
+
+int Pairs::bearing() const {
+  return static_cast<int>(std::count_if(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.bears(); }));
+}
+
+bool Pairs::activate(const Buffer<float>& change) {
+  bool changed = false;
+  for (Pair& pair : pairs_) {
+    if (!pair.added) continue;
+    const Vector3d force = pair.sight.force + pair.row.force - pair.row.stiffness * pair.motion(change, free_nodes_);
+    if (force.dot(pair.sight.normal) >= 0.0) continue;
+    pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.sight.force};
+    pair.added = false;
+    pair.released = changed = true;
+  }
+  for (PairKind kind : {PairKind::vertex_triangle, PairKind::edge_edge}) {
+    bool any = false;
+    for (Pair& pair : pairs_) {
+      if (pair.who.kind != kind || pair.bears() || pair.released) continue;
+      const double gap = pair.sight.gap + pair.sight.normal.dot(pair.motion(change, free_nodes_));
+      if (!(gap < -predicted_gap * settings_.thickness)) continue;
+      pair.row = closing_row(pair.sight);
+      pair.added = any = true;
+    }
+    if (any) return true;
+  }
+  return changed;
+}
+
+void Pairs::solved(const Buffer<float>& change) {
+  for (Pair& pair : pairs_) {
+    pair.change = pair.row.force - pair.row.stiffness * pair.motion(change, free_nodes_);
+    pair.added = pair.released = false;
+  }
+  base_ = pairs_;
+}
+
+void Pairs::return_to_best() {
+  base_ = best_;
+  for (Pair& pair : base_) pair.change.setZero();
+}
+
+PairData Pairs::rows() {
+  nodes_.clear();
+  weights_.clear();
+  stiffness_.clear();
+  for (const Pair& pair : pairs_) {
+    if (!pair.bears()) continue;
+    for (int c = 0; c < 4; ++c) {
+      nodes_.push_back(pair.who.node[c] < free_nodes_ ? pair.who.node[c] : -1);
+      weights_.push_back(static_cast<float>(pair.weights[c]));
+    }
+    for (int column = 0; column < 3; ++column) {
+      for (int r = 0; r < 3; ++r) stiffness_.push_back(static_cast<float>(pair.row.stiffness(r, column)));
+      stiffness_.push_back(0.0f);
+    }
+  }
+  return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
+}
+
+void Pairs::subtract_right_side(Buffer<float>& force) const {
+  for (const Pair& pair : pairs_) {
+    if (pair.row.force.isZero(0.0)) continue;
+    for (int c = 0; c < 4; ++c) {
+      if (pair.who.node[c] < free_nodes_) at_node(force, pair.who.node[c]) -= (pair.weights[c] * pair.row.force).cast<float>();
+    }
+  }
+}
+
+}  // namespace sim_core
