@@ -1,4 +1,4 @@
-"""Closest points, candidates and step bounds of cloth on cloth: finite differences, brute force, and ipctk as oracle."""
+"""Closest points, candidates and step bounds: finite differences, brute force, and ipctk as an oracle."""
 
 import ipctk
 import numpy as np
@@ -183,5 +183,5 @@ def test_a_common_way_is_not_capped() -> None:
     mesh = meshes.grid(0.1, 0.1, 8, 8)
     triangles = np.concatenate([mesh.triangles, mesh.triangles + 81]).astype(np.int32)
     x = np.concatenate([np.column_stack([mesh.rest, np.full(81, z)]) for z in (0.0, 5e-4)])
-    to = x + [0.3, -0.2, 0.1]
+    to = x + np.array([0.3, -0.2, 0.1])
     assert (core.cap_motion(triangles, x, to, 5e-4, 0.001) == to).all()

@@ -56,11 +56,14 @@ def test_error_is_the_force_by_which_the_law_is_missed(
     assert law(gap, n, slip * t, force[0] * n + force[1] * t, 0.5)[4] == pytest.approx(error)
 
 
-def test_a_pair_without_a_force_closes_sticking() -> None:
+def test_a_pair_without_a_force_sticks_as_far_as_it_sinks_in() -> None:
     """At no force it would be frictionless, and cloth would slide away."""
     n, t, _ = frame(2)
-    assert law(-0.1, n, 0.01 * t, np.zeros(3), 0.5)[0] == STICK
-    assert law(-0.1, n, 0.01 * t, np.zeros(3), 0.0)[0] == SLIP
+    assert law(-0.1, n, 0.04 * t, np.zeros(3), 0.5)[0] == STICK
+    mode, stiffness, _, _, _ = law(-0.1, n, 0.06 * t, np.zeros(3), 0.5)
+    assert mode == SLIP
+    assert stiffness @ n == pytest.approx(KAPPA * (n - 0.5 * t))  # with friction against the slip
+    assert law(-0.1, n, 0.04 * t, np.zeros(3), 0.0)[0] == SLIP
 
 
 def test_without_friction_it_never_sticks() -> None:
@@ -110,4 +113,6 @@ def test_slipping_row_is_newtons(seed: int) -> None:
     assert symmetric == pytest.approx(symmetric.T)
     unsymmetric = stiffness - symmetric
     assert np.linalg.matrix_rank(unsymmetric) == 1
-    assert unsymmetric @ n == pytest.approx(mu * KAPPA * (across @ (force - K * slip)) @ across / np.linalg.norm(across @ (force - K * slip)))
+    assert unsymmetric @ n == pytest.approx(
+        mu * KAPPA * (across @ (force - K * slip)) @ across / np.linalg.norm(across @ (force - K * slip))
+    )

@@ -73,8 +73,8 @@ void bind_contact(nb::module_& m) {
       "triangles"_a, "start"_a, "end"_a, "thickness"_a, "margin"_a, "Internal: see contact/path.hpp.");
   m.def(
       "pair_law",
-      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force, double mu,
-         double stiffness, double proximal) {
+      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force,
+         double mu, double stiffness, double proximal) {
         const PairSight sight{gap, normal, slip, force, mu, stiffness, proximal};
         const PairRow row = pair_row(sight);
         return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(sight));

@@ -17,6 +17,11 @@ constexpr int reversals_from = 4;
 // With pairs: rounds of making pairs bear in an iteration, and the tolerance of GMRES, which predicts their gaps.
 constexpr int rounds_max = 6;
 constexpr double pairs_tolerance = 1e-4;
+// A gap or a slip of a pair that counts as much as the tolerance does, m.
+constexpr double length_tolerance = 2e-9;
+// Where pairs that say nearly the same contradict each other, their forces grow apart until one lets go: by so much
+// more from one iteration to the next while the error falls by less than to this share.
+constexpr double hurry = 4.0, hurry_max = 1024.0, stalled = 0.5;
 
 }  // namespace
 
@@ -48,7 +53,7 @@ Norms Newton::look(const StepProblem& problem, const Buffer<double>& x, double s
   }
   if (pairs) pairs->look(x, share, residual);
   Norms norms = contact.sort(x, problem.start, residual, problem.at_start, problem.at_end);
-  if (pairs) pairs->count_errors(norms);
+  if (pairs) pairs->count_errors(settings_.tolerance / length_tolerance, norms);
   return norms;
 }
 
@@ -92,7 +97,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   double window[4];
   std::fill(window, window + 4, norms.squared);
   trial_ = best_ = x;
-  double least = norms.squared;
+  double least = norms.squared, forces_share = 1.0;
   for (int iteration = 0; iteration < iterations; ++iteration) {
     contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
@@ -113,13 +118,19 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
         pairs->near.cap(x, trial_);
       }
       evaluate(trial_, true);
-      next = look(problem, trial_, share);
+      next = look(problem, trial_, share * forces_share);
+      if (forces_share > 1.0 && next.squared > limit) {
+        forces_share = 1.0;
+        continue;
+      }
       if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5 || (iteration == 0 && resumed)) break;
       share *= 0.5;
     }
     for (int i = 0; i < free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
     modes = contact.mode;
     std::swap(x, trial_);
+    const bool stalls = pairs && share == 1.0 && next.squared > stalled * norms.squared && pairs->settled();
+    forces_share = stalls ? std::min(hurry * forces_share, hurry_max) : 1.0;
     norms = next;
     if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);
     window[iteration % 4] = norms.squared;

@@ -1,8 +1,8 @@
 // Closest points of a point and a triangle, and of two segments, as weights of their four nodes.
 //
-// The vector between them is rho = sum w_i x_i: from the triangle to the point with w = (1, -b), b barycentric, and from
-// the second segment to the first with w = (1 - s, s, -(1 - t), -t). At an optimum its length changes by n . sum w_i
-// dx_i, n = rho/|rho|, whatever the weights do: they are stationary.
+// The vector between them is rho = sum w_i x_i: from the triangle to the point with w = (1, -b), b barycentric, and
+// from the second segment to the first with w = (1 - s, s, -(1 - t), -t). At an optimum its length changes by n . sum
+// w_i dx_i, n = rho/|rho|, whatever the weights do: they are stationary.
 #pragma once
 
 #include <Eigen/Core>

@@ -12,9 +12,7 @@ using Eigen::Vector3d;
 
 namespace {
 
-PairRow open_row(const PairSight& sight) {
-  return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -sight.force};
-}
+PairRow open_row(const PairSight& sight) { return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -sight.force}; }
 
 PairRow stick_row(const PairSight& sight) {
   const Matrix3d stiffness = sight.proximal * Matrix3d::Identity();
@@ -41,14 +39,20 @@ PairRow slip_row(const PairSight& sight) {
 
 }  // namespace
 
-PairRow closing_row(const PairSight& sight) { return sight.mu > 0.0 ? stick_row(sight) : slip_row(sight); }
-
 PairRow pair_row(const PairSight& sight) {
-  const double pressing = sight.force.dot(sight.normal);
-  if (!(pressing - sight.stiffness * sight.gap > 0.0)) return open_row(sight);
-  if (!(pressing > 0.0)) return closing_row(sight);
+  const double pressing = sight.force.dot(sight.normal), bearing = pressing - sight.stiffness * sight.gap;
+  if (!(bearing > 0.0)) return open_row(sight);
   const Vector3d tau = sight.force - pressing * sight.normal - sight.stiffness * sight.slip;
-  return sight.mu > 0.0 && tau.norm() <= sight.mu * pressing ? stick_row(sight) : slip_row(sight);
+  const bool sticks = sight.mu > 0.0 && tau.norm() <= sight.mu * std::max(pressing, bearing);
+  return sticks ? stick_row(sight) : slip_row(sight);
+}
+
+PairRow closing_row(const PairSight& sight, const Vector3d& motion) {
+  const double sinking = sight.normal.dot(motion) + sight.gap;
+  PairSight then = sight;
+  then.slip += motion - sight.normal.dot(motion) * sight.normal;
+  const bool sticks = sight.mu > 0.0 && then.slip.norm() <= sight.mu * std::max(-sinking, 0.0);
+  return sticks ? stick_row(sight) : slip_row(then);
 }
 
 double pair_error_squared(const PairSight& sight) {

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <tuple>
 #include <utility>
 
@@ -18,10 +19,13 @@ using Eigen::Vector4d;
 constexpr double law_share = 0.1, proximal_share = 10.0;
 // A pair whose predicted gap is below minus so much of the thickness is made to bear.
 constexpr double predicted_gap = 0.02;
-// Edges whose squared sine is smaller have no pair: their ends have.
-constexpr double crossing_least = 0.01;
+// Edges whose squared sine is smaller have no pair, nor have those that are closest nearer to an end than so much of
+// their length: vertices have one there.
+constexpr double crossing_least = 0.01, end_share = 1e-3;
 // Cosine up to which a force is handed on from one normal to another.
 constexpr double hand_on_cosine = 0.5;
+// Pairs whose middles are nearer than so much of the thickness are one; forces are handed on up to so far.
+constexpr double merge_share = 0.2, hand_on_share = 0.5;
 
 auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
 
@@ -34,6 +38,14 @@ Matrix3d axes(PairKind kind, const FourPoints& x) {
   out.col(2) = a.cross(b).normalized();
   out.col(1) = out.col(2).cross(out.col(0));
   return out;
+}
+
+// The force on the cone that is nearest along the normal and across it.
+Vector3d admissible(const PairSight& sight) {
+  const double pressing = std::max(sight.force.dot(sight.normal), 0.0), bound = sight.mu * pressing;
+  const Vector3d across = sight.force - sight.force.dot(sight.normal) * sight.normal;
+  const double size = across.norm();
+  return pressing * sight.normal + (size > bound ? Vector3d(bound / size * across) : across);
 }
 
 }  // namespace
@@ -76,7 +88,9 @@ void Pairs::keep() {
 void Pairs::look(const Buffer<double>& x, double share, Buffer<double>& residual) {
   select(x);
   hand_on(base_, share);
+  merge();
   for (Pair& pair : pairs_) {
+    if (share > 1.0) pair.sight.force = admissible(pair.sight);
     pair.row = pair_row(pair.sight);
     if (pair.sight.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.sight.force;
@@ -127,15 +141,25 @@ void Pairs::select(const Buffer<double>& x) {
       const int around = feature < triangles           ? 1
                          : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
                                                        : surface.triangles_of_node[feature - triangles - edges];
-      if (static_cast<int>(next - i) == around) add(candidates[found[i].candidate], feature, found[i].weights, x);
+      if (static_cast<int>(next - i) != around) continue;
+      if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
+        const int other = feature - triangles - edges;
+        const auto first = std::lower_bound(pairs_.begin(), pairs_.end(), other,
+                                            [](const Pair& pair, int who) { return pair.who.first < who; });
+        if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
+              return pair.who.first == other && pair.feature == triangles + edges + vertex;
+            })) {
+          continue;
+        }
+      }
+      add(candidates[found[i].candidate], feature, found[i].weights, x);
     }
   }
   for (; c < candidates.size(); ++c) {
     const Candidate& who = candidates[c];
     const FourPoints at = points_of(who, x);
     const Vector4d weights = closest_weights(who.kind, at);
-    if ((weights.array() == 0.0).any()) continue;  // at an end: a vertex has that pair
-    if (crossing_squared(at) < crossing_least) continue;
+    if (weights.cwiseAbs().minCoeff() < end_share || crossing_squared(at) < crossing_least) continue;
     add(who, who.second, weights, x);
   }
 }
@@ -155,9 +179,14 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   slip -= slip.dot(n) * n;
   const std::vector<int>& sheet = near.surface.sheet_of_node;
   const double mu = settings_.mu(sheet[who.node[0]], sheet[who.node[3]]);
-  pairs_.push_back({who, feature, weights,
-                    {distance - settings_.thickness, n, slip, Vector3d::Zero(), mu, law_share / softness,
-                     proximal_share / softness}});
+  const Vector3d first =
+      who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
+  pairs_.push_back(
+      {who,
+       feature,
+       weights,
+       {distance - settings_.thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, proximal_share / softness},
+       first - 0.5 * rho});
 }
 
 // Pairs take the forces they had. The force of one that is gone goes to the most alike of those that are new and have
@@ -191,15 +220,74 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
       const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
       if (alike > best) best = alike, heir = i;
     }
-    if (heir < pairs_.size()) pairs_[heir].sight.force += force;
+    if (heir < pairs_.size()) {
+      pairs_[heir].sight.force += force;
+      continue;
+    }
+    best = hand_on_share * settings_.thickness;
+    for (std::size_t i = 0; i < pairs_.size(); ++i) {
+      const double far = (pairs_[i].middle - orphan->middle).norm();
+      const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
+      if (far < best && std::abs(alike) > hand_on_cosine) best = far, heir = i;
+    }
+    if (heir < pairs_.size()) {
+      pairs_[heir].sight.force += pairs_[heir].sight.normal.dot(orphan->sight.normal) > 0.0 ? force : Vector3d(-force);
+    }
   }
 }
 
-void Pairs::count_errors(Norms& norms) const {
+// Leaves one of the pairs that are at nearly the same place, as where a vertex lies on a vertex: they would say the
+// same but for rounding, and contradict each other. One that has a force stays before one that has none, and then the
+// closer one; it takes the forces of the others.
+void Pairs::merge() {
+  const std::size_t count = pairs_.size();
+  const Vector3d across(0.62, 0.55, 0.56);  // along no edge of a mesh that is aligned with the axes
+  const double radius = merge_share * settings_.thickness;
+  std::vector<std::pair<double, std::size_t>> line(count);
+  for (std::size_t i = 0; i < count; ++i) line[i] = {across.dot(pairs_[i].middle), i};
+  std::sort(line.begin(), line.end());
+  std::vector<std::size_t> place(count), order(count);
+  for (std::size_t l = 0; l < count; ++l) place[line[l].second] = l;
+  std::iota(order.begin(), order.end(), std::size_t{0});
+  std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
+    const bool free_a = pairs_[a].sight.force.isZero(0.0), free_b = pairs_[b].sight.force.isZero(0.0);
+    return free_a != free_b ? free_b : pairs_[a].sight.gap < pairs_[b].sight.gap;
+  });
+  std::vector<char> gone(count, 0);
+  for (std::size_t i : order) {
+    if (gone[i]) continue;
+    const auto take = [&](std::size_t j) {
+      if (gone[j] || (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius) return;
+      const Vector3d& force = pairs_[j].sight.force;
+      pairs_[i].sight.force += pairs_[i].sight.normal.dot(pairs_[j].sight.normal) > 0.0 ? force : Vector3d(-force);
+      gone[j] = 1;
+    };
+    const double reach = 1.01 * radius;
+    for (std::size_t l = place[i]; l-- > 0 && line[place[i]].first - line[l].first < reach;) take(line[l].second);
+    for (std::size_t l = place[i] + 1; l < count && line[l].first - line[place[i]].first < reach; ++l)
+      take(line[l].second);
+  }
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < count; ++i) {
+    if (gone[i]) continue;
+    if (kept != i) pairs_[kept] = pairs_[i];
+    ++kept;
+  }
+  pairs_.erase(pairs_.begin() + static_cast<std::ptrdiff_t>(kept), pairs_.end());
+}
+
+void Pairs::count_errors(double stiffness, Norms& norms) const {
   for (const Pair& pair : pairs_) {
-    const double error = pair_error_squared(pair.sight);
+    PairSight sight = pair.sight;
+    sight.stiffness = stiffness;
+    const double error = pair_error_squared(sight);
     if (error != 0.0) norms.count(error);
   }
+}
+
+bool Pairs::settled() const {
+  return std::equal(pairs_.begin(), pairs_.end(), base_.begin(), base_.end(),
+                    [](const Pair& a, const Pair& b) { return key(a) == key(b) && a.row.mode == b.row.mode; });
 }
 
 bool Pairs::active() const {
@@ -225,9 +313,9 @@ bool Pairs::activate(const Buffer<float>& change) {
     bool any = false;
     for (Pair& pair : pairs_) {
       if (pair.who.kind != kind || pair.bears() || pair.released) continue;
-      const double gap = pair.sight.gap + pair.sight.normal.dot(pair.motion(change, free_nodes_));
-      if (!(gap < -predicted_gap * settings_.thickness)) continue;
-      pair.row = closing_row(pair.sight);
+      const Vector3d motion = pair.motion(change, free_nodes_);
+      if (!(pair.sight.gap + pair.sight.normal.dot(motion) < -predicted_gap * settings_.thickness)) continue;
+      pair.row = closing_row(pair.sight, motion);
       pair.added = any = true;
     }
     if (any) return true;
@@ -270,7 +358,8 @@ void Pairs::subtract_right_side(Buffer<float>& force) const {
   for (const Pair& pair : pairs_) {
     if (pair.row.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] < free_nodes_) at_node(force, pair.who.node[c]) -= (pair.weights[c] * pair.row.force).cast<float>();
+      if (pair.who.node[c] < free_nodes_)
+        at_node(force, pair.who.node[c]) -= (pair.weights[c] * pair.row.force).cast<float>();
     }
   }
 }

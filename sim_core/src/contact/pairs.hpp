@@ -19,9 +19,11 @@ struct PairSettings {
 
 struct Pair {
   Candidate who;
-  int feature;  // that is closest to a vertex: a triangle, an edge after them, or a node after these; or the second edge
+  int feature;  // that is closest to a vertex: a triangle, an edge after them, or a node after these; or the second
+                // edge
   Eigen::Vector4d weights;
   PairSight sight;
+  Eigen::Vector3d middle;                            // of the two points, m
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force by the last linear problem, N
   PairRow row{};
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
@@ -39,21 +41,25 @@ class Pairs {
 
   // Forgets all forces.
   void restart();
-  // An attempt at a step begins at `start`, with the forces that were kept last; `stiffness`: of the free nodes, which are
-  // `share` of their own.
+  // An attempt at a step begins at `start`, with the forces that were kept last; `stiffness`: of the free nodes, which
+  // are `share` of their own.
   void begin(const Buffer<double>& start, const std::vector<double>& stiffness, double share);
   // A step ended.
   void keep();
 
-  // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual.
+  // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual. With a
+  // share above 1 forces stay on their cones.
   void look(const Buffer<double>& x, double share, Buffer<double>& residual);
-  void count_errors(Norms& norms) const;
+  // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
+  void count_errors(double stiffness, Norms& norms) const;
+  // Whether all pairs are in the branches that they were in at the last linear problem.
+  bool settled() const;
   const std::vector<Pair>& list() const { return pairs_; }
   // Whether there is a force or a pair that bears.
   bool active() const;
 
-  // After a linear problem: makes pairs bear that would come too near, vertices before edges, and lets go of those added
-  // ones that would pull. Returns whether the problem is another one now.
+  // After a linear problem: makes pairs bear that would come too near, vertices before edges, and lets go of those
+  // added ones that would pull. Returns whether the problem is another one now.
   bool activate(const Buffer<float>& change);
   // Takes over the forces' changes that belong to the solved motion.
   void solved(const Buffer<float>& change);
@@ -73,6 +79,7 @@ class Pairs {
   void select(const Buffer<double>& x);
   void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x);
   void hand_on(const std::vector<Pair>& before, double share);
+  void merge();
 
   PairSettings settings_;
   int free_nodes_;

@@ -80,7 +80,7 @@ def together(*parts: Mesh) -> Mesh:
     rest, triangles, right, count = [], [], 0.0, 0
     for part in parts:
         low, high = part.rest[:, 0].min(), part.rest[:, 0].max()
-        rest.append(part.rest + [right - low, 0.0])
+        rest.append(part.rest + np.array([right - low, 0.0]))
         triangles.append(part.triangles + count)
         right += 1.1 * (high - low)
         count += len(part.rest)

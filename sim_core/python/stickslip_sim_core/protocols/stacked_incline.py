@@ -101,7 +101,7 @@ def run(
 
 
 class Stack:
-    """Sheets on each other on a slope, the widest below; the interface below sheet `sheets // 2` has the least friction.
+    """Sheets on each other on a slope, the widest below, with the least friction below sheet `sheets // 2`.
 
     Args:
         sheets: Their number.
