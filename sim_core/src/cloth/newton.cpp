@@ -129,7 +129,8 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     for (int i = 0; i < free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
     modes = contact.mode;
     std::swap(x, trial_);
-    const bool stalls = pairs && share == 1.0 && next.squared > stalled * norms.squared && pairs->settled();
+    const bool stalls =
+        pairs && pairs->active() && share == 1.0 && next.squared > stalled * norms.squared && pairs->settled();
     forces_share = stalls ? std::min(hurry * forces_share, hurry_max) : 1.0;
     norms = next;
     if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);

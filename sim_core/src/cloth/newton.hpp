@@ -35,7 +35,7 @@ class Newton {
   ContactState contact;
   FactorPool factors;
   std::unique_ptr<Pairs> pairs;  // of cloth with cloth; null where it does not feel itself
-  Buffer<double> residual;  // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
+  Buffer<double> residual;       // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
   ClothPhases phases;
 
   // Solves for the free nodes of x, or leaves the best found in it; its held nodes are at their ends. `from_rest`:

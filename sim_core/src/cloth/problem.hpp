@@ -122,7 +122,7 @@ struct Factor {
   float* tiles;
   float* panel;  // the front that is being made
   float* updates;
-  float* local;  // one front's right-hand side
+  float* local;      // one front's right-hand side
   const int* order;  // nodes by their place in a factor of its own order, or null
   float* ordered;    // a vector in that order
 };

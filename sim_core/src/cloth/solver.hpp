@@ -21,7 +21,8 @@ namespace sim_core {
 class ClothSolver {
  public:
   // `kernel`: level of the kernels, "" for the widest that this processor runs. `held`: vertices whose positions are
-  // prescribed; `clamped`: boundary edges whose outward slope is prescribed; `self`: how the cloth feels itself, if it does.
+  // prescribed; `clamped`: boundary edges whose outward slope is prescribed; `self`: how the cloth feels itself, if it
+  // does.
   ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
               const StepControl& control, const std::string& kernel = "",

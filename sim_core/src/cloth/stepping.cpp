@@ -61,6 +61,7 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
   }
   const Buffer<double> from = x;
   drive_nodes(begin, end, part, drive);
+  const Buffer<double> driven = x;
   assembly_.read_table(start_);
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
   const bool deepest = depth == settings_.halvings_max;
@@ -72,6 +73,7 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
                            settings_.krylov_tolerance);
     // Modes of contact that flip to and fro under exact solves settle under loose ones.
     if (!outcome.converged) {
+      x = driven;
       outcome =
           newton.solve(problem, x, deepest, settings_.newton_max, report, std::max(loose, settings_.krylov_tolerance));
     }
