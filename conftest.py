@@ -2,4 +2,5 @@
 
 import os
 
-os.environ.pop("STICKSLIP_DATABASE", None)  # no test is to write into a database that is in use
+for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write into what is in use
+    os.environ.pop(_name, None)

@@ -13,7 +13,7 @@ import numpy as np
 from stickslip_schemas.chunks import encode_chunk
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.layout import layout
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import ChunkRef, PackSlot, PackTask, RecordRef
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.records import encode_records
@@ -58,7 +58,7 @@ def main() -> None:
     )
     pictures = [picture(sample) for sample in range(SAMPLES)]
     with tempfile.TemporaryDirectory() as scratch:
-        store = Store(scratch)
+        store = DirectoryStore(scratch)
         chunks = [encode_chunk(views) for views in pictures]
         encode = cpu_seconds(lambda: [encode_chunk(views) for views in pictures])
         curves = {

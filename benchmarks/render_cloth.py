@@ -53,7 +53,7 @@ from stickslip_schemas.clips import shown_frames
 from stickslip_schemas.codecs import decode_clip
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.textures import Texture
 
@@ -266,7 +266,7 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
         **look_of_clip,
     )
     with tempfile.TemporaryDirectory() as folder:
-        store = Store(folder)
+        store = DirectoryStore(folder)
         data = io.BytesIO()
         np.savez(data, **record)
         reference = RecordRef(digest=store.publish(data.getvalue()), row=0)

@@ -13,6 +13,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import zarr
+from zarr.abc.store import Store as ZarrStore
 
 T = TypeVar("T")
 
@@ -70,8 +71,10 @@ def descendants(pid: int) -> list[int]:
 class Service:
     """`stickslip up` on a free port, with everything below `data`."""
 
-    def __init__(self, data: Path) -> None:
+    def __init__(self, data: Path, *options: str) -> None:
         self.data = data
+        self.options = options
+        """Other options of `stickslip up`."""
         self.process: subprocess.Popen[bytes] | None = None
         self.url = ""
 
@@ -81,9 +84,11 @@ class Service:
         self.data.mkdir(parents=True, exist_ok=True)
         with (self.data / "up.log").open("ab") as log:
             self.process = subprocess.Popen(
-                [STICKSLIP, "up", "--data", self.data, "--port", "0"], stdout=log, stderr=subprocess.STDOUT
+                [STICKSLIP, "up", "--data", self.data, "--port", "0", *self.options],
+                stdout=log,
+                stderr=subprocess.STDOUT,
             )
-        self.url = wait_for("the coordinator", self._ready_url, 60)
+        self.url = wait_for("the coordinator", self._ready_url, 180)
 
     def _ready_url(self) -> str | None:
         assert self.process is not None
@@ -145,7 +150,7 @@ class Service:
         return wait_for(f"the end of {job}", probe, timeout)
 
 
-def read_arrays(place: Path | str) -> dict[str, npt.NDArray[Any]]:
-    """Return all arrays of a dataset, on disk or at a URL, as zarr-python reads them."""
+def read_arrays(place: Path | str | ZarrStore) -> dict[str, npt.NDArray[Any]]:
+    """Return all arrays of a dataset, on disk, at a URL or in a store of Zarr, as zarr-python reads them."""
     group = zarr.open_group(place, mode="r")
     return {name: np.asarray(array[:]) for name, array in group.arrays()}

@@ -2,13 +2,17 @@
 
 pytest tests/test_chaos.py                                              a few chosen deaths
 STICKSLIP_KILLS=50 pytest -m slow tests/test_chaos.py -s                random ones, and the longest gap
+
+The second of the slow tests has two coordinators and two dispatchers on one PostgreSQL database and one bucket.
 """
 
 import os
 import random
+import re
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +20,19 @@ import httpx
 import numpy as np
 import pytest
 import yaml
-from harness import Service, command_line, descendants, read_arrays, wait_for
+from harness import STICKSLIP, Service, command_line, descendants, read_arrays, wait_for
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import SEAL_NAME, SEALED_NAMES, Manifest
+from stickslip_schemas.manifest import MANIFEST_NAME, SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.samples import samples
-from stickslip_schemas.store import Store
-from stickslip_services.database.sqlite import SqliteDatabase
+from stickslip_schemas.store import DirectoryStore, Store, open_store
+from stickslip_services.database.opening import connect
 from stickslip_services.queue.audit import audit
+from stickslip_services.settings import Settings
 from stickslip_sim_core import solve_rods
+from zarr.abc.store import Store as ZarrStore
+from zarr.storage import LocalStore, ObjectStore
 
 SPEC: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text())
 
@@ -61,8 +68,8 @@ def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
     builds = Builds.model_validate(service.get("/v1/workers")[0]["builds"]["rod_hang"])
     service.stop()
     assert service.all_processes() == []
-    check_ledger(service.data)
-    check_dataset(service.data, over["dataset"], SPEC, builds)
+    check_ledger(Settings(data=service.data))
+    check_dataset(DirectoryStore(service.data / "store"), over["dataset"], SPEC, builds)
 
 
 def renders_done(service: Service, job: str) -> int:
@@ -102,18 +109,30 @@ def kill(pid: int) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
-def check_ledger(data: Path) -> None:
-    database = SqliteDatabase(data / "coordinator.sqlite3")
+def check_ledger(settings: Settings) -> None:
+    database = connect(settings)
     with database.read() as connection:
         assert audit(connection) == []
     database.close()
 
 
-def check_dataset(data: Path, reference: dict[str, Any], spec: dict[str, Any], builds: Builds) -> None:
+def files_of(store: Store, dataset: str, version: int) -> tuple[set[str], ZarrStore]:
+    """Return the paths of what a version shows, and where a Zarr reader finds it."""
+    if isinstance(store, DirectoryStore):
+        place = store.dataset_path(dataset, version)
+        return {str(path.relative_to(place)) for path in place.rglob("*") if path.is_file()}, LocalStore(place)
+    import obstore
+
+    bucket, _, prefix = store.place.removeprefix("s3://").partition("/")
+    objects = obstore.store.S3Store(bucket, prefix=f"{prefix}/datasets/{dataset}/v{version}")
+    names = {item["path"] for page in obstore.list(objects) for item in page}
+    return names, ObjectStore(objects, read_only=True)
+
+
+def check_dataset(store: Store, reference: dict[str, Any], spec: dict[str, Any], builds: Builds) -> None:
     """Every slot holds its own sample, and every byte is what the manifest says."""
-    store = Store(data / "store")
-    directory = store.dataset_path(reference["dataset"], reference["version"])
-    text = (directory / "manifest.json").read_bytes()
+    version = reference["dataset"], reference["version"]
+    text = store.read_shown(*version, MANIFEST_NAME)
     assert sha256(text) == reference["manifest"]
     manifest = Manifest.model_validate_json(text)
     assert manifest.sample_keys == tuple(
@@ -122,11 +141,11 @@ def check_dataset(data: Path, reference: dict[str, Any], spec: dict[str, Any], b
     count = len(manifest.sample_keys)
     assert len(set(manifest.sample_keys)) == count
     assert manifest.valid_count == count
-    files = {str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file()}
+    files, place = files_of(store, *version)
     assert files == {file.path for file in manifest.files} | set(SEALED_NAMES) | {SEAL_NAME}
     for file in manifest.files:
-        assert sha256((directory / file.path).read_bytes()) == file.sha256
-    group = read_arrays(directory)
+        assert sha256(store.read_shown(*version, file.path)) == file.sha256
+    group = read_arrays(place)
     solution = solve_rods(group["gamma"], group["phi0"], group["phi1"])
     assert np.array_equal(group["centerline"], solution.centerline.astype(np.float32))
     pictures = {views.tobytes() for views in group["views"]}
@@ -191,10 +210,11 @@ def many_rods(number: int) -> dict[str, Any]:
 
 
 class Watch:
-    """Keeps one job at work and notes how long nothing is finished."""
+    """Keeps one job at work and notes how long nothing is finished. The services take turns to be asked."""
 
-    def __init__(self, service: Service) -> None:
-        self._service = service
+    def __init__(self, *services: Service) -> None:
+        self._services = services
+        self._turns = 0
         self.jobs: list[str] = []
         self.done = -1
         self.since = time.monotonic()
@@ -202,10 +222,12 @@ class Watch:
 
     def look(self) -> bool:
         """Submit a job where the last one is over; return whether there was progress since the last look."""
+        self._turns += 1
+        service = self._services[self._turns % len(self._services)]
         try:
-            if not self.jobs or self._service.get(f"/v1/jobs/{self.jobs[-1]}")["finished_at"] is not None:
-                self.jobs.append(self._service.submit(many_rods(len(self.jobs))))
-            text = httpx.get(f"{self._service.url}/metrics", timeout=30).text
+            if not self.jobs or service.get(f"/v1/jobs/{self.jobs[-1]}")["finished_at"] is not None:
+                self.jobs.append(service.submit(many_rods(len(self.jobs))))
+            text = httpx.get(f"{service.url}/metrics", timeout=30).text
         except httpx.TransportError:
             return False
         lines = [line for line in text.splitlines() if line.startswith("stickslip_tasks{")]
@@ -271,12 +293,95 @@ def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixtu
     builds = Builds.model_validate(service.get("/v1/workers")[0]["builds"]["rod_hang"])
     service.stop()
     assert service.all_processes() == []
-    check_ledger(service.data)
+    check_ledger(Settings(data=service.data))
     for number, job in enumerate(over):
-        check_dataset(service.data, job["dataset"], many_rods(number), builds)
+        check_dataset(DirectoryStore(service.data / "store"), job["dataset"], many_rods(number), builds)
     with capsys.disabled():
         print(f"{count} kills (seed {seed}): each of {len(over) * RODS} samples once")
         for victim, seconds in sorted(gaps.items()):
             print(f"    {victim:28} {len(seconds):3} times, {max(seconds):5.1f} s at most until something was finished")
         print(f"    longest gap without progress {watch.longest:.1f} s, load {worst_load:.1f} at most")
     assert watch.longest <= LONGEST_GAP * max(1.0, worst_load / 4.0)
+
+
+BUCKET = "s3://lab/store"
+FAULTS = {"503": 0.01, "late": 0.01, "lost answer": 0.005}
+"""Shares of all requests to the bucket."""
+
+
+@pytest.fixture
+def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Service, Service]]:
+    """Two nodes, each a coordinator and a dispatcher, on one PostgreSQL database and one bucket that fails at times."""
+    pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip-services[postgresql]'")
+    from stickslip_schemas.testing_s3 import make_bucket, s3_proxy, variables
+    from stickslip_services.testing_postgresql import find_programs, postgresql_server
+
+    programs = find_programs()
+    if programs is None:
+        pytest.skip("the PostgreSQL server is not installed: apt-get install postgresql")
+    with postgresql_server(programs) as server, s3_proxy() as proxy:
+        make_bucket(proxy, "lab")
+        proxy.some(1, FAULTS)
+        for name, value in (variables(proxy) | {"STICKSLIP_DATABASE": server.empty()}).items():
+            monkeypatch.setenv(name, value)
+        both = tuple(Service(tmp_path / name, "--store", BUCKET, "--name", name, "--slots", "1") for name in ("a", "b"))
+        try:
+            for node in both:
+                node.start()
+            yield both[0], both[1]
+        finally:
+            for node in both:
+                node.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600 + 90 * KILLS)
+def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
+    nodes: tuple[Service, Service], capsys: pytest.CaptureFixture[str]
+) -> None:
+    random.seed(int(os.environ.get("STICKSLIP_SEED", "0")))
+    watch = Watch(*nodes)
+    watch.wait_for_progress()
+    watch.longest = 0.0
+    for number in range(KILLS):
+        deadline = time.monotonic() + random.uniform(1, 6)
+        while time.monotonic() < deadline:
+            watch.look()
+            time.sleep(0.1)
+        node, victim = random.choice(nodes), random.choice(list(VICTIMS))
+        kill_some(node, victim)
+        wait = watch.wait_for_progress()
+        with capsys.disabled():
+            print(
+                f"{number + 1:3} {node.data.name} {victim:28} {wait:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True
+            )
+    over = [nodes[0].finished(job, timeout=600) for job in watch.jobs]
+    assert [job["state"] for job in over] == ["succeeded"] * len(over)
+    builds = Builds.model_validate(nodes[1].get("/v1/workers")[0]["builds"]["rod_hang"])
+    for node in nodes:
+        node.stop()
+        assert node.all_processes() == []
+    settings = Settings.chosen(data=nodes[0].data, store=BUCKET)
+    check_ledger(settings)
+
+    found = collected(settings, "--delete")  # what calls that were killed had written: another batch, another name
+    assert collected(settings) == 0
+    store = open_store(BUCKET)
+    for number, job in enumerate(over):
+        check_dataset(store, job["dataset"], many_rods(number), builds)
+    with capsys.disabled():
+        print(f"{KILLS} kills: each of {len(over) * RODS} samples once; {found} files of killed calls collected")
+        print(f"    longest gap without progress {watch.longest:.1f} s")
+
+
+def collected(settings: Settings, *options: str) -> int:
+    """Return how many files `stickslip gc` found."""
+    place = ["--data", str(settings.data), "--store", settings.store_place]
+    words = [str(STICKSLIP), "gc", "--older-than", "0", *place, *options]
+    said = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert said.returncode == 0, said.stderr
+    count = re.match(r"(\d+) files", said.stdout)
+    assert count is not None
+    return int(count[1])

@@ -29,25 +29,29 @@ def main() -> None:
     parser.add_argument("--textures", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, nargs="+", help="numbers of the runs; all, if not given")
-    parser.add_argument("--instants", type=int, nargs="+", default=[60, 80, 130, 150, 210, 220])
+    parser.add_argument(
+        "--instants", nargs="+", default=["60", "80", "130", "150", "210", "220"], help="or all that the runs hold"
+    )
     parser.add_argument("--quality", default="draft")
     parser.add_argument("--held-out-textures", action="store_true")
     parser.add_argument("--held-out-viewpoints", action="store_true")
     parser.add_argument("--lighting", default="drawn", help="drawn or held-out")
+    parser.add_argument("--segmentation", action="store_true", help="write what is seen at every pixel, too")
     args = parser.parse_args()
     with np.load(args.runs) as file:
         low, high = file["differences"]
         positions = np.cumsum(np.stack([low, high], axis=-1).view(np.int16)[..., 0], axis=1, dtype=np.int16) * 1e-5
         rest, triangles, instants = file["rest"], file["triangles"].astype(np.int32), file["instants"].tolist()
         about = [json.loads(str(line)) for line in file["about"]]
-    frames = [instants.index(instant) for instant in args.instants]
+    shown = instants if args.instants == ["all"] else [int(instant) for instant in args.instants]
+    frames = [instants.index(instant) for instant in shown]
     runs = list(range(len(about))) if args.only is None else args.only
     textures = [t for t in Texture if (t in HELD_OUT_TEXTURES) == args.held_out_textures]
     views = HELD_OUT_VIEWPOINTS if args.held_out_viewpoints else TRAINING_VIEWPOINTS
     cameras = {camera.name: camera for camera in load_rig("drag")}
     random = np.random.default_rng(args.seed)
     renderer = ClothRenderer(triangles, rest, Holders)
-    videos, told = [], []
+    videos, seen, told = [], [], []
     try:
         for clip in range(args.clips):
             run, view = runs[clip % len(runs)], views[clip % len(views)]
@@ -61,13 +65,15 @@ def main() -> None:
                     "quality": Quality(args.quality),
                     "rig": "drag",
                     "rig_digest": "0" * 64,
-                    "instants": tuple(args.instants),
+                    "instants": tuple(shown),
                     "light_seed": int(random.integers(2**31)),
                     "crease_seed": int(random.integers(2**31)),
                 }
             )
             made = renderer.clip(look, cameras[view.value], positions[run][frames])
             videos += list(made.clips(made.trace(), [texture_image(texture) for texture in chosen])[0])
+            if args.segmentation:
+                seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
             for texture in chosen:
                 told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **about[run]})
                 print(json.dumps(told[-1]), flush=True)
@@ -76,8 +82,9 @@ def main() -> None:
     np.savez_compressed(
         args.out,
         video=np.stack(videos),
-        instants=np.array(args.instants, np.int16),
+        instants=np.array(shown, np.int16),
         about=np.array([json.dumps(line) for line in told]),
+        **({"segmentation": np.stack(seen)} if seen else {}),
     )
 
 

@@ -1,17 +1,20 @@
 """Simulate drop-and-drag for training, and pack meshes of the instants that clips show.
 
     python benchmarks/training/cloth_runs.py RUNS [--fabrics NAME ...] [--runs 30] [--vertices 21] [--preset fast]
-        [--seed 0] [--pack FILE]
+        [--density LOW HIGH] [--bending LOW HIGH] [--stretching LOW HIGH] [--seed 0] [--frames 300] [--pack FILE]
 
 Each run is a file of RUNS, and a call goes on where another stopped; two may share a folder. mu is a Sobol sequence of
-[0, 1.6] for each fabric, and every run has a seed of its own, so that both sides occur. `--pack` writes all runs of the
-folder into one file, as `stickslip_training.cloth.runs` reads it: positions in whole steps of 10 um.
+[0, 1.6] for each fabric, and every run has a seed of its own, so that both sides occur. With a range of factors the
+numbers of each run's fabric are multiplied by a factor of its own, spread evenly over the logarithm: further dimensions
+of the same sequence. `--pack` writes all runs of the folder into one file, as `stickslip_training.cloth.runs` reads it:
+positions in whole steps of 10 um.
 """
 
 import argparse
 import json
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another count as CPU time
@@ -21,29 +24,61 @@ import numpy as np  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
 from stickslip_schemas.clips import shown_frames  # noqa: E402
 from stickslip_sim_core import build_info, drop_and_drag, fabric_names  # noqa: E402
+from stickslip_sim_core.cloth import fabric as fabric_named  # noqa: E402
+from stickslip_training.cloth.runs import STEP, write_packed  # noqa: E402
 
-FRAMES = 30  # of a clip
+SHOWN = 30  # frames of a clip
+FRAMES = 300  # of a simulation
 MU = 1.6
 DROPPED = 17  # the first instant after the drop
 
 
-def frictions(fabric: str, runs: int, seed: int) -> list[float]:
-    """Return the mu of each run of a fabric: a scrambled Sobol sequence of its own."""
-    engine = qmc.Sobol(1, seed=np.random.default_rng((seed, fabric_names().index(fabric))))
+FACTORS = ("density", "bending", "stretching")
+
+
+@dataclass(frozen=True)
+class Point:
+    """What a run is of, besides its fabric."""
+
+    mu: float
+    factors: dict[str, float]
+    """Of the fabric's numbers, by name."""
+
+
+def points(fabric: str, runs: int, seed: int, ranges: dict[str, tuple[float, float]]) -> list[Point]:
+    """Return the points of the runs of a fabric: a scrambled Sobol sequence of its own over mu and what varies."""
+    varied = [name for name in FACTORS if ranges[name][0] < ranges[name][1]]
+    engine = qmc.Sobol(1 + len(varied), seed=np.random.default_rng((seed, fabric_names().index(fabric))))
     count = 1 << (runs - 1).bit_length()
-    return [round(MU * float(x), 6) for x in engine.random(count)[:runs, 0]]
+    found = []
+    for mu, *shares in engine.random(count)[:runs].tolist():
+        factors = {name: ranges[name][0] for name in FACTORS}
+        for name, share in zip(varied, shares, strict=True):
+            low, high = ranges[name]
+            factors[name] = round(low * (high / low) ** share, 6)
+        found.append(Point(round(MU * mu, 6), factors))
+    return found
 
 
-def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int) -> dict[str, object]:
+def instants_of(frames: int) -> list[int]:
+    """Return the instants that clips show, of those that are simulated."""
+    return [instant for instant in shown_frames(SHOWN, FRAMES) if instant < frames]
+
+
+def simulate(name: str, point: Point, vertices: int, preset: str, seed: int, frames: int) -> dict[str, object]:
     """Run one simulation, and return what is kept of it."""
     started = time.process_time()
-    scene = drop_and_drag(fabric, mu, vertices=vertices, preset=preset, seed=seed)
+    fabric = fabric_named(name).scaled(**point.factors)
+    scene = drop_and_drag(fabric, point.mu, vertices=vertices, preset=preset, seed=seed, frames=frames)
     held, free = scene.rest[:, 1].argmax(), scene.rest[:, 1].argmin()
     edges = [np.isclose(scene.rest[:, 1], scene.rest[vertex, 1]) for vertex in (held, free)]
     fell = scene.positions[DROPPED, edges[1], 0].mean() - scene.positions[DROPPED, edges[0], 0].mean()
     about = {
-        "material": fabric,
-        "mu": mu,
+        "material": name,
+        "mu": point.mu,
+        "areal_density": fabric.density,
+        "bending_rigidity": np.diag(fabric.rigidity).tolist(),
+        "factors": point.factors,
         "seed": seed,
         "bias_side": scene.bias_side,
         "landed_side": 1 if fell > 0 else -1,
@@ -54,36 +89,30 @@ def simulate(fabric: str, mu: float, vertices: int, preset: str, seed: int) -> d
         "reason": scene.reason,
         "cpu_s": round(time.process_time() - started, 2),
     }
-    shown = scene.positions[list(shown_frames(FRAMES, 300))] if scene.valid else np.zeros((FRAMES, len(scene.rest), 3))
+    instants = instants_of(frames)
+    shown = scene.positions[instants] if scene.valid else np.zeros((len(instants), len(scene.rest), 3))
     return {
-        "positions": np.round(shown / 1e-5).astype(np.int16),
+        "positions": np.round(shown / STEP).astype(np.int16),
         "rest": scene.rest.astype(np.float32),
         "triangles": scene.triangles.astype(np.int16),
+        "instants": np.array(instants, np.int16),
         "about": json.dumps(about),
     }
 
 
 def pack(folder: Path, file: Path) -> None:
-    """Write the valid runs of a folder into one file; differences of consecutive instants are packed best."""
+    """Write the valid runs of a folder into one file."""
     runs = []
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as run:
             if json.loads(str(run["about"]))["valid"]:
                 runs.append({name: run[name] for name in run.files})
     first = runs[0]
-    if any(not np.array_equal(run["triangles"], first["triangles"]) for run in runs):
-        raise ValueError(f"the runs in {folder} must have one mesh: pack a folder for each")
-    positions = np.stack([run["positions"] for run in runs])
-    differences = np.diff(positions, axis=1, prepend=np.int16(0))
-    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
-    np.savez_compressed(
-        file,
-        differences=np.moveaxis(bytes_apart, -1, 0),  # low bytes, high bytes, (2, runs, frames, vertices, 3)
-        rest=first["rest"],
-        triangles=first["triangles"],
-        instants=np.array(shown_frames(FRAMES, 300), np.int16),
-        about=np.array([str(run["about"]) for run in runs]),
-    )
+    if any(not np.array_equal(run[name], first[name]) for run in runs for name in ("triangles", "instants")):
+        raise ValueError(f"the runs in {folder} must have one mesh and as many frames: pack a folder for each")
+    positions = np.stack([run["positions"] for run in runs]) * STEP
+    about = [str(run["about"]) for run in runs]
+    write_packed(file, positions, first["rest"], first["triangles"], first["instants"], about)
     print(f"{file}: {len(runs)} runs, {file.stat().st_size / 1e6:.2f} MB")
 
 
@@ -95,12 +124,18 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=30, help="of each fabric")
     parser.add_argument("--vertices", type=int, default=21)
     parser.add_argument("--preset", default="fast")
+    for name in FACTORS:
+        parser.add_argument(f"--{name}", type=float, nargs=2, default=(1.0, 1.0), metavar=("LOW", "HIGH"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--frames", type=int, default=FRAMES, help="to simulate, 2.4 a second; all are 300")
     parser.add_argument("--pack", type=Path, help="simulate nothing, and write this file")
     args = parser.parse_args()
     if args.pack is not None:
         pack(args.folder, args.pack)
         return
+    ranges = {name: tuple(getattr(args, name)) for name in FACTORS}
+    if any(not 0 < low <= high for low, high in ranges.values()):
+        parser.error(f"ranges of factors must have 0 < LOW <= HIGH, and are {ranges}")
     args.folder.mkdir(parents=True, exist_ok=True)
     for number in range(args.runs):
         for fabric in args.fabrics:
@@ -110,9 +145,9 @@ def main() -> None:
                 claim.touch(exist_ok=False)
             except FileExistsError:
                 continue  # done, or another process is at it
-            mu = frictions(fabric, args.runs, args.seed)[number]
+            point = points(fabric, args.runs, args.seed, ranges)[number]
             seed = int(np.random.SeedSequence((args.seed, fabric_names().index(fabric), number)).generate_state(1)[0])
-            run = simulate(fabric, mu, args.vertices, args.preset, seed % 2**31)
+            run = simulate(fabric, point, args.vertices, args.preset, seed % 2**31, args.frames)
             np.savez_compressed(path, **run)  # type: ignore[arg-type]  # its stub takes no objects
             print(run["about"], flush=True)
 

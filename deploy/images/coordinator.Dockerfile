@@ -7,7 +7,7 @@ COPY schemas schemas
 COPY services services
 # The constraints fix the version of every package.
 RUN python -m venv /opt/stickslip/.venv \
- && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt "./schemas[sobol]" "./services[server,postgresql]"
+ && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt "./schemas[s3,sobol]" "./services[server,postgresql]"
 
 FROM python:3.11-slim-bookworm
 ARG REVISION=unknown

@@ -13,10 +13,10 @@ COPY workers workers
 # Two environments, because bpy needs NumPy 1 and zarr needs NumPy 2. The core is built once, here.
 RUN python -m venv /opt/stickslip/.venv \
  && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt \
-      "./schemas[sobol]" "./sim_core[plots]" ./workers
+      "./schemas[s3,sobol]" "./sim_core[plots]" ./workers
 RUN python -m venv /opt/stickslip/.venv-blender \
  && /opt/stickslip/.venv-blender/bin/pip install --no-cache-dir --constraint constraints-blender.txt \
-      ./schemas "./workers/blender[bpy]" ray
+      "./schemas[s3]" "./workers/blender[bpy]" ray
 
 FROM python:3.11-slim-bookworm
 ARG REVISION=unknown

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.store import CorruptArtifactError, Store, write_durably
+from stickslip_schemas.store import CorruptArtifactError, DirectoryStore, sync, write_durably
 
 
 def test_publish_and_read(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = DirectoryStore(tmp_path)
     digest = store.publish(b"0123456789")
     assert digest == sha256(b"0123456789")
     assert store.read(digest) == b"0123456789"
@@ -17,7 +17,7 @@ def test_publish_and_read(tmp_path: Path) -> None:
 
 
 def test_publishing_twice_keeps_the_first_file(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = DirectoryStore(tmp_path)
     digest = store.publish(b"data")
     before = store.path(digest).stat().st_ino
     assert store.publish(b"data") == digest
@@ -25,7 +25,7 @@ def test_publishing_twice_keeps_the_first_file(tmp_path: Path) -> None:
 
 
 def test_changed_bytes_are_found(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = DirectoryStore(tmp_path)
     digest = store.publish(b"data")
     store.path(digest).write_bytes(b"dato")
     with pytest.raises(CorruptArtifactError, match=digest):
@@ -37,7 +37,7 @@ def test_changed_bytes_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["../../etc/passwd", "", "A" * 64, "0" * 63, "0" * 64 + "\n"])
 def test_a_path_is_a_digest_and_nothing_else(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="64 lower-case hexadecimal"):
-        Store(tmp_path).path(name)
+        DirectoryStore(tmp_path).path(name)
 
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,11 +51,11 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_link_is_the_same_file_and_can_be_repeated(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = DirectoryStore(tmp_path)
     digest = store.publish(b"shard")
     target = store.dataset_path("ds-1", 1) / "views" / "c" / "0"
     for _ in range(2):
-        store.link(digest, target)
+        store.show(digest, "ds-1", 1, "views/c/0")
         assert target.read_bytes() == b"shard"
         assert target.stat().st_ino == store.path(digest).stat().st_ino
         assert [path.name for path in target.parent.iterdir()] == ["0"]
@@ -66,6 +66,16 @@ def test_link_copies_where_it_cannot_link(tmp_path: Path, monkeypatch: pytest.Mo
         raise OSError(18, "Invalid cross-device link")
 
     monkeypatch.setattr(os, "link", no_links)
-    store = Store(tmp_path)
-    store.link(store.publish(b"shard"), tmp_path / "datasets" / "file")
-    assert (tmp_path / "datasets" / "file").read_bytes() == b"shard"
+    store = DirectoryStore(tmp_path)
+    store.show(store.publish(b"shard"), "ds-1", 1, "file")
+    assert (store.dataset_path("ds-1", 1) / "file").read_bytes() == b"shard"
+
+
+def test_a_file_and_its_name_are_synced_before_a_write_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
+    write_durably(tmp_path / "file", b"data")
+    assert synced[0].name.startswith(".file.")
+    assert synced[1:] == [tmp_path]
+    sync(tmp_path / "file")
+    assert synced[2:] == [tmp_path / "file"]

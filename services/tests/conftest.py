@@ -3,6 +3,7 @@
 Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL only as slow tests.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,7 +18,10 @@ from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, start_server
 
 if TYPE_CHECKING:
+    from stickslip_schemas.testing_s3 import Proxy
     from stickslip_services.testing_postgresql import PostgresqlServer
+
+_buckets = itertools.count()
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -40,6 +44,30 @@ def postgresql() -> Iterator["PostgresqlServer"]:
         pytest.skip("PostgreSQL's server is not installed: apt-get install postgresql")
     with postgresql_server(programs) as server:
         yield server
+
+
+@pytest.fixture(scope="session")
+def s3() -> Iterator["Proxy"]:
+    """An S3 server behind a proxy, started with the first test that needs it."""
+    pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+    from stickslip_schemas.testing_s3 import s3_proxy
+
+    with s3_proxy() as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def bucket(s3: "Proxy", monkeypatch: pytest.MonkeyPatch) -> str:
+    """The place of an empty store in a bucket, which processes find by their environment."""
+    from stickslip_schemas.testing_s3 import make_bucket, no_fault, variables
+
+    s3.fault = no_fault
+    for variable, value in variables(s3).items():
+        monkeypatch.setenv(variable, value)
+    name = f"services-{next(_buckets)}"
+    make_bucket(s3, name)
+    return f"s3://{name}/lab"
 
 
 @pytest.fixture

@@ -378,7 +378,5 @@ def test_it_is_counted_how_often_the_time_left_held(
     clock.advance(60)
     coordinator.sweep()
     assert watch.held == {("rod_hang", True): 2, ("rod_hang", False): 1}
-    metrics = (
-        Metrics(coordinator.database, coordinator.store.root, coordinator.alive_workers, watch.held).text().decode()
-    )
+    metrics = Metrics(coordinator.database, coordinator.store, coordinator.alive_workers, watch.held).text().decode()
     assert 'stickslip_eta_predictions_total{held="true",kind="rod_hang"} 2.0' in metrics

@@ -12,7 +12,7 @@ import tensorstore
 import xarray
 import zarr
 from stickslip_schemas.manifest import Manifest
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, rods, serving
@@ -21,7 +21,7 @@ from stickslip_services.testing import PretendWorker, rods, serving
 @dataclass
 class Published:
     client: httpx.Client
-    store: Store
+    store: DirectoryStore
     root: str
     url: str
 

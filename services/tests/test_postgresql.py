@@ -17,7 +17,7 @@ from httpx_sse import connect_sse
 from sqlalchemy import func, select, text
 from sqlalchemy.exc import OperationalError
 from stickslip_schemas.states import JobState
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.cli import app
 from stickslip_services.coordinator import main, reindex
@@ -57,7 +57,7 @@ def settings(tmp_path: Path, postgresql: "PostgresqlServer", monkeypatch: pytest
 
 def one_more(settings: Settings, name: str) -> Settings:
     """Return the settings of another coordinator with the same database and the same store."""
-    return settings.model_copy(update={"data": settings.data.parent / name, "store_path": settings.store_root})
+    return settings.model_copy(update={"data": settings.data.parent / name, "store": settings.store_place})
 
 
 @dataclass
@@ -71,7 +71,7 @@ class Pair:
     def worker(self, which: int, name: str) -> PretendWorker:
         server = self.servers[which]
         api = HttpApi(server.url, (server.data / "worker-key").read_text().strip(), self.client.post)
-        return PretendWorker(api, Store(self.settings.store_root), name=name).register()
+        return PretendWorker(api, DirectoryStore(self.settings.store_place), name=name).register()
 
     def submit(self, which: int, **spec: object) -> str:
         response = self.client.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec))
@@ -82,7 +82,7 @@ class Pair:
 @pytest.fixture
 def pair(settings: Settings) -> Iterator[Pair]:
     def start(name: str) -> RunningServer:
-        server = start_server(settings.data.parent / name, options=("--store", str(settings.store_root)))
+        server = start_server(settings.data.parent / name, options=("--store", settings.store_place))
         stack.callback(server.stop)
         return server
 
@@ -355,12 +355,12 @@ def test_a_lost_database_is_built_again(settings: Settings, postgresql: "Postgre
 def test_nothing_is_deleted_by_an_empty_database(
     settings: Settings, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    artifact = Store(settings.store_root).publish(b"of a job that runs")
+    artifact = DirectoryStore(settings.store_place).publish(b"of a job that runs")
     monkeypatch.setenv(DATABASE_VARIABLE, postgresql.empty())
     arguments = ["gc", "--data", str(settings.data), "--older-than", "0", "--delete"]
     result = CliRunner().invoke(app, arguments)
     assert (result.exit_code, "does not exist or is empty: name the --database" in result.stderr) == (1, True)
-    assert Store(settings.store_root).path(artifact).exists()
+    assert DirectoryStore(settings.store_place).path(artifact).exists()
 
 
 def test_a_data_directory_with_another_database_is_refused(settings: Settings) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import PackOutput, RecordRef, RenderOutput, SimulateOutput, TaskResult
 from stickslip_services.client.pulling import verify
 from stickslip_services.database.tables import dataset_versions, tasks
@@ -33,7 +33,13 @@ def rot(path: Path, rng: random.Random) -> None:
     path.write_bytes(data if how == 1 else data[: len(data) // 2])
 
 
-def artifacts(store: Store) -> list[Path]:
+def directory(worker: PretendWorker) -> DirectoryStore:
+    """Return where a worker publishes."""
+    assert isinstance(worker.store, DirectoryStore)
+    return worker.store
+
+
+def artifacts(store: DirectoryStore) -> list[Path]:
     return sorted(path for path in (store.root / "artifacts").rglob("*") if path.is_file())
 
 
@@ -51,7 +57,7 @@ def finish(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, 
     shown = show_job(coordinator, job)
     assert shown.state is JobState.succeeded, shown.message
     assert shown.dataset is not None
-    assert verify(worker.store.dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
+    assert verify(directory(worker).dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
     check(coordinator)
 
 
@@ -60,7 +66,7 @@ def test_200_rotten_artifacts_are_mended(coordinator: Coordinator, worker: Prete
     gammas = [1.0, 2.0, 3.0]
     finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
     for round_ in range(20):
-        for path in rng.sample(artifacts(worker.store), 10):
+        for path in rng.sample(artifacts(directory(worker)), 10):
             rot(path, rng)
         finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
         if round_ % 5 == 4:  # the grid grows: what was made for the smaller one is read again
@@ -74,7 +80,7 @@ def test_only_what_is_damaged_is_made_again(
     finish(coordinator, worker, clock, submit(coordinator))
     with coordinator.database.read() as connection:
         output = connection.scalar(select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1))
-    worker.store.path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(b"x")
+    directory(worker).path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(b"x")
     worker.ran.clear()
     job = submit(coordinator)
     assert "1 of its files were damaged or lost" in show_job(coordinator, job).message
@@ -90,7 +96,7 @@ def test_a_rotten_trajectory_is_simulated_again(
     worker.finish(*worker.lease(simulate=10))
     (render, *others) = worker.lease(render=10)
     worker.finish(*others)
-    worker.store.path(render.task.record.digest).unlink()  # type: ignore[union-attr]
+    directory(worker).path(render.task.record.digest).unlink()  # type: ignore[union-attr]
     assert worker.finish(render) == ["accepted"]
     counts = show_job(coordinator, job).progress.stages
     assert counts[Stage.simulate].counts == {TaskState.succeeded: 3, TaskState.pending: 1}
@@ -110,8 +116,8 @@ def test_a_pack_task_names_what_was_made_two_stages_before(
     worker.finish(*worker.lease(render=10))
     packs = worker.lease(pack=10)
     for slot in packs[0].task.slots:  # type: ignore[union-attr]
-        worker.store.path(slot.record.digest).write_bytes(b"")  # type: ignore[union-attr]
-        worker.store.path(slot.chunks["views"].digest).unlink()
+        directory(worker).path(slot.record.digest).write_bytes(b"")  # type: ignore[union-attr]
+        directory(worker).path(slot.chunks["views"].digest).unlink()
     worker.finish(*packs)
     counts = show_job(coordinator, job).progress.stages
     assert counts[Stage.simulate].counts[TaskState.pending] == 2
@@ -128,7 +134,7 @@ def test_a_disk_that_keeps_rotting_fails_the_job_and_a_resubmission_mends_it(
         for lease in worker.lease(simulate=10):
             worker.finish(lease)
         for lease in worker.lease(render=10):
-            worker.store.path(lease.task.record.digest).unlink(missing_ok=True)  # type: ignore[union-attr]
+            directory(worker).path(lease.task.record.digest).unlink(missing_ok=True)  # type: ignore[union-attr]
             worker.finish(lease)
         clock.advance(10)
         coordinator.sweep()
@@ -171,7 +177,7 @@ def test_a_result_that_is_not_in_the_store_is_refused(
         chunk = output.chunks["views"]
         output = output.model_copy(update={"chunks": {"views": chunk.model_copy(update={"length": 10**6})}})
     else:
-        worker.store.path(output.files[1].sha256).unlink()  # type: ignore[union-attr]
+        directory(worker).path(output.files[1].sha256).unlink()  # type: ignore[union-attr]
     lie = TaskResult(outcome="succeeded", output=output)
     assert worker.report((lease, lie)) == ["accepted"]  # as a failure
     with coordinator.database.read() as connection:
@@ -183,7 +189,7 @@ def test_a_result_that_is_not_in_the_store_is_refused(
 
 
 def test_publishing_again_mends_an_artifact(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = DirectoryStore(tmp_path)
     digest = store.publish(b"right")
     for wrong in (b"wrong", b"", b"right and more"):
         store.path(digest).write_bytes(wrong)

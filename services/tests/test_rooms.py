@@ -11,7 +11,16 @@ import stickslip_services
 
 ROOT = Path(stickslip_services.__file__).parent
 MAX_FLOORS = 6
-SERVER_ONLY = ("alembic", "fastapi", "prometheus_client", "pydantic_settings", "sqlalchemy", "starlette", "uvicorn")
+SERVER_ONLY = (
+    "alembic",
+    "fastapi",
+    "prometheus_client",
+    "pydantic_settings",
+    "sqlalchemy",
+    "standardwebhooks",
+    "starlette",
+    "uvicorn",
+)
 
 
 def module_name(path: Path) -> str:

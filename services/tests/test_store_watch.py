@@ -91,7 +91,7 @@ def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
 
 
 def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
-    settings = Settings(data=tmp_path / "data", store_path=disk / "store", durable=False, min_free_bytes=0)
+    settings = Settings(data=tmp_path / "data", store=str(disk / "store"), durable=False, min_free_bytes=0)
     coordinator = Coordinator(settings, ManualClock())
     coordinator.start()
     worker = PretendWorker(coordinator, coordinator.store).register()
@@ -117,7 +117,7 @@ def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
 
 def test_a_store_that_is_a_file_pauses_the_job(coordinator: Coordinator, worker: PretendWorker) -> None:
     """Works without root: whatever keeps the store from being written is told with its reason."""
-    root = coordinator.settings.store_root
+    root = Path(coordinator.settings.store_place)
     if root.exists():
         root.rmdir()
     root.write_text("in the way")

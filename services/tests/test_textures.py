@@ -138,5 +138,5 @@ def test_a_texture_that_a_job_names_is_kept(coordinator: Coordinator) -> None:
     coordinator.submit(parsed(_spec(f"sha256:{kept}")), None)
     with pytest.raises(UnknownTextureError, match="/textures/logo: must name a texture that was uploaded"):
         coordinator.submit(parsed(_spec(f"sha256:{'1' * 64}")), None)
-    found = [file.path.name for file in unused(coordinator.database, coordinator.store, older_than=-1)]
+    found = [file.name for file in unused(coordinator.database, coordinator.store, older_than=-1)]
     assert found == [other]

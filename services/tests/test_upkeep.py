@@ -12,7 +12,7 @@ import pytest
 from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.responses import JobDetail
 from stickslip_schemas.states import JobState
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
@@ -53,7 +53,7 @@ def made(settings: Settings) -> list[str]:
         assert dataset is not None
         ids.append(dataset.dataset)
     for file in unused(coordinator.database, coordinator.store, older_than=-1):
-        file.path.unlink()  # a pretended worker leaves something behind
+        coordinator.store.delete(file.name)  # a pretended worker leaves something behind
     coordinator.close()
     return ids
 
@@ -76,12 +76,12 @@ def run(settings: Settings, *arguments: object) -> Ended:
 
 
 def artifacts(settings: Settings) -> dict[str, int]:
-    return {path.name: path.stat().st_size for path in (settings.store_root / "artifacts").glob("*/*")}
+    return {path.name: path.stat().st_size for path in (Path(settings.store_place) / "artifacts").glob("*/*")}
 
 
 def age(settings: Settings, seconds: float) -> None:
     """Let all files of the store be as old as that."""
-    for path in settings.store_root.rglob("*"):
+    for path in Path(settings.store_place).rglob("*"):
         if path.is_file():
             os.utime(path, (time.time() - seconds,) * 2)
 
@@ -113,7 +113,7 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
     result = run(settings, "rm", f"{first}:v1")
     assert result.exit_code == 0, result.stderr
     assert "with 1 jobs" in result.stdout
-    assert not (settings.store_root / "datasets" / first).exists()
+    assert not (Path(settings.store_place) / "datasets" / first).exists()
     assert artifacts(settings) == before
     dry = run(settings, "gc", "--older-than", 0)
     assert "may be deleted: add --delete" in dry.stdout
@@ -132,7 +132,7 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
 
 
 def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) -> None:
-    manifest = settings.store_root / "datasets" / made[0] / "v1" / MANIFEST_NAME
+    manifest = Path(settings.store_place) / "datasets" / made[0] / "v1" / MANIFEST_NAME
     content = manifest.read_bytes()
     run(settings, "rm", f"{made[0]}:v1")
     run(settings, "gc", "--delete", "--older-than", 0)
@@ -150,7 +150,7 @@ def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) ->
 
 
 def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
-    stray = settings.store_root / "artifacts" / "ab" / ("ab" + "0" * 62)
+    stray = Path(settings.store_place) / "artifacts" / "ab" / ("ab" + "0" * 62)
     scratch = stray.with_name(f".{stray.name}.0123.tmp")
     for path in (stray, scratch):
         path.parent.mkdir(exist_ok=True)
@@ -166,7 +166,7 @@ def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
 
 def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(settings: Settings, made: list[str]) -> None:
     """As after a database was restored from an old backup."""
-    directory = settings.store_root / "datasets" / made[0] / "v1"
+    directory = Path(settings.store_place) / "datasets" / made[0] / "v1"
     away = settings.data / "away"
     directory.rename(away)
     run(settings, "rm", f"{made[0]}:v1")
@@ -176,14 +176,14 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
     with opened(settings, Role.upkeep) as database:
-        found = reindex(database, Store(settings.store_root))
+        found = reindex(database, DirectoryStore(settings.store_place))
         assert sorted(version.is_new for version in found) == [False, True]
 
 
 def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[str]) -> None:
     _, datasets, coordinator = look(settings)
     coordinator.close()
-    coordinator.store.path(datasets[0].versions[0].manifest).unlink()
+    coordinator.store.delete(datasets[0].versions[0].manifest)
     before = artifacts(settings)
     result = run(settings, "gc", "--delete", "--older-than", 0)
     assert result.exit_code == 1
@@ -195,13 +195,13 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
     _, datasets, coordinator = look(settings)
     PretendWorker(coordinator, coordinator.store).register()
     (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
-    coordinator.store.path(version.manifest).unlink()  # so that a job makes it once more
+    coordinator.store.delete(version.manifest)  # so that a job makes it once more
     again = submitted(coordinator, (1.0, 2.0))
     coordinator.close()
     result = run(settings, "rm", f"{made[0]}:v1")
     assert result.exit_code == 1
     assert f"the job {again.id} is" in result.stderr
-    assert (settings.store_root / "datasets" / made[0] / "v1" / MANIFEST_NAME).exists()
+    assert (Path(settings.store_place) / "datasets" / made[0] / "v1" / MANIFEST_NAME).exists()
 
 
 @pytest.mark.parametrize(

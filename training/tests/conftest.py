@@ -265,7 +265,7 @@ def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ())
         if array.name in content or array.name in ("valid", "split", "sample_key"):
             continue
         values = generator.standard_normal((len(labels), *array.shape))
-        content[array.name] = (10 * values).astype(array.dtype)
+        content[array.name] = (0 * values if array.categories else 10 * values).astype(array.dtype)
     if spec.store_positions:  # one mesh for all samples
         content["rest"][:], content["triangles"][:] = content["rest"][0], content["triangles"][0]
     return write_dataset(root, spec, content, rejected)

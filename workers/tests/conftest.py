@@ -17,7 +17,7 @@ from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import (
     ChunkRef,
     FileEntry,
@@ -44,7 +44,7 @@ class Made:
     """A dataset before it is packed: `arrays` is what every reader must give back."""
 
     spec: RodHangSpec
-    store: Store
+    store: DirectoryStore
     pack_tasks: list[PackTask]
     arrays: dict[str, np.ndarray[Any, Any]]
     rejections: tuple[Rejection, ...]
@@ -73,12 +73,12 @@ class Made:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store")
+def store(tmp_path: Path) -> DirectoryStore:
+    return DirectoryStore(tmp_path / "store")
 
 
 @pytest.fixture
-def make_dataset(store: Store) -> Callable[..., Made]:
+def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
     """Make up a dataset: `make_dataset(count=7, per_shard=4, rejected=(2,), views=True)`."""
 
     def make(*, count: int = 7, per_shard: int = 4, rejected: tuple[int, ...] = (2,), views: bool = True) -> Made:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stickslip_schemas.chunks import encode_chunk
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 from stickslip_schemas.tasks import ChunkRef, RenderOutput, RenderTask, TaskResult
 
 BUILD = "2" * 64
@@ -18,7 +18,7 @@ class RenderActor:
     """Has the face of stickslip_blender's. Tests and it talk through files beside the store."""
 
     def __init__(self, store: str) -> None:
-        self._store = Store(store)
+        self._store = open_store(store)
         self._beside = Path(store)
 
     def describe(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest, Pictures
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import ChunkRef, FileEntry, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
 from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
@@ -119,7 +119,7 @@ def _task(**changes: Any) -> SimulateTask:
     return SimulateTask(simulation=ClothDragSimulation(**(cloth | changes)))
 
 
-def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> None:
+def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectoryStore) -> None:
     (result,) = run_tasks([_task()], store)
     assert core.calls == [("gray-interlock", 0.25, "fast", SIDE, 300, 7)]
     assert result.outcome == "succeeded"
@@ -149,7 +149,7 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: Store) -> N
     assert record["self_intersections"][[1, 50]].tolist() == [1000, 32767]  # more than fits is still many
 
 
-def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: Core, store: Store) -> None:
+def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: Core, store: DirectoryStore) -> None:
     core.changes = {"valid": False, "reason": "12 of 1200 steps did not converge"}
     (result,) = run_tasks([_task()], store)
     assert (result.outcome, result.reason) == ("rejected", Reason.solver_diverged)
@@ -171,7 +171,7 @@ class Clips:
 
 
 @pytest.fixture
-def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
+def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
     def make(rejected: tuple[int, ...] = (), per_shard: int = 4, **changes: Any) -> Clips:
         document = {
             "kind": "cloth_drag",
@@ -252,7 +252,7 @@ def make_clips(core: Core, store: Store) -> Callable[..., Clips]:
 
 @pytest.mark.parametrize("store_positions", [True, False])
 def test_files_are_those_of_zarr_python(
-    make_clips: Callable[..., Clips], store: Store, tmp_path: Path, store_positions: bool
+    make_clips: Callable[..., Clips], store: DirectoryStore, tmp_path: Path, store_positions: bool
 ) -> None:
     made = make_clips(rejected=(2,), store_positions=store_positions)
     packed = {file.path: store.read(file.sha256) for task in made.pack_tasks for file in pack(task, store).files}
@@ -270,7 +270,7 @@ def test_files_are_those_of_zarr_python(
     assert [path for path in packed if packed[path] != written[path]] == []
 
 
-def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], store: Store) -> None:
+def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], store: DirectoryStore) -> None:
     made = make_clips(rejected=(3,))
     files = [file for task in made.pack_tasks for file in pack(task, store).files]
     publish(made.publish_task(files), store)
@@ -302,7 +302,7 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
 
 
 def test_a_trajectory_is_encoded_once_for_all_its_renders(
-    make_clips: Callable[..., Clips], store: Store, monkeypatch: pytest.MonkeyPatch
+    make_clips: Callable[..., Clips], store: DirectoryStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     encoded = []
 
@@ -316,14 +316,14 @@ def test_a_trajectory_is_encoded_once_for_all_its_renders(
     assert len(encoded) == 3
 
 
-def test_a_mesh_of_another_size_is_refused(make_clips: Callable[..., Clips], store: Store) -> None:
+def test_a_mesh_of_another_size_is_refused(make_clips: Callable[..., Clips], store: DirectoryStore) -> None:
     (task, *_) = make_clips().pack_tasks
     other = ClothDragSpec.model_validate(task.spec.model_dump() | {"mesh": 7})
     with pytest.raises(ValueError, match=r"must be float32 of shape \(n, \*\(300, 49, 3\)\) with n > 0; got float32"):
         pack(task.model_copy(update={"spec": other}), store)
 
 
-def test_records_forget_what_is_too_much(store: Store) -> None:
+def test_records_forget_what_is_too_much(store: DirectoryStore) -> None:
     digests = [store.publish(encode_records({"a": np.full(100, i)})) for i in range(3)]
     records = Records(store, kept_bytes=1700)
     for i in (0, 1, 2, 0):

@@ -14,7 +14,7 @@ from coordinator_double import CoordinatorDouble
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason, Stage
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_workers.cluster import Cluster
 from stickslip_workers.coordinator_client import SupersededError
@@ -60,10 +60,10 @@ def double() -> Iterator[CoordinatorDouble]:
 Start = Callable[..., Running]
 
 
-def _settings(double: CoordinatorDouble, store: Store, **changes: Any) -> Settings:
+def _settings(double: CoordinatorDouble, store: DirectoryStore, **changes: Any) -> Settings:
     settings = {
         "url": f"http://127.0.0.1:{double.port}",
-        "store": store.root,
+        "store": store.place,
         "name": "test",
         "slots": 1,
         "blender_python": Path(sys.executable),
@@ -73,7 +73,7 @@ def _settings(double: CoordinatorDouble, store: Store, **changes: Any) -> Settin
 
 
 @pytest.fixture
-def start(double: CoordinatorDouble, store: Store, cluster: Cluster) -> Iterator[Start]:
+def start(double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster) -> Iterator[Start]:
     """Start a dispatcher; it is stopped after the test."""
     store.root.mkdir()
     started: list[Running] = []
@@ -110,7 +110,7 @@ def _cloth() -> SimulateTask:
 HANG = fake_renderer.UNTIL_RELEASED
 
 
-def _wait_for_pid(double: CoordinatorDouble, store: Store, what: int) -> int:
+def _wait_for_pid(double: CoordinatorDouble, store: DirectoryStore, what: int) -> int:
     """Wait until the renderer is at work; heartbeats, which go on, are the clock."""
     path = store.root / f"pid-{what}"
     double.until(lambda: path.exists() and path.read_text() != "")
@@ -118,7 +118,7 @@ def _wait_for_pid(double: CoordinatorDouble, store: Store, what: int) -> int:
 
 
 def test_runs_what_it_is_given_and_says_who_it_is(
-    start: Start, double: CoordinatorDouble, store: Store, make_dataset: Callable[..., Any]
+    start: Start, double: CoordinatorDouble, store: DirectoryStore, make_dataset: Callable[..., Any]
 ) -> None:
     made = make_dataset(count=5, per_shard=4)
     start()
@@ -145,7 +145,9 @@ def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -
     assert double.results["fine"].outcome == "succeeded"
 
 
-def test_a_render_process_that_is_killed_costs_one_try(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_a_render_process_that_is_killed_costs_one_try(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start()
     double.offer(crash=_render(HANG), other=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
@@ -161,7 +163,7 @@ def test_a_render_process_that_is_killed_costs_one_try(start: Start, double: Coo
 
 
 def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
-    start: Start, double: CoordinatorDouble, store: Store
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
 ) -> None:
     start(slots=1)
     double.offer(first=_render(fake_renderer.FINE))
@@ -182,8 +184,8 @@ def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
     }
 
 
-def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: Store) -> None:
-    start(exec_seconds={**Settings(url="", store=store.root, name="x").exec_seconds, Stage.render: 0.5})
+def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
+    start(exec_seconds={**Settings(url="", store=store.place, name="x").exec_seconds, Stage.render: 0.5})
     double.offer(slow=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
     double.until(lambda: "slow" in double.results)
@@ -193,7 +195,7 @@ def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, 
 
 
 def test_a_lease_has_a_limit_of_its_own_and_a_stopped_process_is_killed(
-    start: Start, double: CoordinatorDouble, store: Store
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
 ) -> None:
     start()
     double.limits["stopped"] = 1.5
@@ -213,7 +215,7 @@ def _is_gone(pid: int) -> bool:
         return True
 
 
-def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     """Two long tasks hold both slots; what was leased ahead goes back, and what is short runs at once."""
     start(clog_seconds=1.0)
     double.long |= {"one", "two", "three"}
@@ -252,7 +254,7 @@ def test_a_simulation_tells_how_far_it_is(start: Start, double: CoordinatorDoubl
     assert 0 < done <= frames == 300
 
 
-def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(slots=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1), third=_render(HANG + 2))
     _wait_for_pid(double, store, HANG)
@@ -263,7 +265,9 @@ def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorD
     assert double.started == {"running"}
 
 
-def test_dropped_tasks_are_left_alone_and_never_reported(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_dropped_tasks_are_left_alone_and_never_reported(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start(slots=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
@@ -275,7 +279,9 @@ def test_dropped_tasks_are_left_alone_and_never_reported(start: Start, double: C
     assert not (store.root / f"pid-{HANG + 1}").exists()
 
 
-def test_results_wait_for_a_coordinator_that_is_away(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_results_wait_for_a_coordinator_that_is_away(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start()
     double.offer(one=_render(HANG), two=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
@@ -291,7 +297,7 @@ def test_results_wait_for_a_coordinator_that_is_away(start: Start, double: Coord
     assert Path(f"/proc/{pid}").exists()  # no process was lost over it
 
 
-def test_a_forgotten_session_is_opened_again(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_a_forgotten_session_is_opened_again(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(slots=1)
     double.offer(lost=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
@@ -321,7 +327,7 @@ def test_a_superseded_dispatcher_goes(start: Start, double: CoordinatorDouble) -
     assert isinstance(running.error, SupersededError)
 
 
-def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     running = start(slots=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     _wait_for_pid(double, store, HANG)
@@ -332,7 +338,7 @@ def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorD
     assert double.results == {}
 
 
-def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     running = start(slots=1, stop_seconds=20)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     _wait_for_pid(double, store, HANG)
@@ -344,7 +350,7 @@ def test_stopping_waits_for_what_is_nearly_done(start: Start, double: Coordinato
     assert double.results.keys() == {"running"}
 
 
-def test_processes_give_way_to_fresh_ones(start: Start, double: CoordinatorDouble, store: Store) -> None:
+def test_processes_give_way_to_fresh_ones(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     start(slots=1, renders_per_process=1)
     pids = []
     for what in (HANG, HANG + 1):
@@ -363,7 +369,9 @@ def test_a_renderer_that_does_not_start_is_told(start: Start, double: Coordinato
     assert double.registrations == []
 
 
-def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, store: Store, cluster: Cluster) -> None:
+def test_work_that_nothing_can_be_found_for_is_told(
+    double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster
+) -> None:
     settings = _settings(double, store, start_seconds=1.0)
     # As if the cluster had promised more CPUs than it has.
     with pytest.raises(StartError, match=r"no stage process could be started within 1 s; each needs 25 CPUs"):
@@ -371,7 +379,7 @@ def test_work_that_nothing_can_be_found_for_is_told(double: CoordinatorDouble, s
 
 
 def test_a_gpu_that_the_cluster_does_not_have_is_told(
-    double: CoordinatorDouble, store: Store, cluster: Cluster
+    double: CoordinatorDouble, store: DirectoryStore, cluster: Cluster
 ) -> None:
     """Nothing is rendered on the CPU instead."""
     import ray

@@ -8,7 +8,7 @@ import pytest
 import zarr
 from stickslip_schemas.layout import layout
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import ChunkRef, PackTask
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
@@ -46,7 +46,7 @@ def _with_first_slot(task: PackTask, **changes: Any) -> PackTask:
     return task.model_copy(update={"slots": (first.model_copy(update=changes), *others)})
 
 
-def test_a_corrupt_chunk_is_refused(make_dataset: Callable[..., Any], store: Store) -> None:
+def test_a_corrupt_chunk_is_refused(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
     (task, *_) = make_dataset().pack_tasks
     where = task.slots[0].chunks["views"]
     chunk = bytearray(store.read(where.digest, offset=where.offset, length=where.length))
@@ -57,7 +57,7 @@ def test_a_corrupt_chunk_is_refused(make_dataset: Callable[..., Any], store: Sto
         pack(_with_first_slot(task, chunks={"views": bad}), store)
 
 
-def test_a_record_that_was_damaged_on_disk_is_refused(make_dataset: Callable[..., Any], store: Store) -> None:
+def test_a_record_that_was_damaged_on_disk_is_refused(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
     (task, *_) = make_dataset().pack_tasks
     path = store.path(task.slots[0].record.digest)
     data = bytearray(path.read_bytes())
@@ -67,14 +67,14 @@ def test_a_record_that_was_damaged_on_disk_is_refused(make_dataset: Callable[...
         pack(task, store)
 
 
-def test_a_missing_artifact_is_refused(make_dataset: Callable[..., Any], store: Store) -> None:
+def test_a_missing_artifact_is_refused(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
     (task, *_) = make_dataset().pack_tasks
     store.path(task.slots[0].chunks["views"].digest).unlink()
     with pytest.raises(FileNotFoundError):
         pack(task, store)
 
 
-def test_what_is_wrong_is_named(make_dataset: Callable[..., Any], store: Store) -> None:
+def test_what_is_wrong_is_named(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
     (task, *_) = make_dataset().pack_tasks
     slot = task.slots[0]
     with pytest.raises(ValueError, match="consecutive from 4 and at most 4; got 4 from 0 to 3"):
@@ -87,7 +87,7 @@ def test_what_is_wrong_is_named(make_dataset: Callable[..., Any], store: Store) 
         pack(_with_first_slot(task, record=slot.record.model_copy(update={"row": 99})), store)
 
 
-def test_a_failed_task_names_all_its_damaged_inputs(make_dataset: Callable[..., Any], store: Store) -> None:
+def test_a_failed_task_names_all_its_damaged_inputs(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
     task = make_dataset().pack_tasks[1]
     (whole,) = run_tasks([task], store)
     assert whole.outcome == "succeeded"
@@ -99,7 +99,7 @@ def test_a_failed_task_names_all_its_damaged_inputs(make_dataset: Callable[..., 
     assert set(result.damaged_inputs) == set(chunks[:2])
 
 
-def test_publishing_a_rotten_shard_names_it(make_dataset: Callable[..., Any], store: Store) -> None:
+def test_publishing_a_rotten_shard_names_it(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
     task = make_dataset().publish_task
     path = store.path(task.files[3].sha256)
     data = bytearray(path.read_bytes())

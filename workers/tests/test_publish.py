@@ -15,8 +15,7 @@ from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
 from stickslip_schemas.manifest import Manifest, Pictures, check_seal
-from stickslip_schemas.store import Store
-from stickslip_workers.stages import publish as publish_module
+from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.publish import publish
 
 Make = Callable[..., Any]
@@ -98,17 +97,17 @@ def test_publishing_again_and_after_a_crash_gives_the_same(make_dataset: Make, m
         """Not an Exception: nothing on the way may catch it, as nothing catches SIGKILL."""
 
     links = 0
-    link = Store.link
+    link = DirectoryStore.show
 
-    def dying_link(self: Store, digest: str, target: Path) -> None:
+    def dying_link(self: DirectoryStore, *shown: Any) -> None:
         nonlocal links
         links += 1
         if links == 10:
             raise Killed
-        link(self, digest, target)
+        link(self, *shown)
 
     with monkeypatch.context() as patch:
-        patch.setattr(publish_module.Store, "link", dying_link)
+        patch.setattr(DirectoryStore, "show", dying_link)
         with pytest.raises(Killed):
             publish(task, made.store)
     assert not (directory / "manifest.json").exists()

@@ -9,7 +9,7 @@ import pytest
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask, TaskResult, task_adapter
 from stickslip_workers.__main__ import main
 from stickslip_workers.replay import replay
@@ -21,7 +21,7 @@ def test_the_command_prints_the_result(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["replay", str(tmp_path / "task.json"), "--store", str(tmp_path / "store")]) == 0
     result = TaskResult.model_validate_json(capsys.readouterr().out)
     assert result.outcome == "succeeded"
-    assert Store(tmp_path / "store").path(result.output.record.digest).exists()
+    assert DirectoryStore(tmp_path / "store").path(result.output.record.digest).exists()
 
 
 @pytest.mark.parametrize("what", [fake_renderer.FINE, fake_renderer.BUG])
@@ -29,7 +29,9 @@ def test_a_render_runs_in_the_other_interpreter(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("PYTHONPATH", str(Path(fake_renderer.__file__).parent))
     look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
     task = RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
-    result = replay(task, store=tmp_path, blender_python=Path(sys.executable), render_actor="fake_renderer:RenderActor")
+    result = replay(
+        task, store=str(tmp_path), blender_python=Path(sys.executable), render_actor="fake_renderer:RenderActor"
+    )
     if what == fake_renderer.FINE:
         assert result.outcome == "succeeded"
     else:
@@ -50,3 +52,17 @@ def test_a_task_that_is_none_is_said_in_a_line(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / "other.json").write_text("{}")
     assert main(["replay", str(tmp_path / "other.json"), "--store", str(tmp_path)]) == 2
     assert "other.json is not a task" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command", [["replay", "task.json"], ["dispatch", "--url", "http://127.0.0.1:1", "--name", "x"]]
+)
+def test_a_place_that_is_no_store_is_refused(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--store", "s3:/lab/store"])
+    assert ended.value.code == 2
+    assert "argument --store: store must be a directory, file:///DIRECTORY or s3://BUCKET" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

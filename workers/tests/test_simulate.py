@@ -8,7 +8,7 @@ import pytest
 import stickslip_sim_core
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import SimulateTask, TaskResult
 from stickslip_workers.stages.run import run_tasks
 
@@ -21,13 +21,13 @@ def _rods(count: int) -> list[SimulateTask]:
     ]
 
 
-def _curves(store: Store, result: TaskResult) -> dict[str, Any]:
+def _curves(store: DirectoryStore, result: TaskResult) -> dict[str, Any]:
     record = result.output.record
     with np.load(io.BytesIO(store.read(record.digest))) as arrays:
         return {name: values[record.row] for name, values in arrays.items()}
 
 
-def test_a_batch_is_one_artifact_and_the_same_again(store: Store) -> None:
+def test_a_batch_is_one_artifact_and_the_same_again(store: DirectoryStore) -> None:
     first, second = run_tasks(_rods(20), store), run_tasks(_rods(20), store)
     assert {result.outcome for result in first} == {"succeeded"}
     assert len({result.output.record.digest for result in first}) == 1
@@ -44,7 +44,7 @@ def test_a_batch_is_one_artifact_and_the_same_again(store: Store) -> None:
     }
 
 
-def test_labels_say_what_a_rod_looks_like(store: Store) -> None:
+def test_labels_say_what_a_rod_looks_like(store: DirectoryStore) -> None:
     both_hands = SimulateTask(simulation=RodHangSimulation(gamma=600.0, phi0=0.3, phi1=15.0, poisson=0.5))
     one_hand = SimulateTask(simulation=RodHangSimulation(gamma=600.0, phi0=10.0, phi1=15.0, poisson=0.5))
     coil = SimulateTask(simulation=RodHangSimulation(gamma=0.0, phi0=2.0, phi1=30.0, poisson=0.5))
@@ -57,7 +57,7 @@ def test_labels_say_what_a_rod_looks_like(store: Store) -> None:
         assert rod["reach"] == pytest.approx(np.hypot(*rod["centerline"][:, :2].T).max(), rel=1e-6)
 
 
-def test_a_rod_does_not_depend_on_its_batch(store: Store) -> None:
+def test_a_rod_does_not_depend_on_its_batch(store: DirectoryStore) -> None:
     tasks = _rods(7)
     # Other settings in the same batch make an artifact of their own.
     odd = SimulateTask(simulation=RodHangSimulation(gamma=9.0, phi0=1.0, phi1=1.0, poisson=0.3))
@@ -69,7 +69,7 @@ def test_a_rod_does_not_depend_on_its_batch(store: Store) -> None:
         assert all(np.array_equal(one[name], many[name]) for name in one)
 
 
-def test_a_rod_without_a_stable_shape_is_rejected(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rod_without_a_stable_shape_is_rejected(store: DirectoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
     solve = stickslip_sim_core.solve_rods
 
     def fail_some(*args: Any, **kwargs: Any) -> Any:
@@ -87,7 +87,7 @@ def test_a_rod_without_a_stable_shape_is_rejected(store: Store, monkeypatch: pyt
     assert [results[0].output.record.row, results[3].output.record.row] == [0, 1]
 
 
-def test_all_rejected_makes_no_artifact(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_rejected_makes_no_artifact(store: DirectoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
     solve = stickslip_sim_core.solve_rods
 
     def fail(*args: Any, **kwargs: Any) -> Any:

@@ -17,9 +17,10 @@ from pathlib import Path
 
 from stickslip_schemas.keys import sha256
 
-LIST_OF_KINDS = ("stickslip_schemas.kinds",)
+UNCOUNTED = ("stickslip_schemas.kinds", "stickslip_schemas.store", "stickslip_schemas.store.*")
 """What builds cut. The list of kinds decides on nothing by itself, and it would make every build depend on every kind.
-The documents that it leads to are in the content keys as a whole."""
+The documents that it leads to are in the content keys as a whole. A store gives the bytes that a digest names, or
+none: no result depends on how."""
 
 OURS = "stickslip_"
 """How the names of our packages begin."""

@@ -23,7 +23,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 
 from stickslip_services import __version__
 from stickslip_services.addresses import DEFAULT_PORT
@@ -48,6 +48,7 @@ from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex as find_versions
 from stickslip_services.settings import Settings
+from stickslip_services.webhooks import Messenger
 
 logger = logging.getLogger(__name__)
 
@@ -58,9 +59,8 @@ GRACE_SECONDS = 3
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is opened when it starts."""
     coordinator = Coordinator(settings, clock)
-    metrics = Metrics(
-        coordinator.database, coordinator.store.root, coordinator.alive_workers, coordinator.eta_watch.held
-    )
+    messenger = Messenger(coordinator.database, coordinator.clock)
+    metrics = Metrics(coordinator.database, coordinator.store, coordinator.alive_workers, coordinator.eta_watch.held)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -69,9 +69,11 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         keepers = [
             asyncio.create_task(_for_ever(coordinator.sweep, every)),
             asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+            asyncio.create_task(_for_ever(messenger.deliver, every)),
             asyncio.create_task(coordinator.database.listen(coordinator.bell.ring)),
         ]
         yield
+        messenger.stop()
         for keeper in keepers:
             keeper.cancel()
         await asyncio.gather(*keepers, return_exceptions=True)
@@ -139,12 +141,11 @@ def reindex(settings: Settings) -> int:
     """Find the datasets in the store again; return the exit status."""
     counts = Counter[str]()
     with locked(settings.data), opened(settings, Role.upkeep) as database:
-        for found in find_versions(database, Store(settings.store_root)):
-            name = f"{found.place.parent.name}:{found.place.name}"
+        for found in find_versions(database, open_store(settings.store_place)):
             if found.fault:
-                sys.stderr.write(f"left out: {found.place}: {found.fault}\n")
+                sys.stderr.write(f"left out: {found.name}: {found.fault}\n")
             elif found.is_new:
-                sys.stdout.write(f"{name}  {found.samples} samples\n")
+                sys.stdout.write(f"{found.name}  {found.samples} samples\n")
             counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
     sys.stderr.write(
         f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out\n"
@@ -157,7 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until a signal comes; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
     parser.add_argument("--data", type=Path, help="directory of the database and the store")
-    parser.add_argument("--store", type=Path, dest="store_path", help="root of the store (DATA/store)")
+    parser.add_argument("--store", help="directory of the store, or s3://BUCKET/PREFIX (DATA/store)")
     parser.add_argument("--database", help="URL of a PostgreSQL database; STICKSLIP_DATABASE hides its password better")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")

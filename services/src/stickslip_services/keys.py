@@ -19,6 +19,7 @@ from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys
 from stickslip_services.errors import NotFoundError
+from stickslip_services.journal import note
 from stickslip_services.scopes import Scope
 
 LOCAL_WORKER = "local-worker"
@@ -42,7 +43,9 @@ class ApiKey:
 def create_key(connection: Connection, name: str, scopes: Collection[Scope], now: float) -> tuple[ApiKey, str]:
     """Make a key; return it and its secret, which nobody can be told again."""
     secret = f"sk_{secrets.token_urlsafe(32)}"
-    return _insert(connection, name, scopes, secret, now), secret
+    key = _insert(connection, name, scopes, secret, now)
+    note(connection, "key.create", key.id, now, name=name, scopes=[scope for scope in Scope if scope in scopes])
+    return key, secret
 
 
 def list_keys(connection: Connection) -> list[ApiKey]:
@@ -66,6 +69,7 @@ def revoke_key(connection: Connection, key_id: str, now: float) -> None:
     if connection.scalar(select(api_keys.c.seq).where(known)) is None:
         raise NotFoundError(f"there is no key {key_id[:100]!r}")
     connection.execute(update(api_keys).where(known, api_keys.c.revoked_at.is_(None)).values(revoked_at=now))
+    note(connection, "key.revoke", key_id, now)
 
 
 def local_worker_key(path: Path) -> str:
@@ -87,31 +91,41 @@ def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
         _insert(connection, LOCAL_WORKER, (Scope.work,), local_worker_key(path), now)
 
 
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Who shows a key, as far as the key says."""
+
+    name: str
+    """The id and the name of the key."""
+    scopes: frozenset[Scope]
+
+
 class KeyRing:
     """The keys that open something, as they were a moment ago. Thread-safe."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._lock = threading.Lock()
-        self._scopes: dict[str, frozenset[Scope]] = {}
+        self._holders: dict[str, Holder] = {}
         self._read_at = float("-inf")
 
     @property
     def is_fresh(self) -> bool:
-        """True where `scopes_of` answers without a look at the database."""
+        """True where `holder_of` answers without a look at the database."""
         return time.monotonic() < self._read_at + FRESH_SECONDS
 
-    def scopes_of(self, secret: str) -> frozenset[Scope] | None:
-        """Return what a secret is for; None where it is no key, or one that was revoked."""
+    def holder_of(self, secret: str) -> Holder | None:
+        """Return who shows a secret; None where it is no key, or one that was revoked."""
         with self._lock:
             if not self.is_fresh:
                 with self._database.read() as connection:
-                    rows = connection.execute(
-                        select(api_keys.c.digest, api_keys.c.scopes).where(api_keys.c.revoked_at.is_(None))
-                    )
-                    self._scopes = {row.digest: frozenset(map(Scope, row.scopes.split())) for row in rows}
+                    rows = connection.execute(select(api_keys).where(api_keys.c.revoked_at.is_(None)))
+                    self._holders = {
+                        row.digest: Holder(f"{row.id} {row.name}", frozenset(map(Scope, row.scopes.split())))
+                        for row in rows
+                    }
                 self._read_at = time.monotonic()
-            return self._scopes.get(sha256(secret.encode()))
+            return self._holders.get(sha256(secret.encode()))
 
 
 def _insert(connection: Connection, name: str, scopes: Collection[Scope], secret: str, now: float) -> ApiKey:

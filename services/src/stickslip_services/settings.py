@@ -7,6 +7,7 @@ from pydantic import Field, SecretStr, ValidationError, field_validator, model_v
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
+from stickslip_schemas.store import open_store, store_place
 
 from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback, reachable
 from stickslip_services.errors import SettingsError
@@ -18,9 +19,9 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="STICKSLIP_", frozen=True, extra="forbid")
 
     data: Path = Path("stickslip-data")
-    """Directory of the worker key; also of database and store, unless `database` and `store_path` say otherwise."""
-    store_path: Path | None = None
-    """Root of the store; null is `data/store`."""
+    """Directory of the worker key; also of database and store, unless `database` and `store` say otherwise."""
+    store: str | None = None
+    """Place of the store, a directory or `s3://BUCKET/PREFIX`; null is the directory `data/store`."""
     database: SecretStr | None = None
     """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`. Null is a SQLite file in `data`."""
     host: str = "127.0.0.1"
@@ -70,6 +71,14 @@ class Settings(BaseSettings):
         except ValidationError as error:
             rules = (item["msg"].removeprefix("Value error, ") for item in error.errors(include_input=False))
             raise SettingsError("; ".join(rules)) from None
+
+    @field_validator("store")
+    @classmethod
+    def _is_place(cls, store: str | None) -> str | None:
+        if store is None:
+            return None
+        open_store(store)
+        return store_place(store)
 
     @field_validator("database")
     @classmethod
@@ -140,9 +149,9 @@ class Settings(BaseSettings):
         return self.data / "worker-key"
 
     @property
-    def store_root(self) -> Path:
-        """Root of the store."""
-        return self.data / "store" if self.store_path is None else self.store_path
+    def store_place(self) -> str:
+        """Place of the store, as other processes of this machine understand it."""
+        return str((self.data / "store").absolute()) if self.store is None else self.store
 
     @property
     def url(self) -> str:

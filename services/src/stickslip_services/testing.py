@@ -27,7 +27,7 @@ from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore, Store
 from stickslip_schemas.tasks import (
     ChunkRef,
     FileEntry,
@@ -245,10 +245,9 @@ class PretendWorker:
         digest = self.store.publish(content)
         group_digest = self.store.publish(with_manifest_digest(group, digest))
         seal = self.store.publish(seal_text(digest, group_digest))
-        directory = self.store.dataset_path(task.dataset, task.version)
         own = {MANIFEST_NAME: digest, GROUP_NAME: group_digest, SEAL_NAME: seal}
         for path, artifact in (own | {file.path: file.sha256 for file in manifest.files}).items():
-            self.store.link(artifact, directory / path)
+            self.store.show(artifact, task.dataset, task.version, path)
         return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size)
 
     def _zarr(self, count: int) -> list[FileEntry]:
@@ -301,9 +300,9 @@ class RunningServer:
     process: "subprocess.Popen[str]"
 
     @property
-    def store(self) -> Store:
+    def store(self) -> DirectoryStore:
         """Its store."""
-        return Store(self.data / "store")
+        return DirectoryStore(self.data / "store")
 
     def worker(self, **options: Any) -> PretendWorker:
         """Return a worker that has registered."""

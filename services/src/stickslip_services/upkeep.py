@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import ConflictError, DatabaseRefusedError, NotFoundError, SettingsError
+from stickslip_services.journal import acting, this_user
 from stickslip_services.local.locking import locked
 from stickslip_services.queue.removing import remove
 from stickslip_services.queue.unused import unused
@@ -33,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     collecting.add_argument("--delete", action="store_true", help="delete them")
     for verb in (removing, collecting):
         verb.add_argument("--data", type=Path, required=True, help="directory of the database and the store")
-        verb.add_argument("--store", type=Path, help="root of the store (DATA/store)")
+        verb.add_argument("--store", help="directory of the store, or s3://BUCKET/PREFIX (DATA/store)")
     chosen = parser.parse_args(arguments)
     try:
         with _data(chosen.data, chosen.store) as (database, store):
@@ -48,16 +49,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 @contextmanager
-def _data(data: Path, store_path: Path | None) -> Iterator[tuple[Database, Store]]:
+def _data(data: Path, place: str | None) -> Iterator[tuple[Database, Store]]:
     """Open what a coordinator left; raise DatabaseRefusedError where it runs, or where no database is."""
-    settings = Settings.chosen(data=data, store_path=store_path)
+    settings = Settings.chosen(data=data, store=place)
     if not check(settings, Role.upkeep, with_store=True):
         raise DatabaseRefusedError(
             f"the database {settings.database_name} does not exist or is empty: name the "
             f"{settings.database_option} of a coordinator"
         )
-    with locked(data), opened(settings, Role.upkeep) as database:
-        yield database, Store(settings.store_root)
+    with locked(data), acting(this_user()), opened(settings, Role.upkeep) as database:
+        yield database, open_store(settings.store_place)
 
 
 def _remove(database: Database, store: Store, name: str) -> int:
@@ -80,7 +81,7 @@ def _collect(database: Database, store: Store, hours: float, *, delete: bool) ->
         count += 1
         size += file.bytes
         if delete:
-            file.path.unlink(missing_ok=True)
+            store.delete(file.name)
     done = "were deleted" if delete else "may be deleted: add --delete"
     sys.stdout.write(f"{count} files, {size / 1e6:,.1f} MB, that nothing refers to {done}\n")
     return 0

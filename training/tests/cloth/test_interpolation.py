@@ -12,9 +12,8 @@ RIG = training_cameras()
 def made(mu, material, landed=None):
     count = len(mu)
     landed = np.ones(count, int) if landed is None else np.asarray(landed)
-    return Runs(
-        np.zeros((count, 1, 2, 2, 3), np.float32), (0,), ("a", "b"), np.asarray(material), np.asarray(mu), landed
-    )
+    meshes, fabric = np.zeros((count, 1, 2, 2, 3), np.float32), np.full((count, 3), np.nan)
+    return Runs(meshes, (0,), ("a", "b"), np.asarray(material), np.asarray(mu), landed, fabric)
 
 
 def test_a_curve_is_followed_between_known_runs_and_not_beyond():

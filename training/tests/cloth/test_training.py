@@ -12,10 +12,12 @@ from stickslip_training.cloth.runs import split_of_runs, split_runs
 from stickslip_training.cloth.training import (
     INSTANTS,
     WEIGHTS,
+    Clips,
     ClothTraining,
     RenderedClips,
     _FrictionLearner,
     calibrated,
+    covering,
     jittered,
     load_friction,
     render_clips,
@@ -101,6 +103,13 @@ def test_temperatures_mend_what_is_too_sure():
     assert found[1] == pytest.approx(4.0, rel=0.1)
 
 
+def test_wider_intervals_take_a_higher_temperature(few):
+    model = train_friction(*few[:2], SMALL, epoch=6)
+    clips = render_clips(few[0], 4, 3)
+    half, most = (covering(model.nets[0], clips, 1.0, model.materials, 0, share) for share in (0.5, 0.95))
+    assert 0.4 <= half <= most <= 6.0
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -143,7 +152,7 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_p
 def test_half_of_each_batch_is_of_the_clips(few):
     black = replace(some_clips(few).train, mu=np.full(18, 9.0))
     learner = _FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
-    crops, direction, material, mu = learner.batch(0)
+    crops, direction, material, mu, _ = learner.batch(0)
     assert len(crops) == len(direction) == len(material) == 6
     assert (mu == 9.0).tolist() == [False] * 3 + [True] * 3
 
@@ -190,6 +199,9 @@ def test_a_file_of_clips_is_read_and_its_test_simulations_are_refused(runs, pack
     clips, about = clips_of_file(tmp_path / "clips.npz", runs.materials)
     assert clips.crops.shape == (2, 6, 72, 88)
     assert clips.run.tolist() == kept == [clip["run"] for clip in about]
+    twice = Clips.joined([clips, clips[np.array([1])]])
+    assert twice.run.tolist() == [*kept, kept[1]]
+    assert torch.equal(twice.crops[2], clips.crops[1])
     file_of_clips(tmp_path / "tested.npz", [*kept, tested])
     done = CliRunner().invoke(
         app, ["cloth", "train", str(packed), "--out", str(tmp_path / "out"), "--clips", str(tmp_path / "tested.npz")]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from stickslip_schemas.cameras import load_rig
-from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, stage
+from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
 from stickslip_training.cloth.training import INSTANTS
 from stickslip_training.cloth.video import (
@@ -19,28 +19,13 @@ from stickslip_training.cloth.video import (
     load_clip,
     save_clip,
 )
+from stickslip_training.testing import meshes_at, write_film
 
-av = pytest.importorskip("av")
+pytest.importorskip("av")
 cv2 = pytest.importorskip("cv2")
 
 START, FRAMES_A_SECOND, DISTORTION = 1.7, 6, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 CAMERA = next(camera for camera in load_rig("drag") if camera.name == "calibrated")
-
-
-def meshes_at(run, seconds):
-    """Return the mesh at times after the start, (F, side, side, 3): between instants it moves on with the holders."""
-    times = np.maximum(np.asarray(seconds), 0.0) * RATE
-    known = np.array(run.instants)
-    after = np.clip(np.searchsorted(known, times, side="right"), 1, len(known) - 1)
-    share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)
-
-    def carried(frame):
-        x, z = stage(known[frame])
-        return run.positions[0, frame] - np.stack([x, np.zeros(len(x)), z], axis=-1)[:, None, None]
-
-    shape = carried(after - 1) * (1 - share)[:, None, None, None] + carried(after) * share[:, None, None, None]
-    x, z = stage(times)
-    return torch.tensor(shape + np.stack([x, np.zeros(len(x)), z], axis=-1)[:, None, None], dtype=torch.float32)
 
 
 def pictures(run, seconds):
@@ -48,7 +33,7 @@ def pictures(run, seconds):
     lines = torch.linspace(0, 1, 112)
     checks = 0.35 + 0.3 * ((lines[:, None] * 20).floor() + (lines * 20).floor()).remainder(2)
     found = []
-    for mesh in meshes_at(run, seconds).split(32):
+    for mesh in torch.from_numpy(meshes_at(run, seconds)).split(32):
         fine = _refined(mesh[None], 112)
         whole = Crops(torch.zeros(1, len(mesh), 2), torch.ones(1, len(mesh)), (0.0, 0.0))
         colors = checks.expand(fine.shape[:-1])
@@ -57,22 +42,10 @@ def pictures(run, seconds):
     return torch.cat(found).numpy()
 
 
-def filmed(path, frames, shake, distortion=DISTORTION):
-    """Write an H.264 film of pictures through a lens, each moved by `shake` (F, 2) [px]."""
-    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
-    columns, rows = np.meshgrid(np.arange(224.0), np.arange(224.0))
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=FRAMES_A_SECOND)
-        stream.width = stream.height = 224
-        stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "20"}
-        for frame, moved in zip(frames, shake, strict=True):
-            seen = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-            flat = cv2.undistortPoints(seen, matrix, np.array(distortion), P=matrix).reshape(224, 224, 2) - moved
-            picture = cv2.remap(frame, *np.moveaxis(flat.astype(np.float32), -1, 0), cv2.INTER_CUBIC)
-            grey = np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.repeat(grey[..., None], 3, 2), format="rgb24")))
-        container.mux(stream.encode())
+def filmed(path, frames, shake):
+    """Write a film of grey pictures (F, 224, 224), 0 to 1."""
+    colored = (np.repeat(255 * frame[..., None], 3, axis=2) for frame in frames)
+    write_film(path, colored, CAMERA, rate=FRAMES_A_SECOND, distortion=DISTORTION, shake=shake)
 
 
 @pytest.fixture(scope="module")

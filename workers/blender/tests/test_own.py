@@ -18,7 +18,7 @@ from stickslip_schemas.appearance import Calibration, FloorNumbers, LampNumbers
 from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import RenderOutput, TaskResult, input_digests, task_adapter
 from stickslip_schemas.textures import Texture
 
@@ -28,19 +28,19 @@ RED, BLUE = (200, 30, 30), (30, 40, 190)
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store")
+def store(tmp_path: Path) -> DirectoryStore:
+    return DirectoryStore(tmp_path / "store")
 
 
 @pytest.fixture
-def actor(store: Store) -> Iterator[RenderActor]:
+def actor(store: DirectoryStore) -> Iterator[RenderActor]:
     actor = RenderActor(str(store.root))
     yield actor
     actor.close()
 
 
 @pytest.fixture
-def record(store: Store, make_sheet: Callable[..., Any]) -> str:
+def record(store: DirectoryStore, make_sheet: Callable[..., Any]) -> str:
     """Digest of the trajectory of a sheet of 5 x 5 vertices."""
     sheet, file = make_sheet(5), io.BytesIO()
     track = np.repeat(sheet.track, 75, axis=0)
@@ -84,7 +84,7 @@ def _output(actor: RenderActor, task: dict[str, Any]) -> RenderOutput:
     return output
 
 
-def _frame(store: Store, output: RenderOutput, texture: str | None = None) -> Clip:
+def _frame(store: DirectoryStore, output: RenderOutput, texture: str | None = None) -> Clip:
     chunk = output.chunks["video"] if texture is None else output.clips[texture]
     video = np.empty((1, 224, 224, 3), dtype=np.uint8)
     decode_clip(store.read(chunk.digest, offset=chunk.offset, length=chunk.length), video)
@@ -98,7 +98,7 @@ def _colored(frame: Clip) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]
 
 
 def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
-    actor: RenderActor, store: Store, record: str, monkeypatch: pytest.MonkeyPatch
+    actor: RenderActor, store: DirectoryStore, record: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its upper edge is the held one. It shares its trace with textures that are built in."""
     image = f"sha256:{store.publish(_png(_flag()))}"
@@ -114,7 +114,7 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
     assert not np.array_equal(_frame(store, both, "dots"), frame)
 
 
-def test_a_task_says_which_pictures_it_reads(store: Store, record: str) -> None:
+def test_a_task_says_which_pictures_it_reads(store: DirectoryStore, record: str) -> None:
     digest = store.publish(_png(_flag()))
     own = _task(record, texture="my-flag", image=f"sha256:{digest}")
     together = _task(record, textures=["dots", f"sha256:{digest}"])
@@ -134,7 +134,7 @@ def test_a_built_in_texture_as_a_file_is_the_texture() -> None:
 
 
 def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
-    actor: RenderActor, store: Store, record: str
+    actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
     """The calibration of the rig's own camera, at twice the size and in the middle of a wide image."""
     (ours,) = (camera for camera in load_rig("drag") if camera.name == "left")
@@ -161,7 +161,7 @@ def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
     assert (np.abs(seen.astype(int) - expected) > 2).mean() < 0.002
 
 
-def test_lamps_and_floors_of_the_users_own(actor: RenderActor, store: Store, record: str) -> None:
+def test_lamps_and_floors_of_the_users_own(actor: RenderActor, store: DirectoryStore, record: str) -> None:
     lamp = LampNumbers(azimuth=(-30.0, -20.0), elevation=(50.0, 50.0), power=(1.0, 1.2))
     floor = FloorNumbers(albedo=(0.5, 0.6), roughness=(0.8, 0.9), grain=0.0, tint=(0.2, 0.5, 1.0))
     light, ground = drawn_light("bench", 9, lamp), drawn_substrate("green-baize", 9, floor)

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from pydantic import ValidationError
+from stickslip_schemas.store import open_store, store_place
 from stickslip_schemas.tasks import task_adapter
 
 from stickslip_workers.backoff import Backoff
@@ -30,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray")
     dispatch.add_argument("--url", required=True, help="base URL of the coordinator")
-    dispatch.add_argument("--store", type=Path, required=True, help="root of the store")
+    dispatch.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
     dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
@@ -41,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator")
     replay.add_argument("task", type=Path, help="the task as JSON")
-    replay.add_argument("--store", type=Path, required=True, help="root of the store")
+    replay.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
     replay.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
 
     certify = commands.add_parser("certify", help="run the physical protocols of a preset with this build")
@@ -67,6 +68,15 @@ def main(arguments: list[str] | None = None) -> int:
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
     return 0
+
+
+def _store(place: str) -> str:
+    """Return the place of a store; raise ArgumentTypeError where it cannot be opened."""
+    try:
+        open_store(place)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return store_place(place)
 
 
 def _dispatch(options: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ and the versions of libraries that decide on bytes.
 from importlib import metadata
 
 from stickslip_schemas.keys import content_key
-from stickslip_schemas.sources import LIST_OF_KINDS, digests, sources
+from stickslip_schemas.sources import UNCOUNTED, digests, sources
 
 from stickslip_workers.kinds import kind
 
@@ -28,7 +28,7 @@ def build(stage: str, name: str) -> str:
     """Return the digest of everything that decides on what a stage makes for a kind."""
     libraries = {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
     core = "" if stage == "pack" else _core(kind(name).kernel())
-    files = digests(sources(roots(stage, name), cut=LIST_OF_KINDS))
+    files = digests(sources(roots(stage, name), cut=UNCOUNTED))
     return content_key(f"build/{stage}", {"kind": name, "sources": files, "core": core, "libraries": libraries})
 
 
@@ -37,7 +37,7 @@ def solver_build(module: str) -> str:
 
     The level of its kernels is not part of it: levels differ by less than a certificate can see.
     """
-    return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=LIST_OF_KINDS))})
+    return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=UNCOUNTED))})
 
 
 def kind_builds(name: str) -> dict[str, str]:

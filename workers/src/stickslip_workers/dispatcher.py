@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Reason, Stage
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 from stickslip_schemas.tasks import RenderTask, SimulateTask, Task, TaskResult
 from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
@@ -118,7 +118,7 @@ class Dispatcher:
         # Both pools full take all CPUs of the cluster, so that neither can keep the other from starting.
         share = int(0.5 * max(cluster.cpus, 1) / most * 1000) / 1000
         common: dict[str, Any] = {
-            "store": str(settings.store.resolve()),
+            "store": settings.store,
             "size": most,
             "num_cpus": share,
             "start_seconds": settings.start_seconds,
@@ -144,7 +144,7 @@ class Dispatcher:
                 **common,
             )
         )
-        self._store = Store(settings.store)
+        self._store = open_store(settings.store)
         self._coordinator = CoordinatorClient(settings.url, settings.key, settings.tls_certificate)
         self._backoff = Backoff()
         self._session: WorkerSession | None = None

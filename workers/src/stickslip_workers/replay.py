@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 from stickslip_schemas.tasks import RenderTask, TaskResult
 
 from stickslip_workers.failures import failed
@@ -25,14 +25,14 @@ with open(answer, "w") as file:
 """
 
 
-def replay(task: AnyTask, *, store: Path, blender_python: Path, render_actor: str = RENDER_ACTOR) -> TaskResult:
+def replay(task: AnyTask, *, store: str, blender_python: Path, render_actor: str = RENDER_ACTOR) -> TaskResult:
     """Run a task and return its result; a render runs in Blender's interpreter."""
     if not isinstance(task, RenderTask):
-        return run_tasks([task], Store(store))[0]
+        return run_tasks([task], open_store(store))[0]
     with tempfile.TemporaryDirectory() as scratch:
         given, answer = Path(scratch, "task.json"), Path(scratch, "result.json")
         given.write_text(task.model_dump_json())
-        command = [blender_python, "-c", _RENDER, render_actor, store.absolute(), given, answer]
+        command = [blender_python, "-c", _RENDER, render_actor, store, given, answer]
         status = subprocess.run([str(word) for word in command], check=False).returncode
         if status != 0:
             return failed(Reason.renderer_crash, f"the renderer ended with status {status}")

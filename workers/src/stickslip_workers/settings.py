@@ -18,8 +18,8 @@ class Settings:
 
     url: str
     """Base URL of the coordinator."""
-    store: Path
-    """Root of the store: the same directory on every node."""
+    store: str
+    """Place of the store, see `store_place`. A directory is the same on every node."""
     name: str
     """Name of this dispatcher; a second one of the same name takes the first one's place."""
     key: str | None = None

@@ -16,6 +16,7 @@ from stickslip_schemas.problems import ProblemCode
 
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import problem_response
+from stickslip_services.journal import NOBODY, acting
 from stickslip_services.keys import KeyRing
 from stickslip_services.scopes import Scope, allows
 
@@ -87,34 +88,36 @@ class KeyMiddleware:
             await self._app(scope, receive, send)
             return
         try:
-            refusal = await self._refusal(Headers(scope=scope), needed)
+            admitted = await self._admitted(Headers(scope=scope), needed)
         except OperationalError:
-            refusal = (503, ProblemCode.storage_error, "the coordinator cannot read its keys; its log says more")
-        if refusal is None:
-            await self._app(scope, receive, send)
+            admitted = (503, ProblemCode.storage_error, "the coordinator cannot read its keys; its log says more")
+        if isinstance(admitted, str):
+            with acting(admitted):
+                await self._app(scope, receive, send)
             return
-        status, code, detail = refusal
+        status, code, detail = admitted
         request_id = scope.get("state", {}).get("request_id")
         headers = {"WWW-Authenticate": _CHALLENGE} if status == 401 else {"Retry-After": "10"} if status == 503 else {}
         response = problem_response(status, code, detail, path=scope["path"], request_id=request_id, headers=headers)
         await response(scope, receive, send)
 
-    async def _refusal(self, headers: Headers, needed: Scope) -> tuple[int, ProblemCode, str] | None:
+    async def _admitted(self, headers: Headers, needed: Scope) -> str | tuple[int, ProblemCode, str]:
+        """Return who sends a request, or why it is refused."""
         authorization = headers.get("authorization")
         if authorization is None:
             if needed in self._open:
-                return None
+                return NOBODY
             return 401, ProblemCode.unauthorized, f"the request needs a key of the scope `{needed}`{_HOW}"
         secret = _secret(authorization)
         if secret is None or self._ring.is_fresh:
-            granted = None if secret is None else self._ring.scopes_of(secret)
+            holder = None if secret is None else self._ring.holder_of(secret)
         else:
-            granted = await run_in_threadpool(self._ring.scopes_of, secret)
-        if granted is None:
+            holder = await run_in_threadpool(self._ring.holder_of, secret)
+        if holder is None:
             return 401, ProblemCode.unauthorized, f"the key is not known, or it was revoked{_HOW}"
-        if needed in self._open or allows(granted, needed):
-            return None
-        has = ", ".join(scope for scope in Scope if scope in granted)
+        if needed in self._open or allows(holder.scopes, needed):
+            return holder.name
+        has = ", ".join(scope for scope in Scope if scope in holder.scopes)
         return 403, ProblemCode.scope_missing, f"the request needs the scope `{needed}`, and the key has: {has}"
 
 

@@ -2,18 +2,17 @@
 
 import base64
 import re
-from collections.abc import Iterator
-from pathlib import Path
+from pathlib import PurePosixPath
 
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.store import Store
 
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.errors import MissingArtifactError
 
-BLOCK = 1 << 18
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".webp": "image/webp", ".html": "text/html"}
 
@@ -28,18 +27,17 @@ OPENAPI_HEADERS = {
 }
 
 
-def picture_format(path: Path) -> str:
+def picture_format(store: Store, digest: Sha256) -> str:
     """Return the format of a picture, png or webp, from its first bytes; of a file that cannot be read, png."""
     try:
-        with path.open("rb") as file:
-            head = file.read(12)
+        head = store.read(digest, length=12)
     except OSError:
         return "png"
     return "webp" if head[:4] == b"RIFF" and head[8:] == b"WEBP" else "png"
 
 
-def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Response:
-    """Answer with the artifact at `path`, or the part of it that the request asks for."""
+def serve(request: Request, store: Store, digest: Sha256, *, name: str, size: int | None = None) -> Response:
+    """Answer with an artifact, of `size` bytes where that is known, or the part of it that the request asks for."""
     etag = f'"{digest}"'
     headers = {
         "ETag": etag,
@@ -50,10 +48,10 @@ def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Respons
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     try:
-        size = path.stat().st_size
+        size = store.size(digest) if size is None else size
     except OSError as error:
         raise MissingArtifactError(f"artifact {digest} is not in the store") from error
-    media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+    media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")
     wanted = request.headers.get("range")
     if wanted is not None and request.headers.get("if-range", etag).strip() != etag:
         wanted = None  # the client has a part of another file
@@ -65,7 +63,7 @@ def serve(request: Request, path: Path, digest: Sha256, *, name: str) -> Respons
     status = 200 if span is None else 206
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=media_type)
-    return StreamingResponse(_blocks(path, first, last + 1), status, headers, media_type)
+    return StreamingResponse(store.stream(digest, first, last + 1), status, headers, media_type)
 
 
 def matches(header: str | None, etag: str) -> bool:
@@ -96,14 +94,3 @@ def _span(header: str, size: int, headers: dict[str, str]) -> tuple[int, int] | 
             headers=headers | {"Content-Range": f"bytes */{size}", "Cache-Control": "no-store"},
         )
     return first, last
-
-
-def _blocks(path: Path, start: int, stop: int) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        file.seek(start)
-        while start < stop:
-            block = file.read(min(BLOCK, stop - start))
-            if not block:
-                raise MissingArtifactError(f"{path.name} has become shorter while it was read")
-            start += len(block)
-            yield block

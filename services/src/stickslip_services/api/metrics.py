@@ -1,13 +1,12 @@
 """Metrics for Prometheus: the queue and the store, read when somebody asks, and what went by since the start."""
 
-import shutil
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import Connection, func, select
+from stickslip_schemas.store import Store
 from stickslip_schemas.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
@@ -20,7 +19,7 @@ AliveWorkers = Callable[[Connection], list[RegisteredWorker]]
 
 
 class _QueueCollector(Collector):
-    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
+    def __init__(self, database: Database, store: Store, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
         self._database = database
         self._store = store
         self._alive_workers = alive_workers
@@ -44,10 +43,9 @@ class _QueueCollector(Collector):
         versions = GaugeMetricFamily("stickslip_dataset_versions", "Dataset versions", value=count)
         bytes_ = GaugeMetricFamily("stickslip_dataset_bytes", "Size of the files of all dataset versions", value=size)
         disk = GaugeMetricFamily("stickslip_store_disk_bytes", "Disk of the store", labels=["state"])
-        place = self._store if self._store.exists() else self._store.parent
-        usage = shutil.disk_usage(place)
-        disk.add_metric(["free"], usage.free)
-        disk.add_metric(["used"], usage.used)
+        if (room := self._store.room()) is not None:
+            disk.add_metric(["free"], room.free)
+            disk.add_metric(["used"], room.used)
         for worker in alive:
             leases.add_metric([worker.name], held.get(worker.id, 0))
         workers.add_metric([], len(alive))
@@ -65,7 +63,7 @@ class _QueueCollector(Collector):
 class Metrics:
     """The metrics of one coordinator."""
 
-    def __init__(self, database: Database, store: Path, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
+    def __init__(self, database: Database, store: Store, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
         self._registry = CollectorRegistry()
         self._registry.register(_QueueCollector(database, store, alive_workers, eta_held))
         Info("stickslip", "The coordinator", registry=self._registry).info({"version": __version__})

@@ -71,7 +71,7 @@ def _files(store: Store, manifest: Sha256) -> Mapping[str, FileEntry]:
 
 def _size(store: Store, digest: Sha256) -> int:
     try:
-        return store.path(digest).stat().st_size
+        return store.size(digest)
     except OSError as error:
         raise MissingArtifactError(f"artifact {digest} is not in the store") from error
 

@@ -1,14 +1,13 @@
 """Versions as they are made. A version exists when its manifest's digest is in the database, and not before."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.keys import Sha256, sha256
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal, seal_text
 from stickslip_schemas.responses import DatasetRef
 from stickslip_schemas.samples import dataset_id
-from stickslip_schemas.store import CorruptArtifactError, Store
+from stickslip_schemas.store import CorruptArtifactError, Store, is_unavailable
 from stickslip_schemas.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 
 from stickslip_services.database.tables import dataset_versions, datasets
@@ -49,7 +48,7 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     if dataset_id(manifest.spec) != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
         raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
     for file in manifest.files:
-        if store.path(file.sha256).stat().st_size != file.size:
+        if store.size(file.sha256) != file.size:
             raise CorruptArtifactError(f"{file.path} has another size than the manifest says")
     return ManifestSummary(
         dataset=manifest.dataset,
@@ -75,7 +74,7 @@ def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutpu
     else:
         named |= {file.sha256: file.size for file in output.files}
     for digest, size in named.items():
-        if not store.has(digest, size=size):
+        if not store.exists(digest, size=size):
             raise CorruptArtifactError(f"artifact {digest} must be in the store with at least {size} bytes")
 
 
@@ -131,6 +130,7 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> froze
     """Return the digests of the files of a version that are not whole, in the store or in the version's directory.
 
     None where the three files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
+    Raises OSError where the store is out of reach.
     """
     if group is None:
         return None
@@ -138,19 +138,14 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> froze
     try:
         document = Manifest.model_validate_json(store.read(manifest))
         check_seal(store.read(manifest), store.read(group), store.read(seal))
-    except (OSError, ValueError):
+    except (OSError, ValueError) as error:
+        if isinstance(error, OSError) and is_unavailable(error):
+            raise
         return None
-    directory = store.dataset_path(document.dataset, document.version)
     own = {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: seal}
     files = own | {file.path: file.sha256 for file in document.files}
-    return frozenset(digest for path, digest in files.items() if not _is_whole(store, digest, directory / path))
-
-
-def _is_whole(store: Store, digest: Sha256, place: Path) -> bool:
-    """Tell whether an artifact is whole, under its own name and at its place in a version."""
-    try:
-        if not place.samefile(store.path(digest)) and sha256(place.read_bytes()) != digest:
-            return False
-    except OSError:
-        return False
-    return store.holds(digest)
+    return frozenset(
+        digest
+        for path, digest in files.items()
+        if not (store.shows(digest, document.dataset, document.version, path) and store.holds(digest))
+    )

@@ -20,6 +20,11 @@ DatabaseOption = Annotated[
     str | None,
     typer.Option("--database", help="URL of a PostgreSQL database; give one with a password as STICKSLIP_DATABASE"),
 ]
+StoreOption = Annotated[
+    str | None, typer.Option(help="directory of the store, or s3://BUCKET/PREFIX, if it is not DATA/store")
+]
+DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
+DEFAULT_DATA = Path("stickslip-data")
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
 
 

@@ -4,15 +4,14 @@ Whoever may write the data directory may make keys: no key is needed for that, a
 """
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from stickslip_services.cli.common import DatabaseOption, console, say, table
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 from stickslip_services.scopes import Scope
@@ -22,20 +21,12 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
 
-DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
-DEFAULT_DATA = Path("stickslip-data")
 
-
-@contextmanager
-def _writing(data: Path, database_url: str | None) -> Iterator["Connection"]:
+def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
     require_server("keys")
-    from stickslip_services.database.database import Role  # the server's packages may be missing
-    from stickslip_services.database.opening import opened
-    from stickslip_services.settings import Settings
+    from stickslip_services.database.opening import visited  # the server's packages may be missing
 
-    chosen = {"data": data} if database_url is None else {"data": data, "database": database_url}
-    with opened(Settings.chosen(**chosen), Role.visitor) as database, database.write() as connection:
-        yield connection
+    return visited(data, database)
 
 
 @app.command()
@@ -47,7 +38,7 @@ def create(
     database: DatabaseOption = None,
 ) -> None:
     """Make a key and print it. It is shown this once: only its digest is kept."""
-    with _writing(data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.keys import create_key
 
         key, secret = create_key(connection, name, scope, time.time())
@@ -60,7 +51,7 @@ def create(
 @shows_errors
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
-    with _writing(data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.keys import list_keys
 
         found = list_keys(connection)
@@ -84,7 +75,7 @@ def revoke(
     database: DatabaseOption = None,
 ) -> None:
     """Let a key open nothing any more; a running coordinator knows it within a second."""
-    with _writing(data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.keys import revoke_key
 
         revoke_key(connection, key_id, time.time())

@@ -10,11 +10,13 @@ from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import app as datasets
 from stickslip_services.cli.datasets import export, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
+from stickslip_services.cli.journal import journal
 from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.textures import upload
 from stickslip_services.cli.up import up
 from stickslip_services.cli.upkeep import gc, rm
+from stickslip_services.cli.webhooks import app as webhooks
 from stickslip_services.cli.workers import workers
 
 app = typer.Typer(
@@ -55,6 +57,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "certify": certify,
     "register": register,
     "certificates": certificates,
+    "journal": journal,
 }
 
 for _name, _command in _COMMANDS.items():
@@ -62,3 +65,4 @@ for _name, _command in _COMMANDS.items():
 
 app.add_typer(datasets, name="datasets")
 app.add_typer(keys, name="keys")
+app.add_typer(webhooks, name="webhooks")

@@ -1,19 +1,29 @@
 """Running a coordinator and a dispatcher on this machine."""
 
+import re
 from pathlib import Path
-from typing import Annotated
+from socket import gethostname
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
-from stickslip_services.cli.common import DatabaseOption, console
+from stickslip_services.cli.common import DatabaseOption, StoreOption, console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
+
+if TYPE_CHECKING:
+    from stickslip_services.settings import Settings
 
 
 def _url_option(url: str) -> str:
     return "" if url == DEFAULT_URL else f" --url {url}"
+
+
+def _name(settings: "Settings") -> str:
+    """Return a name that no other dispatcher has: one of the same name would take its tasks away."""
+    return "local" if settings.database is None else re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname()).lstrip("_.-")[:63]
 
 
 @shows_errors
@@ -23,7 +33,12 @@ def up(
     host: Annotated[
         str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
     ] = "127.0.0.1",
+    store: StoreOption = None,
     database: DatabaseOption = None,
+    name: Annotated[
+        str | None,
+        typer.Option(help="name of the dispatcher; `local`, or this machine's where the database is PostgreSQL"),
+    ] = None,
     slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
     allow_host: Annotated[
         list[str] | None, typer.Option(help="name that the coordinator may be asked by; repeatable")
@@ -51,13 +66,12 @@ def up(
         "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
-    given = {name: value for name, value in doors.items() if value}
-    if database is not None:
-        given["database"] = database
+    given: dict[str, Any] = {name: value for name, value in doors.items() if value}
+    given |= {name: value for name, value in (("store", store), ("database", database)) if value is not None}
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
-        supervisor.LocalService(settings, slots=slots, dispatcher=dispatcher),
+        supervisor.LocalService(settings, name or _name(settings), slots, dispatcher),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"

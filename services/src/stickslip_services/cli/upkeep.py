@@ -7,12 +7,11 @@ from typing import Annotated
 
 import typer
 
-from stickslip_services.cli.common import DatabaseOption, with_database
+from stickslip_services.cli.common import DatabaseOption, StoreOption, with_database
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 
 DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator, which must not run")]
-StoreOption = Annotated[Path | None, typer.Option(help="root of the store, if it is not DATA/store")]
 DEFAULT_DATA = Path("stickslip-data")
 
 
@@ -42,9 +41,9 @@ def gc(
     _run("gc", ["--older-than", str(older_than), *["--delete"] * delete], data, store, database)
 
 
-def _run(verb: str, options: list[str], data: Path, store: Path | None, database: str | None) -> None:
+def _run(verb: str, options: list[str], data: Path, store: str | None, database: str | None) -> None:
     require_server(verb)
-    place = ["--data", str(data), *([] if store is None else ["--store", str(store)])]
+    place = ["--data", str(data), *([] if store is None else ["--store", store])]
     program = [sys.executable, "-m", "stickslip_services.upkeep", verb, *place, *options]
     ended = subprocess.run(program, capture_output=True, text=True, check=False, env=with_database(database))
     typer.echo(ended.stdout, nl=False)

@@ -33,7 +33,7 @@ from stickslip_schemas.manifest import (
     check_seal,
 )
 from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection, part_files
-from stickslip_schemas.store import write_durably
+from stickslip_schemas.store import sync, write_durably
 from stickslip_schemas.tasks import FileEntry
 
 from stickslip_services.client.calls import ClientError, UnreachableError, raise_for_problem
@@ -358,7 +358,7 @@ def _download(
         if stop.is_set():
             return
         if part.stat().st_size == file.size and _digest(part) == file.sha256:
-            _sync(part)
+            sync(part)
             part.replace(path)
             return
         part.unlink()  # a part of something else, or damaged on its way: from the beginning
@@ -405,11 +405,3 @@ def _is_whole(path: Path, file: FileEntry) -> bool:
 def _digest(path: Path) -> Sha256:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

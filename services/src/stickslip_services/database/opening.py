@@ -7,13 +7,16 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, text
+from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError
+from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.store import open_store
 
 from stickslip_services.database import migrate
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.journal import acting, this_user
 from stickslip_services.settings import Settings
 
 
@@ -48,6 +51,14 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
         database.close()
 
 
+@contextmanager
+def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
+    """Open the database of a coordinator, which may run, for a command of this machine that writes a row or two."""
+    settings = Settings.chosen(data=data, **({} if database_url is None else {"database": database_url}))
+    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
+        yield connection
+
+
 def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
     """Return whether there is a database; raise DatabaseRefusedError where it cannot be used in a role.
 
@@ -58,12 +69,11 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
     else:
         revision = _postgresql_revision(settings, role)
     name = settings.database_name
-    datasets = settings.store_root.glob("datasets/*/v*/manifest.json") if with_store else iter(())
-    if revision is None and next(datasets, None) is not None:
-        given = {"--store": settings.store_path, "--database": settings.database}
+    if revision is None and with_store and _has_versions(settings):
+        given = {"--store": settings.store, "--database": settings.database}
         same = " and ".join(option for option, value in given.items() if value is not None)
         raise DatabaseRefusedError(
-            f"{settings.store_root} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
+            f"{settings.store_place} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
             f"{settings.data}`{same and f' with the same {same}'} to find them again"
         )
     known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
@@ -73,6 +83,17 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
             f"install that version again, or name another {settings.database_option}"
         )
     return revision is not None
+
+
+def _has_versions(settings: Settings) -> bool:
+    """Tell whether a store holds datasets; raise DatabaseRefusedError where it cannot be asked."""
+    try:
+        return next(open_store(settings.store_place).versions(MANIFEST_NAME), None) is not None
+    except OSError as error:
+        raise DatabaseRefusedError(
+            f"the database {settings.database_name} is new, and the store {settings.store_place} cannot be asked "
+            f"whether it holds datasets: {error.strerror or error}"
+        ) from error
 
 
 def _sqlite_revision(path: Path) -> str | None:

@@ -290,6 +290,34 @@ api_keys = Table(
     sqlite_autoincrement=True,
 )
 
+journal = Table(  # triggers of the migration refuse to change or to delete its rows
+    "journal",
+    metadata,
+    Column("seq", _Wide, primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("actor", String, nullable=False),
+    Column("action", String, nullable=False),
+    Column("subject", String, nullable=False),
+    Column("details", Text, nullable=False),  # JSON
+    sqlite_autoincrement=True,
+)
+
+webhooks = Table(
+    "webhooks",
+    metadata,
+    Column("seq", _Wide, primary_key=True),
+    Column("id", String, nullable=False, unique=True),
+    Column("url", String, nullable=False),
+    Column("secret", String, nullable=False),  # signing needs it as it is
+    Column("position", _Wide, nullable=False),  # id of the last event that was delivered, or needs no delivery
+    Column("next_at", Float, nullable=False),  # when to try again; ahead, while a coordinator is at it
+    Column("failures", Integer, nullable=False),  # tries in a row that failed
+    Column("failing_since", Float),
+    Column("fault", Text, nullable=False),  # of the last try; empty where it went well
+    Column("created_at", Float, nullable=False),
+    sqlite_autoincrement=True,
+)
+
 events = Table(
     "events",
     metadata,

@@ -29,8 +29,8 @@ from stickslip_services.local.locking import locked
 from stickslip_services.local.sockets import listen
 from stickslip_services.settings import Settings
 
-START_SECONDS = 60.0
-"""How long the coordinator may take until it answers [s]; a migration may be slow."""
+START_SECONDS = 180.0
+"""How long the coordinator may take until it answers [s]: migrations may be slow, and simulations have all cores."""
 SOON_SECONDS = 5.0
 """A child that dies within this time of its start has failed to start [s]."""
 MAX_FAILED_STARTS = 5
@@ -46,6 +46,8 @@ class LocalService:
 
     settings: Settings
     """Of the coordinator. `data` is an absolute path."""
+    name: str = "local"
+    """Name of the dispatcher among all that have the same database."""
     slots: int | None = None
     dispatcher: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
@@ -185,6 +187,7 @@ def print_line(stream: IO[str], message: str) -> None:
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     module = "stickslip_services.coordinator"
     place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
+    place += [] if settings.store is None else ["--store", settings.store]
     doors = [f"--allow-host={host}" for host in settings.allowed_hosts]
     doors += ["--require-keys"] if settings.require_keys else []
     doors += ["--behind-proxy"] if settings.behind_proxy else []
@@ -205,9 +208,9 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
         "--url",
         settings.url,
         "--store",
-        str(settings.store_root),
+        settings.store_place,
         "--name",
-        "local",
+        service.name,
         "--key-file",
         str(settings.worker_key_path),
         *pinned,

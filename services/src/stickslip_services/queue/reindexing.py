@@ -7,14 +7,13 @@ submitted again finds it. Results of single simulations and renders are not foun
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from sqlalchemy import select, update
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.states import TaskState
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import ShownVersion, Store
 from stickslip_schemas.tasks import PublishOutput
 
 from stickslip_services.catalog.versions import (
@@ -36,7 +35,8 @@ from stickslip_services.queue.submitting import insert_job
 class Found:
     """A version in the store."""
 
-    place: Path
+    name: str
+    """Dataset and version, as in `ds-0123456789abcdef:v1`."""
     samples: int
     fault: str
     """Why it was not taken in; empty where it was."""
@@ -45,29 +45,30 @@ class Found:
 
 def reindex(database: Database, store: Store) -> Iterator[Found]:
     """Take in the versions that are in the store and not in the database, one transaction each; yield all of them."""
-    for path in sorted(store.root.glob(f"datasets/*/v*/{MANIFEST_NAME}")):
+    for shown in store.versions(MANIFEST_NAME):
+        name = f"{shown.dataset}:v{shown.version}"
         try:
-            manifest, output = _read(store, path)
+            manifest, output = _read(store, shown)
         except (OSError, ValueError) as error:
-            yield Found(path.parent, 0, str(error).splitlines()[0])
+            yield Found(name, 0, str(error).splitlines()[0])
             continue
-        is_new = _take_in(database, store, manifest, output, path.stat().st_mtime)
-        yield Found(path.parent, manifest.sample_count, "", is_new)
+        is_new = _take_in(database, store, manifest, output, shown.modified_at)
+        yield Found(name, manifest.sample_count, "", is_new)
 
 
-def _read(store: Store, path: Path) -> tuple[Manifest, PublishOutput]:
-    """Read a version; put artifacts back that are gone from the store and are still in the version's directory."""
-    place = path.parent
-    content, group, seal = (place / MANIFEST_NAME, place / GROUP_NAME, place / SEAL_NAME)
-    check_seal(content.read_bytes(), group.read_bytes(), seal.read_bytes())
-    manifest = Manifest.model_validate_json(content.read_bytes())
-    if (dataset_id(manifest.spec), f"v{manifest.version}") != (place.parent.name, place.name):
+def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
+    """Read a version; put artifacts back that are gone and that the version still shows."""
+    place = shown.dataset, shown.version
+    content, group, seal = (store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME))
+    check_seal(content, group, seal)
+    manifest = Manifest.model_validate_json(content)
+    if (dataset_id(manifest.spec), manifest.version) != place:
         raise ValueError(f"the manifest is that of {dataset_id(manifest.spec)}, v{manifest.version}")
-    own = {name: sha256((place / name).read_bytes()) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)}
-    for name, digest in (own | {file.path: file.sha256 for file in manifest.files}).items():
-        if not store.has(digest, size=1):
-            store.publish((place / name).read_bytes())
-    size = manifest.size + sum((place / name).stat().st_size for name in own)
+    own = {MANIFEST_NAME: sha256(content), GROUP_NAME: sha256(group), SEAL_NAME: sha256(seal)}
+    for path, digest in (own | {file.path: file.sha256 for file in manifest.files}).items():
+        if not store.exists(digest, size=1):
+            store.publish(store.read_shown(*place, path))
+    size = manifest.size + len(content) + len(group) + len(seal)
     output = PublishOutput(manifest=own[MANIFEST_NAME], group=own[GROUP_NAME], bytes=size)
     read_version(store, output)  # every file is there
     return manifest, output

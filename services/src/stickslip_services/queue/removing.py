@@ -3,7 +3,7 @@
 The files stay in the store, where other versions may use them; what nothing refers to any more, `unused` finds.
 """
 
-import shutil
+import time
 from collections import Counter
 from dataclasses import dataclass
 
@@ -29,6 +29,7 @@ from stickslip_services.database.tables import (
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
+from stickslip_services.journal import note
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +42,11 @@ class Removed:
 
 def remove(database: Database, store: Store, dataset: str, version: int) -> Removed:
     """Remove a version; raise NotFoundError where it does not exist, ConflictError where a job is making it."""
-    directory = store.dataset_path(dataset, version)
     with database.write() as connection:
         columns = dataset_versions.c
         own = (columns.dataset == dataset, columns.version == version)
         publish_task = connection.scalar(select(columns.publish_task).where(*own))
-        if publish_task is None and not directory.is_dir():
+        if publish_task is None and not store.is_shown(dataset, version):
             raise NotFoundError(f"there is no version {version} of a dataset {dataset[:100]!r}")
         removed = Removed(0, 0)
         if publish_task is not None:
@@ -54,10 +54,8 @@ def remove(database: Database, store: Store, dataset: str, version: int) -> Remo
             connection.execute(delete(dataset_versions).where(*own))
             if connection.scalar(select(columns.version).where(columns.dataset == dataset).limit(1)) is None:
                 connection.execute(delete(datasets).where(datasets.c.id == dataset))
-    if directory.is_dir():  # last: a version that is in the database is always in the store
-        shutil.rmtree(directory)
-        if not any(directory.parent.iterdir()):
-            directory.parent.rmdir()
+        note(connection, "version.remove", f"{dataset}:v{version}", time.time(), jobs=removed.jobs, tasks=removed.tasks)
+    store.hide(dataset, version)  # last: a version that is in the database is always in the store
     return removed
 
 

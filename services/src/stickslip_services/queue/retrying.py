@@ -142,7 +142,7 @@ def _retry_due(book: Ledger) -> None:
 def reproducer(name: str, settings: Settings) -> str:
     """Return the command that runs a task again, by itself, on a machine with a worker's environment."""
     fetch = f"curl -s {settings.url}/v1/tasks/{name} -o task.json"
-    return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(str(settings.store_root))}"
+    return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(settings.store_place)}"
 
 
 @dataclass(frozen=True, slots=True)

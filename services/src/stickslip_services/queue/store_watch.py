@@ -3,27 +3,28 @@
 Two ways lead to trouble: the coordinator itself looks, or a worker reports that it could not write.
 """
 
-import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
+
+from stickslip_schemas.store import DirectoryStore, Store
 
 HOLD_SECONDS = 10.0
 """How long a worker's word counts where the coordinator itself finds nothing wrong [s]."""
 
-_PROBE_BYTES = 4096
+PROBE_SECONDS = 10.0
+"""Time between two looks at a bucket that takes results [s]: each look costs requests."""
 
 
 class StoreWatch:
-    """Looks at the directories of the store and of the database."""
+    """Looks at the store and at the directory of the database."""
 
-    def __init__(self, store: Path, data: Path, *, min_free_bytes: int, clock: Callable[[], float]) -> None:
-        self._store = store
-        self._data = data
+    def __init__(self, store: Store, data: Path, *, min_free_bytes: int, clock: Callable[[], float]) -> None:
+        self._places: tuple[Store, ...] = (store, DirectoryStore(data))
         self._min_free_bytes = min_free_bytes
         self._clock = clock
         self._reported = ""
         self._reported_until = float("-inf")
+        self._next_probe = float("-inf")
         self.trouble = ""
         """What is wrong, in words; empty where nothing is."""
 
@@ -40,26 +41,20 @@ class StoreWatch:
         self.trouble = self.trouble or message
 
     def _fault(self) -> str:
-        for place in (self._store, self._data):
+        least = self._min_free_bytes
+        for looked_at in self._places:
             try:
-                place.mkdir(parents=True, exist_ok=True)
-                free = shutil.disk_usage(place).free
-                if free < self._min_free_bytes:
-                    return f"{place} has {_mib(free)} MiB left, and {_mib(self._min_free_bytes)} MiB must stay free"
-                _probe(place / f".probe-{os.getpid()}")
+                room = looked_at.room()
+                if room is not None and room.free < least:
+                    return f"{looked_at.place} has {_mib(room.free)} MiB left, and {_mib(least)} MiB must stay free"
+                if room is None and not self.trouble:
+                    if self._clock() < self._next_probe:
+                        continue
+                    self._next_probe = self._clock() + PROBE_SECONDS
+                looked_at.probe()
             except OSError as error:
-                return f"{place} cannot be written: {error.strerror or error}"
+                return f"{looked_at.place} cannot be written: {error.strerror or error}"
         return ""
-
-
-def _probe(path: Path) -> None:
-    try:
-        with path.open("wb") as file:
-            file.write(bytes(_PROBE_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-    finally:
-        path.unlink(missing_ok=True)
 
 
 def _mib(size: int) -> str:

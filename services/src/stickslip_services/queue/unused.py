@@ -4,7 +4,6 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from sqlalchemy import select
 from stickslip_schemas.keys import Sha256, is_sha256, sha256
@@ -21,29 +20,24 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 class Unused:
     """A file of the store that may go."""
 
-    path: Path
+    name: str
+    """See `Store.delete`."""
     bytes: int
 
 
 def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Unused]:
-    """Yield the files below `artifacts` that nothing refers to and nobody has written for `older_than` seconds.
+    """Yield the artifacts and leftovers that nothing refers to and nobody has written for `older_than` seconds.
 
-    Whatever a task, a job, a version or a certificate in the database names is kept. So is a file that has a second
-    name in the directory of a version, whether the database knows that version or not. Raises CorruptArtifactError,
-    OSError or ValueError where the manifest of a version cannot be read: then nobody can tell what it needs.
+    Whatever a task, a job, a version or a certificate in the database names is kept. So is what the store knows to be
+    shown by a version, whether the database knows that version or not. Raises CorruptArtifactError, OSError or
+    ValueError where the manifest of a version cannot be read: then nobody can tell what it needs.
     """
     needed = _needed(database, store)
     latest = time.time() - older_than
-    for path in sorted((store.root / "artifacts").glob("*/*")):
-        is_artifact = is_sha256(path.name)
-        if is_artifact and bytes.fromhex(path.name) in needed:
-            continue
-        try:
-            status = path.stat()
-        except FileNotFoundError:
-            continue  # a writer has finished with its scratch file
-        if status.st_mtime < latest and (not is_artifact or status.st_nlink == 1):
-            yield Unused(path, status.st_size)
+    for file in store.stored():
+        is_needed = is_sha256(file.name) and bytes.fromhex(file.name) in needed
+        if not is_needed and not file.is_shown and file.modified_at < latest:
+            yield Unused(file.name, file.bytes)
 
 
 def _needed(database: Database, store: Store) -> set[bytes]:

@@ -2,6 +2,7 @@
 
 import typer
 
+from stickslip_training.cli.benchmark import benchmark
 from stickslip_training.cli.cloth import cloth
 from stickslip_training.cli.datasets import coco, info
 from stickslip_training.cli.export import export
@@ -16,3 +17,4 @@ app.command()(curvature)
 app.command("local-global")(local_global)
 app.command()(reconstruct)
 app.add_typer(cloth, name="cloth")
+app.add_typer(benchmark, name="benchmark")

@@ -1,7 +1,7 @@
 """The commands `stickslip-train cloth ...`: friction and material of dragged cloth from video."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +14,7 @@ from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
     from stickslip_training.cloth.evaluation import Errors, Scores
+    from stickslip_training.cloth.fabric import FabricErrors
     from stickslip_training.cloth.runs import Runs
     from stickslip_training.cloth.training import RenderedClips
 
@@ -38,10 +39,13 @@ def train(
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
     clips: Annotated[
-        str | None,
-        typer.Option(help="train on these clips of Blender, too: a dataset, or a file of blender_clips.py (.npz)"),
+        list[str] | None,
+        typer.Option(help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"),
     ] = None,
     start: Annotated[Path | None, typer.Option(help="a friction.safetensors whose weights are the first")] = None,
+    fabric: Annotated[
+        bool, typer.Option("--fabric", help="also learn mass per area, bending rigidity and bending length")
+    ] = False,
     rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
@@ -50,6 +54,7 @@ def train(
 
     from stickslip_training.cloth.training import ClothTraining, load_friction, save_friction, train_friction
     from stickslip_training.engine.fit import EpochReport
+    from stickslip_training.engine.ranks import current_rank, joined
 
     console = Console()
 
@@ -57,18 +62,18 @@ def train(
         validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
-    with errors_told():
+    with errors_told(), joined(check_device(device)) as own_device:
         settings = ClothTraining(
-            steps=steps, learning_rate=rate, seed=seed, threads=threads, device=check_device(device)
+            steps=steps, learning_rate=rate, fabric=fabric, seed=seed, threads=threads, device=own_device
         )
         first = None if start is None else load_friction(start)
-        if start is not None:
+        if first is not None and bool(first.quantities) == fabric:
             # The order of mu is known: the network is told as sharply as it was in the end.
             settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
         source, parts = _splits(runs, split_seed)
         source["split_seed"] = split_seed
         source["start"] = None if start is None else sha256(start.read_bytes())
-        source["clips"], rendered = (None, None) if clips is None else _clips(clips, runs, parts["train"], split_seed)
+        source["clips"], rendered = _clips(clips, runs, parts["train"], split_seed) if clips else (None, None)
         model = train_friction(
             parts["train"],
             parts["validation"],
@@ -80,6 +85,8 @@ def train(
             resume=resume,
             on_epoch=tell,
         )
+        if not current_rank().is_first:
+            return
         model.card.update(source)
         save_friction(out / "friction.safetensors", model)
         (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")
@@ -97,8 +104,11 @@ def evaluate(
     split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
 ) -> None:
     """Measure how good a model is on simulations that it has not seen, and write a page about it."""
+    import numpy as np
+
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions, score
+    from stickslip_training.cloth.fabric import score_fabric
     from stickslip_training.cloth.report import write_html
     from stickslip_training.cloth.training import load_friction, render_clips
 
@@ -106,7 +116,7 @@ def evaluate(
         friction = load_friction(model)
         if runs.endswith(".npz"):
             source, parts = _splits(runs, split_seed)
-            clips, slots = render_clips(parts[_split(split)], renders, seed), None
+            clips, slots = render_clips(parts[_split(split)].named(friction.materials), renders, seed), None
             notes = [
                 f"Pictures were rendered by the renderer that the network was trained with, {renders} a simulation."
             ]
@@ -122,9 +132,20 @@ def evaluate(
             )
         posterior = friction.estimate(clips)
         scores = score(posterior, clips.truth())
+        fabric = (
+            {}
+            if np.isnan(clips.fabric).any()
+            else score_fabric(friction.quantities, friction.fabric(clips), clips.fabric, clips.material, clips.run)
+        )
         out.mkdir(parents=True, exist_ok=True)
         write_html(out / "report.html", "Friction from video", scores, posterior, clips, notes)
-        report = {"source": source, "split": split, "scores": scores.as_dict(), "notes": notes}
+        report = {
+            "source": source,
+            "split": split,
+            "scores": scores.as_dict(),
+            "fabric": {name: asdict(errors) for name, errors in fabric.items()},
+            "notes": notes,
+        }
         (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         numbers = range(len(clips)) if slots is None else slots.tolist()
         lines = [
@@ -136,6 +157,8 @@ def evaluate(
         (out / "records.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     console = Console()
     console.print(_scores(scores))
+    if fabric:
+        console.print(_fabric(fabric))
     console.print(f"{out}: report.html, report.json, records.jsonl", soft_wrap=True)
 
 
@@ -184,6 +207,7 @@ def predict(
     with 80 %."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
+    from stickslip_training.cloth.fabric import told_fabric
     from stickslip_training.cloth.training import WEIGHTS, load_friction
     from stickslip_training.cloth.video import load_clip
 
@@ -203,6 +227,9 @@ def predict(
         answers = predictions(posterior, slots)
         for answer, far in zip(answers, strangeness.tolist(), strict=True):
             answer["strangeness"] = round(far, 3)
+        for name, intervals in told_fabric(friction.quantities, friction.fabric(clips)).items():
+            for answer, interval in zip(answers, intervals, strict=True):
+                answer.setdefault("fabric", {})[name] = interval
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
         return
@@ -225,22 +252,14 @@ def score(
     split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
 ) -> None:
     """Score a file of predictions, of any method, on the clips of a dataset."""
-    from stickslip_training.cloth.clips import check_kind, simulations
+    from stickslip_training.benchmark.records import read_answers
+    from stickslip_training.cloth.clips import check_kind, truth_of_slots
     from stickslip_training.cloth.evaluation import score_predictions
 
     with errors_told(), DatasetReader(dataset) as reader:
         check_kind(reader)
-        slots = reader.slots(_split(split))
-        labels = zip(reader.label("material")[slots].tolist(), reader.label("mu")[slots].tolist(), strict=True)
-        groups = simulations(reader, slots).tolist()
-        truth = {
-            slot: (int(material), float(mu), group)
-            for slot, (material, mu), group in zip(slots.tolist(), labels, groups, strict=True)
-        }
-        answers = json.loads(predictions.read_text(encoding="utf-8"))
-        if not isinstance(answers, list):
-            raise ValueError(f"{predictions} must hold a list of answers, and holds a {type(answers).__name__}")
-        scores = score_predictions(answers, reader.categories("material"), truth)
+        truth = truth_of_slots(reader, reader.slots(_split(split)))
+        scores = score_predictions(read_answers(predictions)[0], reader.categories("material"), truth)
     Console().print(_scores(scores))
 
 
@@ -272,28 +291,34 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
         return named, splits
 
 
-def _clips(source: str, runs: str, train: "Runs", seed: int) -> "tuple[str, RenderedClips]":
+def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[list[str], RenderedClips]":
     """Return what names the clips, and those of the splits train and validation."""
     import numpy as np
     from stickslip_schemas.keys import sha256
 
     from stickslip_training.cloth.clips import clips_of_file, read_clips
     from stickslip_training.cloth.runs import load_runs, split_of_runs
-    from stickslip_training.cloth.training import RenderedClips
+    from stickslip_training.cloth.training import Clips, RenderedClips
 
-    if not source.endswith(".npz"):
-        with DatasetReader(source) as reader:
+    if not all(source.endswith(".npz") for source in sources):
+        if len(sources) > 1:
+            raise ValueError(f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}")
+        with DatasetReader(sources[0]) as reader:
             learned, judged = (read_clips(reader, _split(part), train.materials)[0] for part in ("train", "validation"))
             # Simulations have numbers by split.
-            return reader.manifest_digest, RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
+            return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
     if not runs.endswith(".npz"):
         raise ValueError(f"runs must be the packed file that the clips are of, and are {runs}")
-    known, _ = clips_of_file(Path(source), train.materials)
     split = split_of_runs(load_runs(runs), SHARES, seed)
-    if known.run.max() >= len(split) or (split[known.run] == 2).any():
-        raise ValueError(f"{source} must not show simulations to test with: it has some of the split test of {runs}")
+    files = []
+    for source in sources:
+        shown, _ = clips_of_file(Path(source), train.materials)
+        if shown.run.max() >= len(split) or (split[shown.run] == 2).any():
+            raise ValueError(f"{source} must not show simulations to test with: it has some of the test split")
+        files.append(shown)
+    known = Clips.joined(files)
     learned, judged = (known[np.flatnonzero(split[known.run] == part)] for part in (0, 1))
-    return sha256(Path(source).read_bytes()), RenderedClips(learned, judged)
+    return [sha256(Path(source).read_bytes()) for source in sources], RenderedClips(learned, judged)
 
 
 def _split(name: str) -> Any:
@@ -302,6 +327,17 @@ def _split(name: str) -> Any:
     if name not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")
     return name
+
+
+def _fabric(found: "dict[str, FabricErrors]") -> Table:
+    table = Table(title="the fabric", caption="Errors are |ln(estimate / truth)|.", caption_justify="left")
+    table.add_column("")
+    for title in ("mean error", "knowing only the material", "in 80 %", "width of the interval"):
+        table.add_column(title, justify="right")
+    for name, part in found.items():
+        shown = str(part.error), str(part.guess), f"{part.coverage.value:.1%}", f"{part.width.value:.2f}"
+        table.add_row(name.replace("_", " "), *shown)
+    return table
 
 
 def _scores(scores: "Scores") -> Table:

@@ -10,6 +10,7 @@ from stickslip_schemas.cameras import load_rig
 
 from stickslip_training.arrays import Array, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
+from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.cloth.runs import landed_side
 from stickslip_training.cloth.training import RIG, Clips, frames_at
 from stickslip_training.data.reader import DatasetReader, Split
@@ -40,10 +41,9 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
     known = np.array([materials.index(name) if name in materials else -1 for name in reader.categories("material")])
     mu = reader.label("mu")[slots].astype(np.float64)
     material = known[reader.label("material")[slots]]
-    clips = Clips(
-        torch.cat(crops), seen.rotation[:, 2], material, mu, _landed(reader, slots), simulations(reader, slots)
-    )
-    return clips, slots
+    fabric = fabric_numbers(*(reader.label(name)[slots] for name in ("areal_density", "bending_rigidity")))
+    landed, runs = _landed(reader, slots), simulations(reader, slots)
+    return Clips(torch.cat(crops), seen.rotation[:, 2], material, mu, landed, runs, fabric), slots
 
 
 def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[dict[str, Any]]]:
@@ -64,8 +64,9 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
         for i in range(len(video))
     ]
     known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
-    told = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
-    return Clips(torch.cat(crops), seen.rotation[:, 2], np.array(known), *told), about
+    mu, landed, run = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
+    fabric = numbers_of_runs(about)
+    return Clips(torch.cat(crops), seen.rotation[:, 2], np.array(known), mu, landed, run, fabric), about
 
 
 def check_kind(reader: DatasetReader) -> None:
@@ -79,6 +80,13 @@ def simulations(reader: DatasetReader, slots: Integers) -> Integers:
     names = [name for name in ("material", "mu", "bias", "areal_density", "bending_rigidity") if name in reader.arrays]
     told: list[Array] = [reader.label(name)[slots].reshape(len(slots), -1).astype(np.float64) for name in names]
     return np.unique(np.concatenate(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def truth_of_slots(reader: DatasetReader, slots: Integers) -> dict[int, tuple[int, float, int]]:
+    """Return the code of the material, mu and the number of the simulation of slots, as `score_predictions` asks."""
+    material, mu = (reader.label(name)[slots].tolist() for name in ("material", "mu"))
+    groups = simulations(reader, slots).tolist()
+    return {slot: (m, x, run) for slot, m, x, run in zip(slots.tolist(), material, mu, groups, strict=True)}
 
 
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:

@@ -21,7 +21,7 @@ from stickslip_training.cloth.crop import Cameras, holder_crops
 from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
 from stickslip_training.cloth.render import splat_meshes
 from stickslip_training.cloth.runs import Runs
-from stickslip_training.cloth.training import Clips, frames_at
+from stickslip_training.cloth.training import INSTANTS, Clips, frames_at
 
 LARGEST_GAP = 0.4
 """In mu: nothing is said between known runs that are farther apart."""
@@ -99,17 +99,27 @@ class Observation:
     """The two holder corners, seen with the same noise, are put where the camera says they are."""
 
 
-def tracks(runs: Runs, camera: Camera) -> Floats:
-    """Return the vertices of runs in the pictures of a camera, (runs, frames, vertices, 2) [px]."""
-    frames, _ = frames_at(runs.instants)
+def tracks(runs: Runs, camera: Camera, wanted: tuple[int, ...] = INSTANTS) -> Floats:
+    """Return the vertices of runs in the pictures of a camera at the instants `wanted`, (runs, frames, vertices, 2)
+    [px]."""
+    frames, _ = frames_at(runs.instants, wanted)
     cameras = Cameras.of([camera] * len(runs))
     pixels, _ = cameras.project(torch.from_numpy(runs.positions[:, frames]))
     return np.asarray(pixels.flatten(2, 3).numpy(), dtype=np.float64)
 
 
-def oracle(known: Runs, test: Runs, camera: Camera, seen: Observation, seed: int) -> Posterior:
-    """Return what the vertices of `test`, seen by `camera` as `seen` says, tell of material and mu."""
-    x = tracks(test, camera)
+def oracle(
+    known: Runs,
+    test: Runs,
+    camera: Camera,
+    seen: Observation,
+    seed: int,
+    wanted: tuple[int, ...] = INSTANTS,
+    bins: Bins = MU_BINS,
+) -> Posterior:
+    """Return what the vertices of `test`, seen by `camera` at the instants `wanted` as `seen` says, tell of material
+    and mu."""
+    x = tracks(test, camera, wanted)
     random = np.random.default_rng((seed, 7))
     observed = x + seen.noise * random.standard_normal(x.shape)
     middle = np.array([camera.cx, camera.cy])
@@ -119,7 +129,7 @@ def oracle(known: Runs, test: Runs, camera: Camera, seen: Observation, seed: int
         side = test.side
         corners = [side * (side - 1), side * side - 1]
         observed = _registered(observed, observed[:, :, corners], x[:, :, corners])
-    curves = Curves.through(tracks(known, camera).reshape(len(known), -1), known)
+    curves = Curves.through(tracks(known, camera, wanted).reshape(len(known), -1), known, bins)
     # The registration's error is shared by all vertices of a frame, and so is the interpolation's: the noise is not
     # all.
     variance = seen.noise**2 + (seen.noise**2 / 2 if seen.registered else 0.0) + 0.1**2

@@ -1,5 +1,6 @@
 """The networks that measure friction: one of ours, and the two of the thesis [thesis, 4.4]."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -10,16 +11,19 @@ from stickslip_training.cloth.crop import HEIGHT, WIDTH
 
 class PosteriorNet(nn.Module):
     """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and log p(mu | m), (B,
-    M, K).
+    M, K); with `quantities`, the bins of each, also to histograms of these: see `fabric`.
 
     Every frame goes through the same four convolutions and keeps its places: what tells friction is where an edge lies,
     to a part of a pixel. Frames are phase-locked to the stage, so each has a place of its own in the layer that joins
     them.
     """
 
-    def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96) -> None:
+    def __init__(
+        self, *, materials: int, bins: int, frames: int, width: int = 96, quantities: Sequence[int] = ()
+    ) -> None:
         super().__init__()
         self.sizes = {"materials": materials, "bins": bins, "frames": frames, "width": width}
+        self.quantity_bins = list(quantities)
         channels = (1, 16, 32, 48, 64)
         layers: list[nn.Module] = []
         for before, after in pairwise(channels):
@@ -41,6 +45,7 @@ class PosteriorNet(nn.Module):
         )
         self.material = nn.Linear(2 * width, materials)
         self.mu = nn.Linear(2 * width, materials * bins)
+        self.quantities = nn.ModuleList(nn.Linear(2 * width, count) for count in quantities)
 
     def features(self, crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
         """Return what material and mu are read off, (B, 2 width)."""
@@ -54,6 +59,10 @@ class PosteriorNet(nn.Module):
         """Return log p(m) and log p(mu | m) of features."""
         mu = self.mu(features).reshape(len(features), self.sizes["materials"], self.sizes["bins"])
         return torch.log_softmax(self.material(features), dim=1), torch.log_softmax(mu, dim=2)
+
+    def read_quantities(self, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return log p(q), (B, bins), of each quantity."""
+        return tuple(torch.log_softmax(head(features), dim=1) for head in self.quantities)
 
     def forward(self, crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return log p(m) and log p(mu | m)."""

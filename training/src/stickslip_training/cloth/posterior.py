@@ -37,6 +37,11 @@ class Bins:
         """(count,)"""
         return (self.edges[:-1] + self.edges[1:]) / 2
 
+    def place(self, values: Floats) -> Integers:
+        """Return the bin of each value, (n,); the first or the last one beyond the ends."""
+        places = ((values - self.low) / (self.edges[1] - self.low)).astype(np.int64)
+        return np.asarray(np.clip(places, 0, self.count - 1))
+
 
 MU_BINS = Bins(0.0, 1.6, 64)
 
@@ -80,10 +85,7 @@ class Posterior:
 
     def log_likelihood(self, material: Integers, mu: Floats) -> Floats:
         """Return log p(m, mu) of the truth, (clips,), with mu a density."""
-        places = np.clip(
-            ((mu - self.bins.low) / (self.bins.edges[1] - self.bins.low)).astype(int), 0, self.bins.count - 1
-        )
-        density = self.joint[np.arange(len(self)), material, places] / (self.bins.edges[1] - self.bins.low)
+        density = self.joint[np.arange(len(self)), material, self.bins.place(mu)] / (self.bins.edges[1] - self.bins.low)
         return np.asarray(np.log(density + 1e-12))
 
     @staticmethod

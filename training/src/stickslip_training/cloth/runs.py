@@ -7,7 +7,7 @@ it); a dataset that stores its meshes holds them, too.
 import json
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from zipfile import BadZipFile
@@ -15,6 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
+from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.data.reader import DatasetReader, Split
 
 STEP = 1e-5
@@ -41,6 +42,8 @@ class Runs:
     """(runs,)"""
     landed: Integers
     """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on the first leg."""
+    fabric: Floats
+    """(runs, 3): log10 of `fabric.FABRIC`; NaN where they are not known."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -54,14 +57,22 @@ class Runs:
             self.material[chosen],
             self.mu[chosen],
             self.landed[chosen],
+            self.fabric[chosen],
         )
+
+    def named(self, materials: tuple[str, ...]) -> "Runs":
+        """Return the runs with the codes of other names; raise ValueError where one of theirs is missing."""
+        if missing := set(self.materials) - set(materials):
+            raise ValueError(f"materials must have those of the runs, and lack {', '.join(sorted(missing))}")
+        codes = np.array([materials.index(name) for name in self.materials])
+        return replace(self, materials=materials, material=codes[self.material])
 
     @staticmethod
     def joined(first: "Runs", second: "Runs") -> "Runs":
         """Return the runs of both, which must have the same instants and materials."""
         if (first.instants, first.materials) != (second.instants, second.materials):
             raise ValueError("runs that are joined must have the same instants and materials")
-        names = ("positions", "material", "mu", "landed")
+        names = ("positions", "material", "mu", "landed", "fabric")
         both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
         return Runs(instants=first.instants, materials=first.materials, **both)
 
@@ -79,6 +90,32 @@ def load_runs(path: str | Path) -> Runs:
         raise ValueError(f"{path} must be a packed file of simulations, and is damaged or is none: {error}") from error
 
 
+def write_packed(
+    path: Path,
+    positions: Floats | SingleFloats,
+    rest: Floats | SingleFloats,
+    triangles: Array,
+    instants: Sequence[int],
+    about: Sequence[str],
+) -> None:
+    """Write positions (runs, frames, V, 3) [m] at instants, and what is true of each run as JSON, as `load_runs` reads
+    them.
+
+    Positions are whole steps of `STEP`; differences of consecutive instants are packed best.
+    """
+    steps = np.round(positions / STEP).astype(np.int16)
+    differences = np.diff(steps, axis=1, prepend=np.int16(0))
+    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
+    np.savez_compressed(
+        path,
+        differences=np.moveaxis(bytes_apart, -1, 0),  # low bytes, high bytes, (2, runs, frames, V, 3)
+        rest=rest,
+        triangles=triangles,
+        instants=np.array(instants, np.int16),
+        about=np.array(about),
+    )
+
+
 def _load(path: str | Path) -> Runs:
     with np.load(path) as file:
         low, high = file["differences"]
@@ -88,7 +125,8 @@ def _load(path: str | Path) -> Runs:
         rest, instants = file["rest"], tuple(map(int, file["instants"]))
     materials = tuple(sorted({run["material"] for run in about}))
     material = np.array([materials.index(run["material"]) for run in about])
-    return _runs(positions, rest, instants, materials, material, np.array([run["mu"] for run in about]))
+    mu = np.array([run["mu"] for run in about])
+    return _runs(positions, rest, instants, materials, material, mu, numbers_of_runs(about))
 
 
 def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
@@ -114,7 +152,9 @@ def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequen
     rest = reader.read("rest", chosen[:1])[0]
     material = reader.label("material")[chosen].astype(np.int64)
     materials = reader.categories("material")
-    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, reader.label("mu")[chosen]), chosen
+    fabric = fabric_numbers(*(reader.label(name)[chosen] for name in ("areal_density", "bending_rigidity")))
+    mu = reader.label("mu")[chosen]
+    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, mu, fabric), chosen
 
 
 def split_runs(runs: Runs, shares: tuple[float, float], seed: int) -> tuple[Runs, Runs, Runs]:
@@ -147,10 +187,11 @@ def _runs(
     materials: tuple[str, ...],
     material: Integers,
     mu: Floats,
+    fabric: Floats,
 ) -> Runs:
     grid = positions[:, :, grid_order(rest)].astype(np.float32)
     landed = _landed(grid[:, _first(instants)])
-    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
+    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed, fabric)
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:

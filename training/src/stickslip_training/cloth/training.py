@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,10 @@ from torch import nn
 from stickslip_training.arrays import Floats, Integers, SingleFloats
 from stickslip_training.cloth.crop import Cameras
 from stickslip_training.cloth.evaluation import Truth
+from stickslip_training.cloth.fabric import FABRIC, Quantity
 from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.nets import PosteriorNet
-from stickslip_training.cloth.posterior import MU_BINS, Bins, Posterior
+from stickslip_training.cloth.posterior import MU_BINS, SHARE, Bins, Posterior, estimates
 from stickslip_training.cloth.render import Style, draw_style, render_crops, turned
 from stickslip_training.cloth.runs import Runs, between
 from stickslip_training.engine.fit import (
@@ -36,6 +37,7 @@ from stickslip_training.engine.fit import (
     seeded,
     torch_threads,
 )
+from stickslip_training.engine.ranks import Rank
 
 RIG = "drag"
 
@@ -70,6 +72,11 @@ class ClothTraining:
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    instants: tuple[int, ...] = INSTANTS
+    """Of the frames that the network sees, of 300."""
+    fabric: bool = False
+    """Also learn the numbers of the fabric, `fabric.FABRIC`. There are no meshes between neighbours in mu then: two
+    fabrics do not make a third."""
     seed: int = 0
     width: int = 96
     threads: int = 1
@@ -98,6 +105,8 @@ class Clips:
     landed: Integers
     run: Integers
     """(clips,): number of the simulation, for errors that count simulations and not clips."""
+    fabric: Floats
+    """(clips, 3): log10 of `fabric.FABRIC`; NaN where they are not known."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -111,7 +120,14 @@ class Clips:
             self.mu[chosen],
             self.landed[chosen],
             self.run[chosen],
+            self.fabric[chosen],
         )
+
+    @staticmethod
+    def joined(parts: "Sequence[Clips]") -> "Clips":
+        """Return the clips of all parts."""
+        columns = [[getattr(part, field.name) for part in parts] for field in fields(Clips)]
+        return Clips(*(torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each) for each in columns))
 
     def truth(self) -> Truth:
         """Return what is true of the clips, as scores ask for it."""
@@ -146,11 +162,14 @@ class FrictionModel:
     instants: tuple[int, ...]
     bins: Bins
     temperature: tuple[float, float]
-    """By which log p(m) and log p(mu | m) are divided: see `calibrated`."""
+    """By which log p(m) and log p(mu | m) are divided: see `calibrated` and `covering`."""
     familiarity: tuple[Familiarity, ...]
     """Of each network: what it was trained on."""
     card: dict[str, Any]
     """Where the network comes from: runs, settings, measures, limits."""
+    quantities: tuple[Quantity, ...] = ()
+    """Numbers of the fabric that it tells, too."""
+    quantity_temperatures: tuple[float, ...] = ()
 
     def estimate(self, clips: Clips) -> Posterior:
         """Return the posterior of every clip: the mean over the networks."""
@@ -167,6 +186,16 @@ class FrictionModel:
         posteriors = [_posterior(*each, self.materials, self.bins, self.temperature) for each in answers]
         far = [known.distance(own) / known.limit for known, own in zip(self.familiarity, seen, strict=True)]
         return Posterior.mean(posteriors), np.asarray(np.mean(far, axis=0))
+
+    def fabric(self, clips: Clips) -> dict[str, Floats]:
+        """Return the histogram of each quantity by name, (clips, bins): the mean over the networks."""
+        told = [tell(net, features(net, clips)) for net in self.nets]
+        return {
+            quantity.name: np.mean([_softmax(own[place] / temperature) for own in told], axis=0)
+            for place, (quantity, temperature) in enumerate(
+                zip(self.quantities, self.quantity_temperatures, strict=True)
+            )
+        }
 
 
 def train_friction(
@@ -187,6 +216,8 @@ def train_friction(
     `clips` are trained on, too; `start` is a model whose weights are the first. `identity` names the runs, and these,
     for a run that is resumed. Validation chooses the weights and the temperature.
     """
+    if start is not None and clips is None:
+        train, validation = (runs.named(start.materials) for runs in (train, validation))
     with torch_threads(settings.threads):
         learner = _FrictionLearner(train, validation, settings, clips, start)
         fitted = fit(
@@ -213,7 +244,10 @@ def train_friction(
         seen = learner.validation
         found = features(net, seen)
         temperature = calibrated(*answer(net, found), seen.material, seen.mu, MU_BINS)
-        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn)
+        temperature = (temperature[0], covering(net, seen, temperature[0], train.materials, settings.seed))
+        quantities = learner.quantities
+        temperatures = calibrated_quantities(quantities, tell(net, found), seen.fabric)
+        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
         familiarity = Familiarity.of(features(net, known), known.material, found, len(train.materials))
     card = {
         "settings": asdict(settings),
@@ -226,8 +260,10 @@ def train_friction(
         "history": [asdict(report) for report in fitted.history],
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
     }
-    instants = frames_at(train.instants)[1]
-    return FrictionModel((net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card)
+    instants = frames_at(train.instants, settings.instants)[1]
+    return FrictionModel(
+        (net,), train.materials, instants, MU_BINS, temperature, (familiarity,), card, quantities, temperatures
+    )
 
 
 WEIGHTS = Path(__file__).with_name("friction.safetensors")
@@ -248,6 +284,8 @@ def save_friction(path: Path, model: FrictionModel) -> None:
         "bins": asdict(model.bins),
         "temperature": model.temperature,
         "limits": [own.limit for own in model.familiarity],
+        "quantities": [quantity.name for quantity in model.quantities],
+        "quantity_temperatures": model.quantity_temperatures,
         "card": model.card,
     }
     tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
@@ -261,8 +299,9 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             about = json.loads((file.metadata() or {})["friction"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         nets, known = [], []
+        quantities = tuple(quantity for quantity in FABRIC if quantity.name in about.get("quantities", ()))
         for i in range(about["nets"]):
-            net = PosteriorNet(**about["sizes"])
+            net = PosteriorNet(**about["sizes"], quantities=[quantity.bins.count for quantity in quantities])
             net.load_state_dict({name: tensors[f"nets.{i}.{name}"] for name in net.state_dict()})
             nets.append(net.eval())
             means, precision = (tensors[f"familiarity.{i}.{name}"].numpy() for name in ("means", "precision"))
@@ -278,6 +317,8 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
         (first, second),
         tuple(known),
         about["card"],
+        quantities,
+        tuple(about.get("quantity_temperatures", ())),
     )
 
 
@@ -314,13 +355,14 @@ def render_clips(
     turn: tuple[float, float] = (0.0, 0.0),
     spread: float = 0.0,
     style: Callable[[Style], Style] | None = None,
+    wanted: tuple[int, ...] = INSTANTS,
 ) -> Clips:
-    """Render every run `renders` times, each with a look of its own, by the cameras in turn.
+    """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
 
     `turn` turns all cameras (about the vertical, up) [degree]; `spread` adds random turns of this deviation; `style`
     changes the looks that were drawn.
     """
-    frames, instants = frames_at(runs.instants)
+    frames, instants = frames_at(runs.instants, wanted)
     rig = training_cameras() if cameras is None else cameras
     number = np.repeat(np.arange(len(runs)), renders)
     crops, directions = [], []
@@ -334,9 +376,8 @@ def render_clips(
         meshes = torch.from_numpy(runs.positions[chosen][:, frames])
         crops.append(render_crops(meshes, seen, instants, looks, generator))
         directions.append(seen.rotation[:, 2])
-    return Clips(
-        torch.cat(crops), torch.cat(directions), runs.material[number], runs.mu[number], runs.landed[number], number
-    )
+    material, mu, landed = runs.material[number], runs.mu[number], runs.landed[number]
+    return Clips(torch.cat(crops), torch.cat(directions), material, mu, landed, number, runs.fabric[number])
 
 
 def jittered(crops: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -374,21 +415,32 @@ class _FrictionLearner(Learner):
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
-        self.frames, self.instants = frames_at(train.instants)
+        self.rank = Rank()
+        self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
-        self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
+        self.quantities = FABRIC if settings.fabric else ()
+        for runs in (train, validation) if settings.fabric else ():
+            _check_fabric(runs)
+        gap = 0.0 if settings.fabric else settings.gap
+        self.pairs = np.array(between(train, gap) + [(run, run) for run in range(len(train))])
         widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
         self.rig = training_cameras()
         self.clips = clips
         self.validation = (
-            render_clips(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
+            render_clips(validation, 6, settings.seed, spread=settings.turn, wanted=settings.instants)
+            if clips is None
+            else clips.validation
         )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
         with seeded(settings.seed):
             self.net = PosteriorNet(
-                materials=len(train.materials), bins=MU_BINS.count, frames=len(self.frames), width=settings.width
+                materials=len(train.materials),
+                bins=MU_BINS.count,
+                frames=len(self.frames),
+                width=settings.width,
+                quantities=[quantity.bins.count for quantity in self.quantities],
             )
         if start is not None:
             if start.materials != train.materials or start.nets[0].sizes != self.net.sizes:
@@ -396,7 +448,15 @@ class _FrictionLearner(Learner):
                     f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
                     f"{', '.join(start.materials)}, and is {start.nets[0].sizes}"
                 )
-            self.net.load_state_dict(start.nets[0].state_dict())
+            own = self.net.state_dict()  # heads that the start lacks begin anew
+            self.net.load_state_dict(own | {n: t for n, t in start.nets[0].state_dict().items() if n in own})
+
+    def share(self, rank: Rank) -> None:
+        if self.settings.batch_size % rank.count:
+            raise ValueError(
+                f"batch_size must be a multiple of the {rank.count} processes, and is {self.settings.batch_size}"
+            )
+        self.rank = rank
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
@@ -405,23 +465,30 @@ class _FrictionLearner(Learner):
         return cosine_rate(self.settings.learning_rate, step, self.settings.steps, 100)
 
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
-        crops, direction, material, mu = self.batch(step)
+        assert isinstance(net, PosteriorNet)
+        crops, direction, material, mu, fabric = self.batch(step)
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
-        target = torch.exp(-0.5 * ((self.centers - mu[:, None]) / deviation) ** 2)
-        target = target / target.sum(dim=1, keepdim=True)
+        target = _blurred(self.centers, mu, deviation)
         device = self.settings.device
-        log_material, log_mu = net(crops.to(device), direction.to(device))
+        seen = net.features(crops.to(device), direction.to(device))
+        log_material, log_mu = net.read(seen)
         rows = torch.arange(len(mu), device=device)
         given = log_mu[rows, material.to(device)]
         loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
+        for place, (quantity, told) in enumerate(zip(self.quantities, net.read_quantities(seen), strict=True)):
+            bins = quantity.bins
+            wide = deviation * (bins.high - bins.low) / (MU_BINS.high - MU_BINS.low)
+            centers = torch.from_numpy(bins.centers.astype(np.float32))
+            loss = loss - (_blurred(centers, fabric[:, place], wide).to(device) * told).sum(dim=1).mean()
         return torch.as_tensor(loss)
 
-    def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the crops, directions of view, materials and mu of a step."""
-        random = np.random.default_rng((self.settings.seed, _TRAINING, step))
-        generator = torch.Generator().manual_seed(seed_of_step(self.settings.seed, _TRAINING, step))
-        count = self.settings.batch_size
+    def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the crops, directions of view, materials, mu and fabrics of this process's share of a step."""
+        seeds = (self.settings.seed, _TRAINING, step, *self.rank.seeds)
+        random = np.random.default_rng(seeds)
+        generator = torch.Generator().manual_seed(seed_of_step(*seeds))
+        count = self.settings.batch_size // self.rank.count
         chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
         share = random.random(count, dtype=np.float32)
         near = torch.from_numpy(share)[:, None, None, None, None]
@@ -434,7 +501,9 @@ class _FrictionLearner(Learner):
         crops = render_crops(meshes, cameras, self.instants, looks, generator)
         first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
         mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32))
-        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu
+        near, far = (self.train.fabric[chosen[:, place]] for place in (0, 1))
+        fabric = torch.from_numpy((near + share[:, None] * (far - near)).astype(np.float32))
+        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, fabric
         if self.clips is None:
             return rendered
         some = self.clips.train[random.integers(len(self.clips.train), size=count // 2)]
@@ -443,17 +512,23 @@ class _FrictionLearner(Learner):
             some.direction,
             torch.from_numpy(some.material),
             torch.from_numpy(some.mu.astype(np.float32)),
+            torch.from_numpy(some.fabric.astype(np.float32)),
         )
-        a, b, c, d = (torch.cat([own[: count - len(some)], given]) for own, given in zip(rendered, told, strict=True))
-        return a, b, c, d
+        both = zip(rendered, told, strict=True)
+        a, b, c, d, e = (torch.cat([own[: count - len(some)], given]) for own, given in both)
+        return a, b, c, d, e
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
-        seen, answers = self.validation, answer(net, features(net, self.validation))
+        seen, found = self.validation, features(net, self.validation)
+        answers = answer(net, found)
         # A network that is too sure is not worse for it: temperatures mend that in the end.
         temperature = calibrated(*answers, seen.material, seen.mu, MU_BINS)
         posterior = _posterior(*answers, self.train.materials, MU_BINS, temperature)
-        return -float(posterior.log_likelihood(seen.material, seen.mu).mean())
+        loss = -float(posterior.log_likelihood(seen.material, seen.mu).mean())
+        for place, (quantity, told) in enumerate(zip(self.quantities, tell(net, found), strict=True)):
+            loss += _best_temperature(told, quantity.bins.place(seen.fabric[:, place]))[1]
+        return loss
 
 
 # --- answers --------------------------------------------------------------------------------------------------
@@ -464,6 +539,13 @@ def answer(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, SingleF
     with torch.inference_mode():
         material, mu = net.read(torch.from_numpy(seen).to(next(net.parameters()).device))
     return material.cpu().numpy(), mu.cpu().numpy()
+
+
+def tell(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, ...]:
+    """Return log p(q) of features, (clips, n): (clips, bins) for each quantity."""
+    with torch.inference_mode():
+        told = net.read_quantities(torch.from_numpy(seen).to(next(net.parameters()).device))
+    return tuple(each.cpu().numpy() for each in told)
 
 
 def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
@@ -496,16 +578,63 @@ def _softmax(logits: SingleFloats) -> Floats:
     return np.asarray(shifted / shifted.sum(axis=-1, keepdims=True))
 
 
+def covering(
+    net: PosteriorNet, clips: Clips, of_material: float, materials: tuple[str, ...], seed: int, share: float = SHARE
+) -> float:
+    """Return the temperature of mu at which the intervals that should hold `share` hold that share of the truths.
+
+    The most likely temperature is another one where a few clips are far off: it makes all intervals wider. The clips
+    are seen with exposures and registrations that differ as those of new clips may.
+    """
+    generator = torch.Generator().manual_seed(seed_of_step(seed, _VALIDATION, 1))
+    answers = answer(net, features(net, replace(clips, crops=jittered(clips.crops, generator))))
+    tried = np.geomspace(0.4, 6.0, 55)
+
+    def held(temperature: float) -> float:
+        posterior = _posterior(*answers, materials, MU_BINS, (of_material, temperature))
+        found = estimates(posterior.mu, MU_BINS, share)
+        return float(((found.low <= clips.mu) & (clips.mu <= found.high)).mean())
+
+    return float(tried[int(np.argmin([abs(held(each) - share) for each in tried]))])
+
+
 def calibrated(
     material: SingleFloats, mu: SingleFloats, true_material: Integers, true_mu: Floats, bins: Bins
 ) -> tuple[float, float]:
     """Return the temperatures at which known answers are the most likely [Guo et al. 2017], of material and of mu."""
     rows = np.arange(len(true_mu))
-    place = np.clip(((true_mu - bins.low) / (bins.edges[1] - bins.low)).astype(int), 0, bins.count - 1)
+    chances = material, true_material
+    return _best_temperature(*chances)[0], _best_temperature(mu[rows, true_material], bins.place(true_mu))[0]
+
+
+def calibrated_quantities(
+    quantities: tuple[Quantity, ...], told: tuple[SingleFloats, ...], truth: Floats
+) -> tuple[float, ...]:
+    """Return the temperature of each quantity, at which log10 of the truth, (clips, 3), is the most likely."""
+    places = [quantity.bins.place(truth[:, i]) for i, quantity in enumerate(quantities)]
+    return tuple(_best_temperature(own, place)[0] for own, place in zip(told, places, strict=True))
+
+
+def _best_temperature(logits: SingleFloats, place: Integers) -> tuple[float, float]:
+    """Return the temperature at which the true bins `place` (clips,) are the most likely, and -log p there."""
     tried = np.geomspace(0.4, 4.0, 47)
+    rows = np.arange(len(place))
+    losses = [float(-np.log(_softmax(logits / t)[rows, place] + 1e-12).mean()) for t in tried]
+    best = int(np.argmin(losses))
+    return float(tried[best]), losses[best]
 
-    def best(logits: SingleFloats, truth: Integers) -> float:
-        losses = [-np.log(_softmax(logits / t)[rows, truth] + 1e-12).mean() for t in tried]
-        return float(tried[int(np.argmin(losses))])
 
-    return best(material, true_material), best(mu[rows, true_material], place)
+def _blurred(centers: torch.Tensor, truth: torch.Tensor, deviation: float) -> torch.Tensor:
+    """Return histograms (B, bins) of this deviation about the truth, (B,)."""
+    target = torch.exp(-0.5 * ((centers - truth[:, None]) / deviation) ** 2)
+    return target / target.sum(dim=1, keepdim=True)
+
+
+def _check_fabric(runs: Runs) -> None:
+    for column, quantity in zip(runs.fabric.T, FABRIC, strict=True):
+        low, high = quantity.bins.low, quantity.bins.high
+        if not ((low <= column) & (column <= high)).all():
+            raise ValueError(
+                f"{quantity.name} of the runs must be known, from {10**low:.2g} to {10**high:.2g} {quantity.unit}: it "
+                f"is from {10 ** column.min():.3g} to {10 ** column.max():.3g}"
+            )

@@ -29,6 +29,7 @@ from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Floats
 from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, stage
+from stickslip_training.cloth.fabric import FABRIC
 from stickslip_training.cloth.training import INSTANTS, Clips, frames_at
 
 if TYPE_CHECKING:
@@ -190,7 +191,8 @@ def load_clip(path: str | Path) -> Clips:
     except (KeyError, OSError, ValueError) as error:
         raise ValueError(f"{path} must be a clip that `cloth import` wrote: {error}") from error
     unknown = np.array([-1])
-    return Clips(crops, direction, unknown, np.array([math.nan]), unknown, np.array([0]))
+    fabric = np.full((1, len(FABRIC)), math.nan)
+    return Clips(crops, direction, unknown, np.array([math.nan]), unknown, np.array([0]), fabric)
 
 
 # --- following the holders -------------------------------------------------------------------------------------

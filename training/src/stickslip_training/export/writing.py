@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from stickslip_schemas.store import sync
+
 from stickslip_training.export import croissant, hdf5
 from stickslip_training.export.content import Content, OnBytes
 
@@ -47,10 +49,10 @@ def made_whole(target: Path) -> Iterator[Path]:
     try:
         yield scratch
         for path in [scratch, *scratch.rglob("*")]:
-            _sync(path)
+            sync(path)
         _refuse_existing(target)
         scratch.rename(target)
-        _sync(target.parent)
+        sync(target.parent)
     finally:
         if scratch.is_dir():
             shutil.rmtree(scratch)
@@ -61,11 +63,3 @@ def made_whole(target: Path) -> Iterator[Path]:
 def _refuse_existing(target: Path) -> None:
     if os.path.lexists(target):
         raise FileExistsError(f"{target} exists, and an export overwrites nothing: name another place")
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -6,7 +6,7 @@ from functools import cache
 from importlib import metadata
 
 from stickslip_schemas.keys import content_key
-from stickslip_schemas.sources import LIST_OF_KINDS, digests, sources
+from stickslip_schemas.sources import UNCOUNTED, digests, sources
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.device import described
@@ -31,7 +31,7 @@ def build_digest(kind: str) -> str:
     """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
     content = {
         "kind": kind,
-        "sources": digests(sources(roots(kind), cut=LIST_OF_KINDS)),
+        "sources": digests(sources(roots(kind), cut=UNCOUNTED)),
         "raster": BUILD_HASH,
         "libraries": {library: metadata.version(library) for library in _LIBRARIES},
         **blender_version(),

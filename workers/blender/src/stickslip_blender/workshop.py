@@ -16,7 +16,7 @@ from stickslip_schemas.cameras import Camera, rig_digest
 from stickslip_schemas.chunks import encode_chunk
 from stickslip_schemas.codecs import encode_clip
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store, write_durably
+from stickslip_schemas.store import open_store, write_durably
 from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
 
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
@@ -51,8 +51,8 @@ class Workshop:
     there is one renderer at a time.
     """
 
-    def __init__(self, store_root: str, scratch: str | None = None) -> None:
-        self.store = Store(store_root)
+    def __init__(self, store: str, scratch: str | None = None) -> None:
+        self.store = open_store(store)
         self.traces: OrderedDict[str, Trace] = OrderedDict()
         """The last traces of cloth, by what they depend on: clips that differ in their texture share one."""
         self.scratch = scratch
@@ -69,6 +69,8 @@ class Workshop:
     def kept_trace(self, key: str) -> bytes | None:
         """Return a trace that any process kept in the store; None where there is none, or a damaged one."""
         path = self._trace_path(key)
+        if path is None:
+            return None
         try:
             data = path.read_bytes()
             path.touch()  # the oldest are deleted first
@@ -83,6 +85,8 @@ class Workshop:
         No result depends on it: where it cannot be written, only time is lost.
         """
         path = self._trace_path(key)
+        if path is None:
+            return
         with suppress(OSError):
             write_durably(path, hashlib.sha256(data).digest() + data)
             files = sorted(path.parent.glob("[0-9a-f]*"), key=lambda file: file.stat().st_mtime)
@@ -93,8 +97,8 @@ class Workshop:
                 room += file.stat().st_size
                 file.unlink(missing_ok=True)
 
-    def _trace_path(self, key: str) -> Path:
-        return self.store.root / "traces" / key
+    def _trace_path(self, key: str) -> Path | None:
+        return None if self.store.cache is None else self.store.cache / "traces" / key
 
     def record(self, record: RecordRef, *names: str) -> list[Array]:
         """Return one row of arrays of an artifact."""

@@ -3,7 +3,7 @@
 from typing import Any
 
 from pydantic import TypeAdapter
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import open_store
 from stickslip_schemas.tasks import Task, TaskResult
 
 from stickslip_workers import builds, progress
@@ -18,7 +18,7 @@ class StageActor:
     """Runs simulate, pack and publish."""
 
     def __init__(self, store: str) -> None:
-        self._store = Store(store)
+        self._store = open_store(store)
 
     def describe(self) -> dict[str, Any]:
         """Return the builds of what runs here, and versions for people."""

@@ -63,17 +63,17 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     text = card(manifest)
     files.append(FileEntry(path=CARD_NAME, sha256=store.publish(text), size=len(text)))
     manifest = manifest.model_copy(update={"files": tuple(sorted(files, key=lambda file: file.path))})
-    directory = store.dataset_path(task.dataset, task.version)
+    version = task.dataset, task.version
     for file in manifest.files:
-        store.link(file.sha256, directory / file.path)
+        store.show(file.sha256, *version, file.path)
     data = canonical_json(manifest.model_dump(mode="json")).encode()
     digest = store.publish(data)
     group = with_manifest_digest(group, digest)
     group_digest = store.publish(group)
     seal = seal_text(digest, group_digest)
-    store.link(group_digest, directory / GROUP_NAME)
-    store.link(store.publish(seal), directory / SEAL_NAME)
-    store.link(digest, directory / MANIFEST_NAME)
+    store.show(group_digest, *version, GROUP_NAME)
+    store.show(store.publish(seal), *version, SEAL_NAME)
+    store.show(digest, *version, MANIFEST_NAME)
     return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size + len(data) + len(group) + len(seal))
 
 

@@ -64,7 +64,7 @@ def get_certificate(digest: str, request: Request, coordinator: CoordinatorDep) 
     """Return a certificate."""
     with coordinator.database.read() as connection:
         artifact = find_certificate(connection, digest).artifact
-    return serve(request, coordinator.store.path(artifact), artifact, name="certificate.json")
+    return serve(request, coordinator.store, artifact, name="certificate.json")
 
 
 @router.get("/v1/certificates/{digest}/page", response_class=Response, responses=_file_responses(_PAGE))
@@ -72,6 +72,6 @@ def get_certificate_page(digest: str, request: Request, coordinator: Coordinator
     """Return the page of a certificate."""
     with coordinator.database.read() as connection:
         artifact = find_certificate(connection, digest).page
-    response = serve(request, coordinator.store.path(artifact), artifact, name="certificate.html")
+    response = serve(request, coordinator.store, artifact, name="certificate.html")
     response.headers.update(_INERT)
     return response

@@ -106,8 +106,8 @@ def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> R
     with coordinator.database.read() as connection:
         if not (is_sha256(digest) and is_preview(connection, digest)):
             raise NotFoundError(f"there is no preview {digest[:100]!r}")
-    path = coordinator.store.path(digest)
-    return serve(request, path, digest, name=f"preview.{picture_format(path)}")
+    name = f"preview.{picture_format(coordinator.store, digest)}"
+    return serve(request, coordinator.store, digest, name=name)
 
 
 def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> FileEntry:
@@ -118,4 +118,4 @@ def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> Fi
 
 def _serve(request: Request, coordinator: CoordinatorDep, dataset: str, version: int, path: str) -> Response:
     file = _find(coordinator, dataset, version, path)
-    return serve(request, coordinator.store.path(file.sha256), file.sha256, name=path)
+    return serve(request, coordinator.store, file.sha256, name=path, size=file.size)

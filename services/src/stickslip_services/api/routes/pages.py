@@ -3,7 +3,6 @@
 import asyncio
 import json
 import pathlib
-import shutil
 from collections.abc import AsyncIterator, Iterator, Mapping
 from functools import lru_cache
 from itertools import islice
@@ -498,8 +497,7 @@ def _workers(coordinator: Coordinator) -> dict[str, Any]:
             for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
             if entry.extent == "full" and entry.passed
         }
-    root = coordinator.store.root
-    disk = shutil.disk_usage(root if root.exists() else coordinator.settings.data)
+    disk = coordinator.store.room()
     now = as_datetime(coordinator.clock())
     return {"workers": workers, "certified": certified, "disk": disk, "memory": _memory(), "now": now}
 

@@ -1,0 +1,34 @@
+"""The store: artifacts whole or not at all, and never with other bytes than their name says."""
+
+from stickslip_schemas.store.base import (
+    CorruptArtifactError,
+    Room,
+    ShownVersion,
+    Span,
+    Store,
+    Stored,
+    artifact_name,
+    is_unavailable,
+    shown_name,
+    version_name,
+)
+from stickslip_schemas.store.directory import DirectoryStore, sync, write_durably
+from stickslip_schemas.store.opening import open_store, store_place
+
+__all__ = [
+    "CorruptArtifactError",
+    "DirectoryStore",
+    "Room",
+    "ShownVersion",
+    "Span",
+    "Store",
+    "Stored",
+    "artifact_name",
+    "is_unavailable",
+    "open_store",
+    "shown_name",
+    "store_place",
+    "sync",
+    "version_name",
+    "write_durably",
+]

@@ -1,0 +1,235 @@
+"""A store in a directory, which several machines may share.
+
+A file is written beside its place, made durable, then renamed. A version is a directory of hard links, so that it takes
+no room and any Zarr reader opens it.
+"""
+
+import hashlib
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from stickslip_schemas.keys import is_sha256, sha256
+from stickslip_schemas.store.base import (
+    ARTIFACTS,
+    DATASETS,
+    VERSION,
+    CorruptArtifactError,
+    Room,
+    ShownVersion,
+    Span,
+    Stored,
+    artifact_name,
+    shown_name,
+    version_name,
+)
+
+BLOCK = 1 << 18
+"""How much of an artifact is held in memory while it is sent [bytes]."""
+
+_PROBE_BYTES = 4096
+
+
+class DirectoryStore:
+    """Artifacts below `root/artifacts` and versions below `root/datasets`; see `Store`."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+
+    @property
+    def place(self) -> str:
+        """See `Store`."""
+        return str(self.root)
+
+    @property
+    def cache(self) -> Path:
+        """See `Store`."""
+        return self.root
+
+    def path(self, digest: str) -> Path:
+        """Return where the artifact lies or would lie."""
+        return self.root / artifact_name(digest)
+
+    def dataset_path(self, dataset: str, version: int) -> Path:
+        """Return the directory of a dataset version."""
+        return self.root / version_name(dataset, version)
+
+    def publish(self, data: bytes) -> str:
+        """See `Store`. An artifact that is there already is read and compared."""
+        digest = sha256(data)
+        if not self.holds(digest, size=len(data)):
+            write_durably(self.path(digest), data)
+        return digest
+
+    def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
+        """See `Store`."""
+        if offset != 0 or length is not None:
+            return self.read_many(digest, [Span(offset, self.size(digest) - offset if length is None else length)])[0]
+        data = self.path(digest).read_bytes()
+        if sha256(data) != digest:
+            raise CorruptArtifactError(f"artifact {digest} has other bytes than its name says")
+        return data
+
+    def read_many(self, digest: str, spans: Sequence[Span]) -> list[bytes]:
+        """See `Store`."""
+        parts = []
+        with self.path(digest).open("rb") as file:
+            for offset, length in spans:
+                parts.append(os.pread(file.fileno(), length, offset))
+                if len(parts[-1]) != length:
+                    raise CorruptArtifactError(f"artifact {digest} ends before {offset} + {length}")
+        return parts
+
+    def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
+        """See `Store`."""
+        with self.path(digest).open("rb") as file:
+            file.seek(start)
+            while start < stop:
+                block = file.read(min(BLOCK, stop - start))
+                if not block:
+                    raise CorruptArtifactError(f"artifact {digest} ends before {stop}")
+                start += len(block)
+                yield block
+
+    def size(self, digest: str) -> int:
+        """See `Store`."""
+        return self.path(digest).stat().st_size
+
+    def exists(self, digest: str, *, size: int = 0) -> bool:
+        """See `Store`."""
+        try:
+            return self.size(digest) >= size
+        except OSError:
+            return False
+
+    def holds(self, digest: str, *, size: int | None = None) -> bool:
+        """See `Store`."""
+        try:
+            with self.path(digest).open("rb") as file:
+                if size is not None and os.fstat(file.fileno()).st_size != size:
+                    return False
+                return hashlib.file_digest(file, "sha256").hexdigest() == digest
+        except OSError:
+            return False
+
+    def delete(self, name: str) -> None:
+        """See `Store`."""
+        self.path(name).unlink(missing_ok=True)
+
+    def stored(self) -> Iterator[Stored]:
+        """See `Store`. Files with names that no store gives are left out."""
+        for path in sorted((self.root / ARTIFACTS).glob("*/*")):
+            try:
+                is_ours = path == self.path(path.name)
+                status = path.stat()
+            except (ValueError, FileNotFoundError):  # of somebody else, or a writer has finished with it
+                continue
+            if is_ours:
+                is_shown = is_sha256(path.name) and status.st_nlink > 1
+                yield Stored(path.name, status.st_size, status.st_mtime, is_shown)
+
+    def url(self, digest: str, *, seconds: float) -> str | None:
+        """See `Store`: there is none."""
+        artifact_name(digest)
+        return None
+
+    def show(self, digest: str, dataset: str, version: int, path: str) -> None:
+        """See `Store`. Where the file system has no hard links, the bytes are written a second time."""
+        target = self.root / shown_name(dataset, version, path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        scratch = _scratch_path(target)
+        try:
+            os.link(self.path(digest), scratch)
+        except OSError:
+            write_durably(target, self.read(digest))
+            return
+        scratch.replace(target)
+        scratch.unlink(missing_ok=True)  # replace() does nothing where both names are one file already
+
+    def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
+        """See `Store`."""
+        place = self.root / shown_name(dataset, version, path)
+        with suppress(OSError):
+            if place.samefile(self.path(digest)):
+                return True
+        try:
+            return sha256(place.read_bytes()) == digest
+        except OSError:
+            return False
+
+    def read_shown(self, dataset: str, version: int, path: str) -> bytes:
+        """See `Store`."""
+        return (self.root / shown_name(dataset, version, path)).read_bytes()
+
+    def versions(self, path: str) -> Iterator[ShownVersion]:
+        """See `Store`."""
+        for place in sorted(self.root.glob(f"{DATASETS}/*/v*/{path}")):
+            dataset, version = place.relative_to(self.root / DATASETS).parts[:2]
+            if VERSION.fullmatch(version):
+                yield ShownVersion(dataset, int(version[1:]), place.stat().st_mtime)
+
+    def hide(self, dataset: str, version: int) -> None:
+        """See `Store`."""
+        directory = self.dataset_path(dataset, version)
+        if directory.is_dir():
+            shutil.rmtree(directory)
+            if not any(directory.parent.iterdir()):
+                directory.parent.rmdir()
+
+    def is_shown(self, dataset: str, version: int) -> bool:
+        """See `Store`."""
+        return any(path.is_file() for path in self.dataset_path(dataset, version).rglob("*"))
+
+    def room(self) -> Room:
+        """See `Store`: that of the disk."""
+        place = self.root
+        while not place.exists():
+            place = place.parent
+        return Room(*shutil.disk_usage(place))
+
+    def probe(self) -> None:
+        """See `Store`."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        path = self.root / f".probe-{os.getpid()}"
+        try:
+            with path.open("wb") as file:
+                file.write(bytes(_PROBE_BYTES))
+                file.flush()
+                os.fsync(file.fileno())
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:
+    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename, fsync directory.
+
+    `mode` are its permissions, less those that the umask takes away.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = _scratch_path(path)
+    try:
+        with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a directory, as they are now."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _scratch_path(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")

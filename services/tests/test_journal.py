@@ -1,0 +1,122 @@
+"""The journal: every change has a line that says whose it was, and no line is ever changed."""
+
+import json
+import time
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import delete, update
+from sqlalchemy.exc import DBAPIError
+from stickslip_services.cli import app
+from stickslip_services.coordinator import make_app
+from stickslip_services.database.tables import journal
+from stickslip_services.journal import NOBODY, acting, read_journal
+from stickslip_services.keys import create_key, revoke_key
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.scopes import Scope
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, parsed, rods, serving
+from stickslip_services.webhooks import create_webhook, delete_webhook, retry_webhook
+from typer.testing import CliRunner
+
+pytestmark = pytest.mark.databases
+
+
+def lines(coordinator: Coordinator, subject: str | None = None) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return who did what, the oldest first."""
+    with coordinator.database.read() as connection:
+        found = read_journal(connection, subject=subject)
+    return [(line.actor, line.action, line.details) for line in reversed(found)]
+
+
+def test_every_change_of_a_job_has_its_line(coordinator: Coordinator, worker: PretendWorker) -> None:
+    with acting("key-1 ada"):
+        job = coordinator.submit(parsed(rods(name="hers")), None, priority=3).id  # type: ignore[union-attr]
+        coordinator.pause(job)
+    with acting("key-2 bert"):
+        coordinator.resume(job)
+        coordinator.prioritise(job, 7)
+        coordinator.cancel(job)
+    assert lines(coordinator, job) == [
+        ("key-1 ada", "job.submit", {"name": "hers", "samples": 4, "priority": 3}),
+        ("key-1 ada", "job.pause", {}),
+        ("key-2 bert", "job.resume", {}),
+        ("key-2 bert", "job.prioritise", {"priority": 7}),
+        ("key-2 bert", "job.cancel", {}),
+    ]
+
+
+def test_what_is_refused_or_fails_leaves_no_line(coordinator: Coordinator, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
+    with pytest.raises(Exception, match="has changed since"):
+        coordinator.pause(job, if_match=['"another"'])
+    monkeypatch.setattr("stickslip_services.queue.coordinator.cancel_job", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        coordinator.cancel(job)
+    again = coordinator.submit(parsed(rods()), "the same")
+    replayed = coordinator.submit(parsed(rods()), "the same")
+    assert type(replayed) is not type(again)
+    assert [action for _, action, _ in lines(coordinator)] == ["job.submit", "job.submit"]
+
+
+def test_keys_and_webhooks_have_lines(coordinator: Coordinator) -> None:
+    with acting("user ada"), coordinator.database.write() as connection:
+        key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
+        revoke_key(connection, key.id, 2.0)
+        hook, sign = create_webhook(connection, "https://example.org/hook", 3.0)
+        retry_webhook(connection, hook.id, 4.0)
+        delete_webhook(connection, hook.id, 5.0)
+    found = lines(coordinator)
+    assert [(actor, action) for actor, action, _ in found] == [
+        ("user ada", action)
+        for action in ("key.create", "key.revoke", "webhook.create", "webhook.retry", "webhook.delete")
+    ]
+    assert found[0][2] == {"name": "bert", "scopes": ["read", "submit"]}
+    assert not any(secret in json.dumps(found) for secret in (secret, sign))
+
+
+@pytest.mark.parametrize("change", [update(journal).values(actor="nobody"), delete(journal)])
+def test_no_line_can_be_changed(coordinator: Coordinator, change: Any) -> None:
+    coordinator.submit(parsed(rods()), None)
+    before = lines(coordinator)
+    with (
+        pytest.raises(DBAPIError, match="the journal can only be added to"),
+        coordinator.database.write() as connection,
+    ):
+        connection.execute(change)
+    assert lines(coordinator) == before != []
+
+
+def test_requests_are_told_apart_by_their_keys(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when many come at once: each is noted with its own."""
+    application = make_app(settings.model_copy(update={"require_keys": True}))
+    with serving(application) as url:
+        with application.state.coordinator.database.write() as connection:
+            made = [create_key(connection, name, [Scope.submit], time.time()) for name in ("ada", "bert")]
+        time.sleep(1.1)  # so long a key may take to count
+        for _ in range(3):
+            for _, secret in made:
+                headers = {"Authorization": f"Bearer {secret}"}
+                answer = httpx.post(f"{url}/v1/jobs", json=rods(), headers=headers, trust_env=False, timeout=30)
+                assert answer.status_code == 202, answer.text
+        found = [actor for actor, action, _ in lines(application.state.coordinator) if action == "job.submit"]
+    assert found == [f"{made[number % 2][0].id} {('ada', 'bert')[number % 2]}" for number in range(6)]
+
+
+def test_the_command_line_shows_it(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    def cli(*words: str) -> Any:
+        result = CliRunner().invoke(app, [*words, "--data", str(settings.data)], env={"COLUMNS": "200"})
+        assert result.exit_code == 0, result.output
+        return result
+
+    monkeypatch.setattr("getpass.getuser", lambda: "ada")
+    cli("keys", "create", "bert", "--scope", "read")
+    with serving(make_app(settings)) as url:
+        job = httpx.post(f"{url}/v1/jobs", json=rods(), trust_env=False, timeout=30).json()["id"]
+    (line,) = (json.loads(text) for text in cli("journal", job, "--json").stdout.splitlines())
+    assert (line["actor"], line["action"], line["subject"]) == (NOBODY, "job.submit", job)
+    shown = cli("journal").stdout
+    assert "user ada" in shown
+    assert "key.create" in shown
+    assert len(cli("journal", "--json", "--limit", "1").stdout.splitlines()) == 1

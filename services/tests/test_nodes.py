@@ -1,0 +1,206 @@
+"""Two coordinators and two workers on one PostgreSQL database and one bucket: kill -9 any of them, again and again.
+
+The workers only pretend to simulate and to render, but lease, publish and report as dispatchers do.
+tests/test_chaos.py does the same with real ones, and takes hours where this takes minutes.
+
+STICKSLIP_KILLS=100 pytest -m slow services/tests/test_nodes.py -s
+"""
+
+import os
+import random
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import httpx
+import pytest
+from sqlalchemy import select
+from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.store import open_store
+from stickslip_services import upkeep
+from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.catalog.versions import damaged_files
+from stickslip_services.database.opening import connect
+from stickslip_services.database.tables import dataset_versions
+from stickslip_services.local.sockets import listen
+from stickslip_services.queue.audit import audit
+from stickslip_services.settings import Settings
+from stickslip_services.testing import rods, wait_until
+
+if TYPE_CHECKING:
+    from stickslip_schemas.testing_s3 import Proxy
+    from stickslip_services.testing_postgresql import PostgresqlServer
+
+KILLS = int(os.environ.get("STICKSLIP_KILLS", "30"))
+SAMPLES = 60
+"""Samples of each of the jobs that run while processes are killed."""
+FAULTS = {"503": 0.02, "late": 0.01, "lost answer": 0.01}
+"""Shares of all requests to the bucket."""
+
+WORKER = """
+import sys, time
+import httpx
+from stickslip_schemas.store import open_store
+from stickslip_services.testing import HttpApi, PretendWorker
+
+name, key, place, url = sys.argv[1:]
+store = open_store(place)
+while True:
+    try:
+        worker = PretendWorker(HttpApi(url, key), store, name=name, whole=False).register()
+        while True:
+            leases = worker.lease(simulate=4, render=4, pack=1, publish=1)
+            worker.start(*leases)
+            for lease in leases:
+                worker.finish(lease)
+            time.sleep(0 if leases else 0.1)
+    except httpx.HTTPError:
+        time.sleep(0.1)
+"""
+
+
+class Node:
+    """A process that is started again when it has been killed."""
+
+    def __init__(self, name: str, words: list[str], log: Path) -> None:
+        self.name = name
+        self._words = words
+        self._log = log
+        self.start()
+
+    def start(self) -> None:
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen([sys.executable, *self._words], stdout=log, stderr=log)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
+def free_port() -> int:
+    with listen("127.0.0.1", 0) as listener:
+        return int(listener.getsockname()[1])
+
+
+@pytest.fixture
+def settings(
+    tmp_path: Path, bucket: str, s3: "Proxy", postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch
+) -> Settings:
+    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.clean())
+    s3.some(1, FAULTS)
+    return Settings.chosen(data=tmp_path / "a", store=bucket, durable=False)
+
+
+@pytest.fixture
+def urls() -> list[str]:
+    return [f"http://127.0.0.1:{free_port()}" for _ in range(2)]
+
+
+@pytest.fixture
+def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
+    place = settings.data.parent
+    made = []
+    for name, url in zip(("a", "b"), urls, strict=True):
+        words = ["-m", "stickslip_services.coordinator", "--data", str(place / name), "--port", url.rsplit(":", 1)[1]]
+        words += ["--store", settings.store_place]
+        made.append(Node(f"coordinator {name}", words, place / f"{name}.log"))
+    try:
+        for name, url in zip(("a", "b"), urls, strict=True):
+            wait_until(lambda url=url: is_ready(url), seconds=120)  # type: ignore[misc]
+            key = (place / name / "worker-key").read_text().strip()
+            words = ["-c", WORKER, f"worker-{name}", key, settings.store_place, url]
+            made.append(Node(f"worker {name}", words, place / f"worker-{name}.log"))
+        yield made
+    finally:
+        for node in made:
+            node.kill()
+
+
+def is_ready(url: str) -> bool:
+    with suppress(httpx.TransportError):
+        return httpx.get(f"{url}/readyz", trust_env=False).status_code == 200
+    return False
+
+
+def asked(urls: list[str], ask: Callable[[str], httpx.Response]) -> httpx.Response:
+    """Return the answer of the first coordinator that is there."""
+    end = time.monotonic() + 120
+    while time.monotonic() < end:
+        for url in random.sample(urls, 2):
+            with suppress(httpx.TransportError):
+                answer = ask(url)
+                if answer.status_code < 500:
+                    answer.raise_for_status()
+                    return answer
+        time.sleep(0.05)
+    raise AssertionError("no coordinator answers")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300 + 60 * KILLS)
+def test_every_sample_once_whoever_is_killed(
+    settings: Settings, urls: list[str], nodes: list[Node], s3: "Proxy", capsys: pytest.CaptureFixture[str]
+) -> None:
+    random.seed(int(os.environ.get("STICKSLIP_SEED", "0")))
+    jobs: list[str] = []
+    kills: Counter[str] = Counter()
+
+    def job(name: str) -> dict[str, object]:
+        return dict(asked(urls, lambda url: httpx.get(f"{url}/v1/jobs/{name}", trust_env=False, timeout=60)).json())
+
+    def done() -> int:
+        """Return how many tasks there are results of; keep a job at work."""
+        if not jobs or job(jobs[-1])["finished_at"] is not None:
+            spec = rods(gamma=tuple(float(number) for number in range(1, SAMPLES + 1)), phi1=(1.0 + len(jobs),))
+            spec["samples_per_shard"] = 10
+            headers = {"Idempotency-Key": f"job {len(jobs)}"}  # it may be killed before it answers
+            answer = asked(
+                urls, lambda url: httpx.post(f"{url}/v1/jobs", json=spec, headers=headers, trust_env=False, timeout=60)
+            )
+            jobs.append(answer.json()["id"])
+        text = asked(urls, lambda url: httpx.get(f"{url}/metrics", trust_env=False, timeout=60)).text
+        lines = [line for line in text.splitlines() if line.startswith("stickslip_tasks{")]
+        return sum(int(float(line.split()[-1])) for line in lines if 'state="succeeded"' in line)
+
+    longest = 0.0
+    before = done()
+    wait_until(lambda: done() > before, seconds=120)
+    for _ in range(KILLS):
+        time.sleep(random.uniform(0.0, 1.0))
+        victim = random.choice(nodes)
+        victim.kill()
+        kills[victim.name] += 1
+        time.sleep(random.choice([0.0, 0.5]))
+        victim.start()
+        before, begin = done(), time.monotonic()
+        wait_until(lambda before=before: done() > before, seconds=120)  # type: ignore[misc]
+        longest = max(longest, time.monotonic() - begin)
+    wait_until(lambda: all(job(name)["finished_at"] is not None for name in jobs), seconds=300)
+    assert [job(name)["state"] for name in jobs] == ["succeeded"] * len(jobs)
+    for node in nodes:
+        node.kill()
+
+    database, store = connect(settings), open_store(settings.store_place)
+    words = ["gc", "--older-than", "0", "--data", str(settings.data), "--store", settings.store_place]
+    assert upkeep.main([*words, "--delete"]) == 0  # what calls that were killed had written
+    capsys.readouterr()
+    assert upkeep.main(words) == 0
+    assert capsys.readouterr().out.startswith("0 files")
+    with database.read() as connection:
+        assert audit(connection) == []
+        versions = connection.execute(select(dataset_versions)).all()
+    database.close()
+    assert len(versions) == len(jobs)
+    for version in versions:
+        manifest = Manifest.model_validate_json(store.read(version.manifest))
+        assert len(set(manifest.sample_keys)) == manifest.valid_count == SAMPLES
+        assert damaged_files(store, version.manifest, version.group_digest) == frozenset()
+    with capsys.disabled():
+        faults = {name: s3.counts[name] for name in FAULTS}
+        print(f"\n{KILLS} kills ({dict(kills)}), {faults} of {s3.counts['']} requests to the bucket failed")
+        print(f"{len(jobs)} jobs, each of {len(jobs) * SAMPLES} samples once; longest wait {longest:.1f} s")

@@ -1,0 +1,185 @@
+"""A store by its URL: everything that takes `--store` uses a bucket, or refuses in a sentence."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+import zarr.storage
+from stickslip_schemas.responses import JobDetail
+from stickslip_schemas.states import JobState, Reason
+from stickslip_services import coordinator as program
+from stickslip_services import upkeep
+from stickslip_services.catalog.versions import damaged_files
+from stickslip_services.cli import app
+from stickslip_services.coordinator import make_app
+from stickslip_services.errors import SettingsError
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.store_watch import PROBE_SECONDS
+from stickslip_services.settings import Settings
+from stickslip_services.testing import ManualClock, PretendWorker, list_datasets, parsed, rods, serving, show_job
+from typer.testing import CliRunner
+
+pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+
+import obstore.store
+from stickslip_schemas.testing_s3 import Proxy, no_fault
+
+REFUSAL = r"store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3:/lab/store'"
+
+
+@pytest.mark.parametrize(
+    "command", [["up"], ["gc"], ["rm", "ds-0123456789abcdef:v1"], ["reindex"], ["coordinator"], ["upkeep", "gc"]]
+)
+def test_a_place_that_is_no_store_is_refused(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    verb, *rest = command
+    words = [*rest, "--data", "data", "--store", "s3:/lab/store"]
+    mains = {"coordinator": program.main, "upkeep": upkeep.main}
+    if verb in mains:
+        status, said = mains[verb](words), ""
+    else:
+        result = CliRunner().invoke(app, [verb, *words], env={"COLUMNS": "200"})
+        status, said = result.exit_code, result.output
+    assert status != 0
+    assert re.search(REFUSAL, said + capfd.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_environment_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STICKSLIP_STORE", "s3:/lab/store")
+    with pytest.raises(SettingsError, match=REFUSAL):
+        Settings.chosen(data=tmp_path)
+
+
+@pytest.fixture
+def in_bucket(bucket: str, tmp_path: Path) -> Settings:
+    return Settings.chosen(data=tmp_path / "data", store=bucket, durable=False)
+
+
+def objects(bucket: str) -> dict[str, float]:
+    """Return the names of all objects of a bucket, and when they were written."""
+    root = obstore.store.S3Store(bucket.removeprefix("s3://").partition("/")[0])
+    return {item["path"]: item["last_modified"].timestamp() for page in obstore.list(root) for item in page}
+
+
+def submitted(coordinator: Coordinator, gamma: tuple[float, ...]) -> JobDetail:
+    job = coordinator.submit(parsed(rods(gamma=gamma)), None)
+    assert isinstance(job, JobDetail)
+    return job
+
+
+def test_a_bucket_is_a_store_like_any_other(
+    in_bucket: Settings, bucket: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Make two datasets, read one, remove one, collect, lose the database, and find the other one again."""
+    coordinator = Coordinator(in_bucket)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    names = []
+    for gamma in ((1.0, 2.0), (2.0, 3.0)):
+        job = submitted(coordinator, gamma)
+        worker.work()
+        dataset = show_job(coordinator, job.id).dataset
+        assert dataset is not None
+        names.append(dataset.dataset)
+    stray = coordinator.store.publish(b"nobody refers to this")
+    coordinator.close()
+    assert not (tmp_path / "data" / "store").exists()
+
+    with serving(make_app(in_bucket)) as url:
+        served = zarr.open_group(f"{url}/v1/datasets/{names[0]}/versions/1/files/", mode="r")["mu"]
+        assert isinstance(served, zarr.Array)
+        assert np.array_equal(served[:], np.arange(4.0))
+    host, _, prefix = bucket.removeprefix("s3://").partition("/")
+    place = obstore.store.S3Store(host, prefix=f"{prefix}/datasets/{names[0]}/v1")
+    kept = zarr.open_group(zarr.storage.ObjectStore(place, read_only=True), mode="r")["mu"]
+    assert isinstance(kept, zarr.Array)
+    assert np.array_equal(kept[:], np.arange(4.0))
+
+    place_options = ["--data", str(in_bucket.data), "--store", bucket]
+    assert upkeep.main(["gc", "--delete", "--older-than", "0", *place_options]) == 0
+    assert not any(stray in name for name in objects(bucket))
+    assert upkeep.main(["rm", f"{names[1]}:v1", *place_options]) == 0
+    assert not any(names[1] in name for name in objects(bucket))
+    assert upkeep.main(["gc", "--delete", "--older-than", "0", *place_options]) == 0
+    assert upkeep.main(["gc", "--older-than", "0", *place_options]) == 0
+    assert "0 files, 0.0 MB, that nothing refers to may be deleted" in capfd.readouterr().out
+
+    in_bucket.database_path.unlink()
+    assert program.main(["--port", "0", *place_options]) == 2
+    said = capfd.readouterr().err
+    assert f"{bucket} holds datasets, and the database" in said
+    assert "run `stickslip reindex" in said
+    assert program.main(["--reindex", *place_options]) == 0
+    assert f"{names[0]}:v1  4 samples" in capfd.readouterr().out
+    coordinator = Coordinator(in_bucket)
+    coordinator.start()
+    (found,) = list_datasets(coordinator)
+    (version,) = found.versions
+    assert found.id == names[0]
+    assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
+    coordinator.close()
+
+
+def test_what_a_version_shows_is_kept_though_no_database_knows_it(in_bucket: Settings, bucket: str) -> None:
+    """A database from an old backup knows less than the bucket."""
+    coordinator = Coordinator(in_bucket)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    submitted(coordinator, (1.0, 2.0))
+    worker.work()
+    coordinator.close()
+    in_bucket.database_path.unlink()
+    fresh = Coordinator(in_bucket)
+    fresh.start()
+    PretendWorker(fresh, fresh.store).register()
+    submitted(fresh, (5.0,))  # it is in use, and knows nothing of what was made before
+    fresh.close()
+    before = {name for name in objects(bucket) if "/datasets/" in name}
+    assert upkeep.main(["gc", "--delete", "--older-than", "0", "--data", str(in_bucket.data), "--store", bucket]) == 0
+    assert {name for name in objects(bucket) if "/datasets/" in name} == before
+    assert program.main(["--reindex", "--data", str(in_bucket.data), "--store", bucket]) == 0
+
+
+def test_jobs_wait_while_the_bucket_is_away(in_bucket: Settings, s3: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stickslip_schemas.store.bucket.PROBE_PATIENCE", 0.5)
+    clock = ManualClock()
+    coordinator = Coordinator(in_bucket, clock)
+    coordinator.start()
+    worker = PretendWorker(coordinator, coordinator.store).register()
+    job = submitted(coordinator, (1.0,)).id
+    coordinator.sweep()
+    asked = s3.counts["PUT"]
+    coordinator.sweep()
+    assert s3.counts["PUT"] == asked  # a look costs money
+
+    s3.fault = lambda method, path: "503"
+    clock.advance(PROBE_SECONDS)
+    coordinator.sweep()
+    shown = show_job(coordinator, job)
+    assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
+    assert in_bucket.store_place in shown.message
+    assert worker.lease() == ()
+
+    s3.fault = no_fault
+    coordinator.sweep()
+    worker.work()
+    assert show_job(coordinator, job).state is JobState.succeeded
+    coordinator.close()
+
+
+def test_a_new_coordinator_wants_an_answer_of_its_bucket(
+    bucket: str, s3: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It must not start an empty queue beside datasets that it cannot see."""
+    monkeypatch.setattr("stickslip_schemas.store.bucket.PATIENCE", 0.5)
+    words = ["--data", str(tmp_path / "data"), "--port", "0", "--store"]
+    assert program.main([*words, "s3://nobody-has-made-this/store"]) == 2
+    assert "cannot be asked whether it holds datasets" in capfd.readouterr().err
+    s3.fault = lambda method, path: "503"
+    assert program.main([*words, bucket]) == 2
+    assert f"the store {bucket} cannot be asked" in capfd.readouterr().err

@@ -1,0 +1,227 @@
+"""Webhooks: everything is told, in order and signed, whatever receivers and coordinators do."""
+
+import json
+import threading
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from standardwebhooks import Webhook as Verifier
+from stickslip_services.cli import app
+from stickslip_services.errors import SettingsError
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, parsed, rods, wait_until
+from stickslip_services.webhooks import (
+    CLAIM_SECONDS,
+    GIVE_UP_SECONDS,
+    WAITS,
+    Messenger,
+    create_webhook,
+    list_webhooks,
+    retry_webhook,
+)
+from typer.testing import CliRunner
+
+pytestmark = pytest.mark.databases
+
+
+class Receiver:
+    """Keeps what it is sent, and answers as it is told."""
+
+    def __init__(self) -> None:
+        self.status = 204
+        self.received: list[tuple[dict[str, str], str]] = []
+        receiver = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                body = self.rfile.read(int(self.headers["Content-Length"])).decode()
+                receiver.received.append(({name.lower(): value for name, value in self.headers.items()}, body))
+                self.send_response(receiver.status)
+                self.end_headers()
+
+            def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/hook"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    @property
+    def told(self) -> list[tuple[str, str]]:
+        """The sort of each message, and the state or the dataset that it tells."""
+        documents = [json.loads(body) for _, body in self.received]
+        return [(one["type"], one["data"].get("state", "v1")) for one in documents]
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    made = Receiver()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def messenger(coordinator: Coordinator) -> Messenger:
+    return Messenger(coordinator.database, coordinator.clock)
+
+
+def made(coordinator: Coordinator, url: str) -> tuple[str, str]:
+    """Make a webhook; return its id and its secret."""
+    with coordinator.database.write() as connection:
+        webhook, secret = create_webhook(connection, url, coordinator.clock())
+    return webhook.id, secret
+
+
+def run_job(coordinator: Coordinator, worker: PretendWorker, gamma: float) -> None:
+    coordinator.submit(parsed(rods(gamma=(gamma,), name="of-a-test")), None)
+    worker.work()
+
+
+ONE_JOB = [("job.state", "running"), ("dataset.published", "v1"), ("job.state", "succeeded")]
+
+
+def test_what_happens_is_told_in_order_and_signed(
+    coordinator: Coordinator, worker: PretendWorker, messenger: Messenger, receiver: Receiver
+) -> None:
+    run_job(coordinator, worker, 1.0)  # before anybody wanted to know
+    name, secret = made(coordinator, receiver.url)
+    messenger.deliver()
+    assert receiver.told == []
+    run_job(coordinator, worker, 2.0)
+    messenger.deliver()
+    messenger.deliver()
+    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    ids = [headers["webhook-id"] for headers, _ in receiver.received]
+    assert len(set(ids)) == len(ids)
+    for headers, body in receiver.received:
+        at = datetime.fromtimestamp(int(headers["webhook-timestamp"]), UTC)
+        assert headers["webhook-signature"] == Verifier(secret).sign(headers["webhook-id"], at, body)
+        assert headers["webhook-id"].startswith(f"msg_{name}_")
+        document = json.loads(body)
+        assert document["data"]["name"] == "of-a-test"
+        assert document["data"]["job"].startswith("job-")
+    published = json.loads(receiver.received[-2][1])["data"]["dataset"]
+    assert published["version"] == 1
+
+
+def test_a_message_that_fails_holds_up_the_others_and_is_sent_again(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+) -> None:
+    made(coordinator, receiver.url)
+    receiver.status = 500
+    run_job(coordinator, worker, 1.0)
+    for wait in (*WAITS, WAITS[-1]):
+        before = len(receiver.received)
+        messenger.deliver()
+        messenger.deliver()
+        assert len(receiver.received) == before + 1
+        clock.advance(wait - 1)
+        messenger.deliver()
+        assert len(receiver.received) == before + 1
+        clock.advance(1)
+    assert len({headers["webhook-id"] for headers, _ in receiver.received}) == 1
+    with coordinator.database.read() as connection:
+        (shown,) = list_webhooks(connection, clock())
+    assert (shown.failures, shown.is_given_up) == (len(WAITS) + 1, False)
+    assert shown.fault == "the receiver answered 500, and 2xx was expected"
+    receiver.status = 200
+    receiver.received.clear()
+    messenger.deliver()
+    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    with coordinator.database.read() as connection:
+        (shown,) = list_webhooks(connection, clock())
+    assert (shown.failures, shown.failing_since, shown.fault) == (0, None, "")
+
+
+def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherwise(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+) -> None:
+    name, _ = made(coordinator, receiver.url)
+    receiver.status = 503
+    run_job(coordinator, worker, 1.0)
+    end = clock() + GIVE_UP_SECONDS
+    while clock() <= end:
+        messenger.deliver()
+        clock.advance(WAITS[-1])
+    receiver.status = 200
+    receiver.received.clear()
+    messenger.deliver()
+    assert receiver.received == []
+    with coordinator.database.write() as connection:
+        assert list_webhooks(connection, clock())[0].is_given_up
+        retry_webhook(connection, name, clock())
+    messenger.deliver()
+    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+
+
+def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one_dies(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+) -> None:
+    made(coordinator, receiver.url)
+    run_job(coordinator, worker, 1.0)
+    other = Messenger(coordinator.database, coordinator.clock)
+    with messenger._claimed(1) as is_ours:  # and here it is killed
+        assert is_ours
+    other.deliver()
+    assert receiver.received == []
+    clock.advance(CLAIM_SECONDS)
+    threads = [threading.Thread(target=one.deliver) for one in (messenger, other)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+
+
+def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+) -> None:
+    receiver.close()
+    made(coordinator, receiver.url)
+    run_job(coordinator, worker, 1.0)
+    messenger.deliver()
+    with coordinator.database.read() as connection:
+        (shown,) = list_webhooks(connection, clock())
+    assert "ConnectError" in shown.fault
+
+
+@pytest.mark.parametrize("url", ["http://example.org/hook", "ftp://127.0.0.1/", "https://", "hook", "http://[", ""])
+def test_urls_that_anybody_could_read_are_refused(coordinator: Coordinator, url: str) -> None:
+    with pytest.raises(SettingsError, match="url must be https"):
+        made(coordinator, url)
+
+
+def test_the_command_line_makes_and_a_coordinator_delivers(
+    server: RunningServer, receiver: Receiver, tmp_path: Path
+) -> None:
+    def cli(*arguments: str) -> Any:
+        words = ["webhooks", *arguments, "--data", str(server.data)]
+        return CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+
+    secret = cli("create", receiver.url).stdout.strip()
+    assert secret.startswith("whsec_")
+    listed = cli("list").stdout
+    assert receiver.url in listed
+    assert secret not in listed
+    httpx.post(f"{server.url}/v1/jobs", json=rods(), trust_env=False).raise_for_status()
+    worker = server.worker()
+    wait_until(lambda: worker.work() > 0)
+    wait_until(lambda: receiver.told[-1:] == [("job.state", "succeeded")])
+    for headers, body in receiver.received:
+        Verifier(secret).verify(body, headers)
+    (name,) = (word for word in listed.split() if word.startswith("hook-"))
+    assert cli("retry", name).exit_code == 0
+    assert cli("delete", name).exit_code == 0
+    assert receiver.url not in cli("list").stdout
+    gone = cli("delete", name)
+    assert gone.exit_code == 1
+    assert f"there is no webhook '{name}'" in gone.output

@@ -1,0 +1,154 @@
+"""Curvature of hanging rods from noisy centrelines, and their weight over their stiffness, gamma.
+
+A method is given the centrelines of the split test under white noise of three strengths. Its answers are a list with
+
+    {"slot": 7, "noise": 0.005, "bending": [150 numbers, |kappa| L from the clamp on], "gamma": 812.0}
+
+for every rod and noise. `bending` is null where a method has no answer, which counts as infinitely wrong. `gamma` may
+be left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
+from stickslip_training.benchmark.task import Task
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.rods.errors import bending, relative_rms_error
+from stickslip_training.rods.noise import with_white_noise
+
+NOISES = (0.001, 0.005, 0.01)
+"""Standard deviation of every coordinate, over L."""
+
+_SEED = 2026
+_DRAWS = 1000
+_EVERY = 15  # points of a rod of which one is compared
+
+
+class RodTask(Task):
+    """|kappa| and gamma of every rod of the split test."""
+
+    columns = (
+        *(f"{100 * noise:g} %: error of \\|κ\\|, median; p95" for noise in NOISES),
+        f"error of gamma at {100 * NOISES[1]:g} %, median; p95",
+    )
+    tolerances = {"centerline": 1e-5, "bending": 1e-3, "noisy": 1e-5}  # noqa: RUF012
+
+    def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
+        columns = {name: reader.label(name)[slots].tolist() for name in ("gamma", "phi0", "phi1")}
+        return [
+            {"slot": slot, **{name: values[place] for name, values in columns.items()}}
+            for place, slot in enumerate(slots.tolist())
+        ]
+
+    def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+        exact = reader.read("centerline", slots)
+        return {
+            "centerline": exact[:, ::_EVERY],
+            "bending": _truth(reader, slots)[:, ::_EVERY].astype(np.float32),
+            "noisy": _noisy(exact)[:, :, -1],
+        }
+
+    def inputs(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+        """Return the slots, (n,), the noises, (3,), and the centrelines over L, (3, n, 150, 3)."""
+        return {"slot": slots, "noise": np.array(NOISES), "centerline": _noisy(reader.read("centerline", slots))}
+
+    def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
+        truth, gamma = _truth(reader, slots), reader.label("gamma")[slots]
+        told, weights = _parsed(answers, slots, truth.shape[1])
+        found = {}
+        for place, noise in enumerate(NOISES):
+            given = np.isfinite(weights[place])
+            found[f"{noise:g}"] = {
+                "rods": len(slots),
+                "failed": int(np.isnan(told[place, :, 0]).sum()),
+                "bending": _quantiles(relative_rms_error(told[place], truth)),
+                "gamma": _quantiles(np.abs(weights[place] / gamma - 1.0)) if given.any() else None,
+            }
+        return found
+
+    def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
+        cells = []
+        for noise in NOISES:
+            of = scores[f"{noise:g}"]
+            cells.append(_cell(of["bending"]) + (f" ({of['failed']} fail)" if of["failed"] else ""))
+        gamma = scores[f"{NOISES[1]:g}"]["gamma"]
+        return (*cells, "" if gamma is None else _cell(gamma))
+
+    def rank(self, scores: Mapping[str, Any]) -> float:
+        median = scores[f"{NOISES[1]:g}"]["bending"]["median"]
+        return float("inf") if median is None else float(median["value"])
+
+
+def _truth(reader: DatasetReader, slots: Integers) -> Floats:
+    return bending(reader.read("curvature", slots))
+
+
+def _noisy(centerline: Array) -> SingleFloats:
+    return np.stack([with_white_noise(centerline, noise, (_SEED, place)) for place, noise in enumerate(NOISES)])
+
+
+def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Floats, Floats]:
+    """Return |kappa| L, (noises, rods, points), and gamma, (noises, rods); NaN where a method gives none."""
+    rows = {int(slot): row for row, slot in enumerate(slots)}
+    told, gamma = np.full((len(NOISES), len(slots), points), np.nan), np.full((len(NOISES), len(slots)), np.nan)
+    answered = np.zeros(gamma.shape, dtype=bool)
+    for place, answer in enumerate(answers):
+        try:
+            slot, noise, given = int(answer["slot"]), float(answer["noise"]), answer["bending"]
+            values = None if given is None else np.array(given, dtype=np.float64)
+            weight = None if answer.get("gamma") is None else float(answer["gamma"])
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ValueError(
+                f"answer {place} must have slot, noise and bending, and may have gamma: {error!r}"
+            ) from None
+        if slot not in rows or noise not in NOISES:
+            raise ValueError(
+                f"slot and noise of answer {place} must be of the test set, whose noises are {NOISES}: they are {slot} "
+                f"and {noise:g}"
+            )
+        where = NOISES.index(noise), rows[slot]
+        if answered[where]:
+            raise ValueError(f"slot {slot} is answered twice at noise {noise:g}, at {place} for the second time")
+        answered[where] = True
+        if values is not None:
+            if values.shape != (points,) or not (np.isfinite(values).all() and (values >= 0).all()):
+                raise ValueError(f"bending of answer {place} must be {points} finite numbers of 0 or more, or null")
+            told[where] = values
+        if weight is not None:
+            if not 0 < weight < np.inf:
+                raise ValueError(f"gamma of answer {place} must be more than 0 and finite, and is {weight}")
+            gamma[where] = weight
+    if not answered.all():
+        noise, row = (int(index[0]) for index in np.nonzero(~answered))
+        raise ValueError(
+            f"every slot of the test set must be answered at every noise, and {(~answered).sum()} are not, "
+            f"{slots[row]} at {NOISES[noise]:g} first"
+        )
+    return told, gamma
+
+
+def _quantiles(errors: Floats) -> dict[str, Any]:
+    """Return median and 95 % quantile, each with its 90 % interval over rods; None where it is infinite."""
+    errors = np.where(np.isfinite(errors), errors, np.inf)
+    drawn = errors[np.random.default_rng(0).integers(len(errors), size=(_DRAWS, len(errors)))]
+    found = {}
+    for name, share in (("median", 0.5), ("p95", 0.95)):
+        value = float(np.quantile(errors, share, method="higher"))
+        low, high = np.quantile(np.quantile(drawn, share, axis=1, method="higher"), (0.05, 0.95), method="nearest")
+        finite = {"value": value, "low": float(low), "high": float(high)}
+        found[name] = {key: number if np.isfinite(number) else None for key, number in finite.items()}
+        if found[name]["value"] is None:
+            found[name] = None  # type: ignore[assignment]
+    return found
+
+
+def _cell(quantiles: Mapping[str, Any]) -> str:
+    return "; ".join("-" if each is None else _percent(each["value"]) for each in quantiles.values())
+
+
+def _percent(share: float) -> str:
+    value = 100.0 * share
+    return f"{value:,.0f} %" if value >= 9.95 else f"{value:.2g} %"
