@@ -124,26 +124,6 @@ class TestNothingCrosses:
         assert cloth.least_distance > 0.9 * THICKNESS
         assert unconverged <= 1
 
-    def test_pile_of_five_sheets(self) -> None:
-        rng = np.random.default_rng(4)
-        parts = [
-            meshes.grid(0.06, 0.06, 5, 5) if i % 2 else meshes.unstructured(0.06, 0.06, 0.012, i) for i in range(5)
-        ]
-        mesh = meshes.together(*parts)
-        positions = []
-        for i, part in enumerate(parts):
-            angle = rng.uniform(0.0, 6.0)
-            c, s = np.cos(angle), np.sin(angle)
-            flat = part.rest @ np.array([[c, s], [-s, c]])
-            tilt = 0.1 * rng.normal(size=2)
-            positions.append(np.column_stack([flat, 0.01 + 0.012 * i + flat @ tilt]))
-        cloth = Cloth(mesh, MATERIAL, CERTIFIED, self_contact=SelfContact(0.4))
-        cloth.set_state(np.concatenate(positions))
-        unconverged = watched(cloth, 60, 0.01, bodies=[plane(0.4)])
-        assert cloth.least_distance > 0.9 * THICKNESS
-        assert unconverged <= 1
-        assert cloth.positions[:, 2].max() > 4.0 * THICKNESS * 0.99  # they lie on each other
-
     def test_held_vertices_do_not_pass_through(self) -> None:
         """A sheet is pushed through another one, both of them held: the step is counted as unconverged."""
         a, b = meshes.grid(0.05, 0.05, 5, 5), meshes.grid(0.02, 0.02, 2, 2)
