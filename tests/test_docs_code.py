@@ -26,7 +26,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 RUN_ELSEWHERE = {"from-four-pngs.md"}  # test_docs.py runs it, and looks at what comes out
-MOST_SKIPPED = 28  # guides of deploy/ and PostgreSQL need other machines; test_deploy.py checks commands of the first
+MOST_SKIPPED = 31  # deploy/, PostgreSQL and S3 need other machines; test_deploy.py checks commands of the first
 
 _RUN = ("python", "sh", "yaml")
 _FENCE = re.compile(r"(?:<!-- skip: (?P<reason>.+?) -->\n)?^```(?P<language>\S*)\n(?P<code>.*?)^```$", re.M | re.S)

@@ -45,7 +45,7 @@ def coarse(runs: Runs, side: int) -> Runs:
     return replace(runs, positions=runs.positions[:, :, ::step, ::step])
 
 
-def told(name: str, way: str, posterior: Posterior, test: Runs, renders: int) -> dict[str, object]:
+def told(test_name: str, name: str, way: str, posterior: Posterior, test: Runs, renders: int) -> dict[str, object]:
     """Print and return the errors of an answer for runs, each seen `renders` times."""
     mu, run = np.repeat(test.mu, renders), np.repeat(np.arange(len(test)), renders)
     found = estimates(posterior.mu, posterior.bins)
@@ -55,7 +55,7 @@ def told(name: str, way: str, posterior: Posterior, test: Runs, renders: int) ->
     right = measure((posterior.material.argmax(axis=1) == np.repeat(test.material, renders)).astype(float), run)
     print(f"| {name} | {way} | {off} | {signed} | {inside.value:.0%} | {right.value:.0%} |", flush=True)
     numbers = {"error": off, "signed": signed, "in_80": inside, "material": right}
-    return {"train": name, "way": way, **{key: asdict(value) for key, value in numbers.items()}}
+    return {"test": test_name, "train": name, "way": way, **{key: asdict(value) for key, value in numbers.items()}}
 
 
 def main() -> None:
@@ -85,14 +85,14 @@ def main() -> None:
         side = min(known.side, asked.side)
         seen = oracle(coarse(known, side), coarse(asked, side), camera, Observation(noise=NOISE), 0, INSTANTS, BINS)
         name = f"{path.stem} ({len(known)} runs)"
-        records.append(told(name, "oracle", seen, asked, 1))
+        records.append(told(args.test.stem, name, "oracle", seen, asked, 1))
         if args.steps:
             settings = ClothTraining(steps=args.steps, instants=INSTANTS)
             learned, validation, _ = split_runs(known, (VALIDATION, 0.0), 0)
             model = train_friction(learned, validation, settings)
             clips = render_clips(asked, 6, 99, wanted=INSTANTS)
             posterior = model.estimate(clips)
-            records.append(told(name, "network", posterior, asked, 6))
+            records.append(told(args.test.stem, name, "network", posterior, asked, 6))
             records[-1]["scores"] = score(posterior, clips.truth()).as_dict()
     print(f"{time.process_time() - started:.0f} CPU s")
     if args.records is not None:

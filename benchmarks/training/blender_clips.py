@@ -9,6 +9,7 @@ light of its own and is rendered with `--textures` textures, from one trace; the
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stickslip_blender.clips import ClothRenderer
@@ -79,13 +80,14 @@ def main() -> None:
                 print(json.dumps(told[-1]), flush=True)
     finally:
         renderer.close()
-    np.savez_compressed(
-        args.out,
-        video=np.stack(videos),
-        instants=np.array(shown, np.int16),
-        about=np.array([json.dumps(line) for line in told]),
-        **({"segmentation": np.stack(seen)} if seen else {}),
-    )
+    arrays: dict[str, Any] = {
+        "video": np.stack(videos),
+        "instants": np.array(shown, np.int16),
+        "about": np.array([json.dumps(line) for line in told]),
+    }
+    if seen:
+        arrays["segmentation"] = np.stack(seen)
+    np.savez_compressed(args.out, **arrays)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
     $BLENDER_PY benchmarks/training/blender_clips.py MESHES.npz FILMS.npz --textures 1 --instants all --clips N
     python benchmarks/training/phone_video.py measure FILMS.npz [--model MODEL] [--records FILE.jsonl]
 
-RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: six a second, from before
+RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: five a second, from before
 the stage starts, at times that no clip shows. After them come the instants of a clip. Blender renders both with one
 look. `measure` makes an H.264 film of the former, as a hand holds a phone, imports it by `cloth import`'s own code, and
 compares.
@@ -13,6 +13,7 @@ compares.
 import argparse
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,11 @@ from stickslip_schemas.cameras import load_rig
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import predictions
 from stickslip_training.cloth.runs import grid_order, load_runs, write_packed
-from stickslip_training.cloth.training import INSTANTS, RIG, WEIGHTS, Clips, FrictionModel, load_friction
+from stickslip_training.cloth.training import INSTANTS, RIG, WEIGHTS, FrictionModel, load_friction
 from stickslip_training.cloth.video import RATE, Calibration, VideoError, import_video, load_clip, save_clip
 from stickslip_training.testing import meshes_at, write_film
 
-START, FRAMES_A_SECOND, DISTORTION = 1.7, 6, (-0.12, 0.05, 0.001, -0.0005, 0.0)
+START, FRAMES_A_SECOND, DISTORTION = 1.7, 5, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 SHAKE = 0.05
 """Standard deviation of a hand's steps from frame to frame, a walk [px]: 1 px after 67 s."""
 
@@ -68,8 +69,7 @@ def measure(films: Path, model: FrictionModel, records: Path | None) -> None:
             imported = load_clip(Path(folder) / "clip.npz")
         seen = Cameras.of([camera])
         direct = cut(grey(torch.from_numpy(clip[None])), holder_crops(seen, INSTANTS))
-        unknown = np.array([-1])
-        pictures = Clips(direct, seen.rotation[:, 2], unknown, np.array([true["mu"]]), unknown, np.array([0]))
+        pictures = replace(imported, crops=direct, direction=seen.rotation[:, 2])
         film_mu, clip_mu = (predictions(model.estimate(each), [0])[0]["mu"]["median"] for each in (imported, pictures))
         answers.append({**true, "film": film_mu, "clip": clip_mu, "start": found.start, "residual": found.residual})
         print(

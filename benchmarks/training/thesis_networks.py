@@ -35,6 +35,9 @@ from torch import nn
 CLASSES = 17
 """Of mu: 0, 0.1, ... 1.6."""
 
+MEAN, DEVIATION = 60.0, 60.0
+"""By which levels are centred, of 255."""
+
 BATCH = 16
 _CHUNK = 32
 
@@ -88,7 +91,7 @@ class ThesisLearner(Learner):
     def logits(self, net: nn.Module, clips: Clips, batch: Array) -> torch.Tensor:
         """Return the logits of some clips, computed in bfloat16 with float32 weights."""
         with torch.autocast("cpu", torch.bfloat16):
-            x = clips.pictures[batch].float() / 255
+            x = (clips.pictures[batch].float() - MEAN) / DEVIATION
             told = (clips.materials(self.known)[batch],) if self.kind == "conditional" else ()
             return torch.as_tensor(net(x, *told)).float()
 

@@ -58,8 +58,8 @@ def write_film(
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": str(quality)}
         for picture, off in zip(pictures, shake, strict=True):
-            places = np.moveaxis((flat - off).astype(np.float32), -1, 0)
-            shown = cv2.remap(np.asarray(picture, np.float32), *places, cv2.INTER_CUBIC)
+            across, down = np.moveaxis((flat - off).astype(np.float32), -1, 0)
+            shown = cv2.remap(np.asarray(picture, np.float32), across, down, cv2.INTER_CUBIC)
             levels = np.round(np.clip(shown, 0, 255)).astype(np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(levels, format="rgb24")))
         container.mux(stream.encode())

@@ -66,8 +66,8 @@ def film(run, tmp_path_factory):
 
 def test_start_shake_and_crops_are_found(film, run, tmp_path):
     crops, instants, found = import_video(film, Calibration(CAMERA, DISTORTION))
-    assert found.start == pytest.approx(START, abs=0.1)
-    assert found.residual < 0.5
+    assert found.start == pytest.approx(START, abs=0.03)
+    assert found.residual < 0.3
     assert set(INSTANTS) <= set(instants)
     frames = [instants.index(instant) for instant in INSTANTS]
     direct = torch.from_numpy(pictures(run, np.array(INSTANTS) / RATE))[None]

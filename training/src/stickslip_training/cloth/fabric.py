@@ -43,7 +43,9 @@ FABRIC = (
 def fabric_numbers(density: Array, rigidity: Array) -> Floats:
     """Return log10 of `FABRIC`, (n, 3), of areal densities (n,) and rigidities (n, 3); NaN where one is NaN."""
     rho, along = np.asarray(density, dtype=np.float64), np.asarray(rigidity, dtype=np.float64)[:, :2].mean(axis=1)
-    return np.asarray(np.log10(np.stack([rho, along, np.cbrt(along / (rho * GRAVITY))], axis=1)))
+    with np.errstate(invalid="ignore", divide="ignore"):  # what is no fabric gets no number
+        numbers = np.log10(np.stack([rho, along, np.cbrt(along / (rho * GRAVITY))], axis=1))
+    return np.where(np.isfinite(numbers), numbers, np.nan)
 
 
 def numbers_of_runs(about: list[dict[str, object]]) -> Floats:

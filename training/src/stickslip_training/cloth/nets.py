@@ -72,9 +72,10 @@ class PosteriorNet(nn.Module):
 class Extractor(nn.Sequential):
     """Pictures (N, 3, H, W) to features (N, 512) [thesis, Table 4.3].
 
-    The table is silent on three things. Convolutions are padded to keep the size. Poolings, 3 x 3 with stride 2, are
-    padded by 1, so that 224 becomes 112, 56 and 28. How the last map of 512 x 28 x 28 enters the LSTM is not said;
-    flattened it would take 411 million weights for 256 units. It is averaged over its places.
+    The table is silent on four things. Convolutions are padded to keep the size. Poolings, 3 x 3 with stride 2, are
+    padded by 1, so that 224 becomes 112, 56 and 28. Weights are drawn so that features keep their size from layer to
+    layer [He et al. 2015]: with torch's default they shrink. How the last map of 512 x 28 x 28 enters the LSTM is not
+    said; flattened it would take 411 million weights for 256 units. It is averaged over its places.
     """
 
     def __init__(self) -> None:
@@ -94,6 +95,10 @@ class Extractor(nn.Sequential):
             nn.AdaptiveAvgPool2d(1),
             nn.Flatten(),
         )
+        for layer in self:
+            if isinstance(layer, nn.Conv2d) and layer.bias is not None:
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)
 
 
 class BaselineNet(nn.Module):

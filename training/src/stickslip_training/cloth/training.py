@@ -126,8 +126,12 @@ class Clips:
     @staticmethod
     def joined(parts: "Sequence[Clips]") -> "Clips":
         """Return the clips of all parts."""
-        columns = [[getattr(part, field.name) for part in parts] for field in fields(Clips)]
-        return Clips(*(torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each) for each in columns))
+        columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Clips)}
+        whole: dict[str, Any] = {
+            name: torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each)
+            for name, each in columns.items()
+        }
+        return Clips(**whole)
 
     def truth(self) -> Truth:
         """Return what is true of the clips, as scores ask for it."""

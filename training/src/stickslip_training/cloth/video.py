@@ -47,6 +47,9 @@ PATCH_BELOW = 0.005
 WINDOW = 0.012
 """Side of what is followed [m]."""
 
+MATCH_MAX = 1.0
+"""How far a match with a kept frame may be from where the steps since led; then another frame is kept [px]."""
+
 RESIDUAL_MAX = 1.0
 """[px of a picture 224 px wide]"""
 
@@ -255,8 +258,8 @@ def _follow(
     precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
     times: list[float] = []
     places: list[Any] = []
-    before = None
-    place = seen.astype(np.float32)[:, None]
+    before = kept = None
+    place = kept_place = seen.astype(np.float32)[:, None]
     for time, picture in _frames(path):
         height, width = picture.shape
         if (width, height) != (camera.width, camera.height):
@@ -265,11 +268,26 @@ def _follow(
                 f"{width} x {height}"
             )
         if before is not None:
-            place, found, _ = cv2.calcOpticalFlowPyrLK(
+            step, found, _ = cv2.calcOpticalFlowPyrLK(
                 before, picture, place, None, winSize=(window, window), maxLevel=2, criteria=precise
             )
             if not found.all():
                 raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
+            # Errors of steps from frame to frame add up. Those of a match with one kept frame do not.
+            place, found, _ = cv2.calcOpticalFlowPyrLK(
+                kept,
+                picture,
+                kept_place,
+                step.copy(),
+                winSize=(window, window),
+                maxLevel=0,
+                criteria=precise,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            )
+            if not found.all() or np.abs(place - step).max() > MATCH_MAX:
+                place, kept, kept_place = step, picture, step
+        else:
+            kept = picture
         times.append(time)
         places.append(place.reshape(2, 2).copy())
         before = picture
@@ -293,9 +311,13 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
         apart = tracks[some] - path
         return np.asarray(apart - np.median(apart, axis=(0, 1)))
 
+    second = max(1, round(1.0 / float(np.median(np.diff(times)))))  # in frames
+
     def found(some: slice, near: float) -> float:
         def residuals(t0: Floats) -> Floats:
-            return off(float(t0[0]), some).ravel()
+            # What moves within a second: a hand wanders slowly, and the stage turns fast.
+            apart = off(float(t0[0]), some)
+            return np.asarray(apart[second:] - apart[:-second]).ravel()
 
         fit = least_squares(residuals, np.array([near]), loss="soft_l1", diff_step=np.array([1e-4]))
         return float(fit.x[0])
