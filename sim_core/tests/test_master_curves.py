@@ -208,7 +208,8 @@ class TestHeavyFold:
         def rate(s: Floats, y: Floats, p: Floats) -> Floats:
             pull = p[1] + p[2] * s
             bend = p[0] * np.sin(y[0]) - pull * np.cos(y[0])
-            return p[2] * np.stack([y[1], bend, np.cos(y[0]), np.sin(y[0])])
+            out: Floats = p[2] * np.stack([y[1], bend, np.cos(y[0]), np.sin(y[0])])
+            return out
 
         def ends(a: Floats, b: Floats, p: Floats) -> Floats:
             return np.array([*a, b[0] - np.pi, b[1], b[3] - gap])
@@ -219,6 +220,7 @@ class TestHeavyFold:
         guess = np.stack([angle, np.gradient(angle, 0.05), x, y])
         found = solve_bvp(rate, ends, s, guess, np.array([0.0, -3.0, 5.0]), tol=1e-9, max_nodes=100_000)
         assert found.success
+        assert found.p is not None
         fine = found.sol(np.linspace(0.0, 1.0, 20_001))
         fold = master_curves.heavy_fold(gap)
         assert found.p[0] == pytest.approx(-0.5 * gap, abs=1e-8)  # whatever the rest
