@@ -23,6 +23,7 @@ def test_exported_names() -> None:
         "RotatingSphere",
         "SelfContact",
         "SolverSettings",
+        "Surface",
         "box",
         "build_info",
         "drop_and_drag",

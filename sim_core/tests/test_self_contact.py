@@ -1,12 +1,13 @@
 """Cloth that feels itself and other cloth: nothing crosses, friction is exact, and without contact nothing changes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import Cloth, SelfContact, fabric, isotropic, plane, preset_named, self_intersections
+from stickslip_sim_core import Cloth, SelfContact, Surface, fabric, isotropic, plane, preset_named, self_intersections
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import stacked_incline
@@ -110,6 +111,169 @@ class TestStack:
         assert not stacked_incline.run(friction=(0.3,), sheets=(2,), cells=3, unstructured=0).passed
 
 
+def flat(mesh: meshes.Mesh, height: float = 0.0) -> Floats:
+    return np.column_stack([mesh.rest, np.full(len(mesh.rest), height)])
+
+
+class TestSeveralFabrics:
+    A, B = meshes.grid(0.05, 0.05, 4, 4), meshes.unstructured(0.06, 0.04, 0.012, 1)
+    LIGHT, HEAVY = fabric("gray-interlock"), replace(fabric("camel-ponte-roma"), damping=3.0)
+
+    def both(self) -> Cloth:
+        return Cloth(meshes.together(self.A, self.B), (self.LIGHT, self.HEAVY), CERTIFIED)
+
+    def test_each_sheet_is_of_its_own(self) -> None:
+        """Energies, forces and masses are those of two cloths of one fabric each."""
+        rng = np.random.default_rng(0)
+        both, first, second = self.both(), Cloth(self.A, self.LIGHT, CERTIFIED), Cloth(self.B, self.HEAVY, CERTIFIED)
+        bent = [flat(mesh) + 1e-3 * rng.normal(size=(len(mesh.rest), 3)) for mesh in (self.A, self.B)]
+        none = both.slopes
+        membrane, bending, force = both._solver.energies(np.concatenate(bent), none)
+        alone = [cloth._solver.energies(at, none) for cloth, at in zip((first, second), bent, strict=True)]
+        assert membrane == pytest.approx(alone[0][0] + alone[1][0], rel=1e-12)
+        assert bending == pytest.approx(alone[0][1] + alone[1][1], rel=1e-12)
+        expected = np.concatenate([alone[0][2], alone[1][2]])
+        assert force == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
+        assert both.masses == pytest.approx(np.concatenate([first.masses, second.masses]), rel=1e-12)
+
+    def test_each_sheet_has_its_own_damping(self) -> None:
+        cloth = self.both()
+        cloth.gravity[:] = 0.0
+        start = np.concatenate([flat(self.A), flat(self.B)])
+        cloth.set_state(start, np.broadcast_to([1.0, 0.0, 0.0], start.shape))
+        for _ in range(5):
+            cloth.step(0.02)
+        speed = cloth.velocities[:, 0]
+        assert speed[: len(self.A.rest)] == pytest.approx(1.0, rel=1e-6)
+        assert speed[len(self.A.rest) :] == pytest.approx((1.0 + 3.0 * 0.02) ** -5, rel=1e-4)
+
+    def test_residuals_are_measured_in_the_lightest(self) -> None:
+        assert self.both().force_scale == pytest.approx(min(self.LIGHT.density, self.HEAVY.density) * 25e-6 * GRAVITY)
+
+    def test_each_two_keep_their_own_distance(self) -> None:
+        """The mean of their thicknesses, and half of both with a surface."""
+        cloth = Cloth(
+            meshes.together(self.A, self.B),
+            (self.LIGHT, self.HEAVY),
+            CERTIFIED,
+            self_contact=SelfContact(0.5, [8e-4, 4e-4]),
+            surfaces=[Surface([[0, 1, 2]], [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]], 0.5, 0.0)],
+        )
+        cloth.set_state(np.concatenate([flat(self.A, 0.001), flat(self.B, 0.002)]))
+        assert watched(cloth, 60) == 0
+        height = [cloth.positions[: len(self.A.rest), 2], cloth.positions[len(self.A.rest) :, 2]]
+        assert height[0] == pytest.approx(4e-4, abs=1e-8)
+        assert height[1][np.abs(self.B.rest[:, 0]) < 0.025] == pytest.approx(10e-4, abs=1e-8)
+        weight = cloth.masses.sum() * GRAVITY
+        assert cloth.surface_forces[0].sum(axis=0) == pytest.approx([0.0, 0.0, -weight], abs=1e-4 * weight)
+        assert cloth.contact_force() == pytest.approx([0.0, 0.0, weight], abs=1e-3 * weight)
+        assert cloth.pair_forces.vertices.max() == len(cloth.mesh.rest) + 2
+
+    def test_number_of_fabrics(self) -> None:
+        with pytest.raises(ValueError, match="fabric: must be one, or one for each of 2 sheets, got 3"):
+            Cloth(meshes.together(self.A, self.B), (self.LIGHT,) * 3, CERTIFIED)
+
+
+class TestSurfaces:
+    SHEET = meshes.grid(0.06, 0.06, 4, 4)
+    GROUND = meshes.grid(0.3, 0.3, 3, 3)
+
+    def on(self, motion: Callable[[float, Floats], Floats], mu: float = 0.5, mesh: meshes.Mesh | None = None) -> Cloth:
+        """A sheet that lies on a ground that moves."""
+        mesh = self.GROUND if mesh is None else mesh
+        ground = Surface(mesh.triangles, lambda time: motion(time, flat(mesh)), mu)
+        cloth = Cloth(self.SHEET, MATERIAL, CERTIFIED, surfaces=[ground])
+        cloth.set_state(flat(self.SHEET, THICKNESS))
+        return cloth
+
+    def watch(self, cloth: Cloth, steps: int, dt: float = 0.02, **drive: object) -> None:
+        for _ in range(steps):
+            cloth.step(dt, **drive)  # type: ignore[arg-type]
+            all_positions = np.concatenate([cloth.positions, cloth.surfaces[0].at(cloth.time)])
+            behind = np.asarray(cloth.surfaces[0].triangles) + len(cloth.mesh.rest)
+            assert self_intersections(all_positions, np.concatenate([cloth.mesh.triangles, behind])) == 0
+        assert cloth.unconverged_steps == 0
+
+    @pytest.mark.parametrize("mu", [0.1, 0.8])
+    @pytest.mark.parametrize("beyond", [-0.02, 0.02])
+    def test_slope(self, mu: float, beyond: float) -> None:
+        cloth = self.on(lambda _, at: at, mu, meshes.unstructured(0.3, 0.3, 0.04, 1))
+        cloth.gravity[:] = tilted(np.arctan(mu) + beyond)
+        self.watch(cloth, 20)
+        speed = np.linalg.norm(cloth.velocities.mean(axis=0))
+        angle = np.arctan(mu) + max(beyond, 0.0)
+        assert speed / cloth.time == pytest.approx(GRAVITY * (np.sin(angle) - mu * np.cos(angle)), rel=1e-3, abs=1e-8)
+
+    def test_carries_what_sticks(self) -> None:
+        """A ground that speeds up sideways and upwards, and turns, all of it slowly enough."""
+
+        def motion(time: float, at: Floats) -> Floats:
+            turn = 0.5 * time**2
+            c, s = np.cos(turn), np.sin(turn)
+            moved: Floats = at @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [0.2 * time**2, 0.0, 0.5 * time**2]
+            return moved
+
+        cloth = self.on(motion)
+        self.watch(cloth, 30)
+        assert cloth.positions == pytest.approx(motion(cloth.time, flat(self.SHEET, THICKNESS)), abs=1e-6)
+
+    def test_lifts_at_once(self) -> None:
+        """By 10 cm in a step, hundreds of times the thickness."""
+        cloth = self.on(lambda time, at: at + np.array([0.0, 0.0, 0.1 * (time > 0.03)]))
+        self.watch(cloth, 3)
+        assert cloth.least_distance >= 0.99 * THICKNESS
+        assert cloth.positions[:, 2].min() > 0.1
+
+    def test_several_with_motion_of_a_controller(self) -> None:
+        """A sheet lies with one half on a smooth ground and with the other on one that moves and is rough."""
+        half = meshes.grid(0.1, 0.2, 2, 3)
+        left, right = flat(half) - np.array([0.05, 0.0, 0.0]), flat(half) + np.array([0.05, 0.0, 0.0])
+        surfaces = [
+            Surface(half.triangles, left, 0.0),
+            Surface(half.triangles, lambda time: right + np.array([0.0, 0.05 * time, 0.0]), 1.0),
+        ]
+        cloth = Cloth(self.SHEET, MATERIAL, preset_named("fast"), surfaces=surfaces)
+        cloth.set_state(flat(self.SHEET, THICKNESS))
+        gravity = cloth.gravity.copy()
+        for frame in range(1, 7):
+            cloth.advance(frame / 30, lambda _: (gravity, np.empty((0, 3)), []))
+        assert cloth.unconverged_steps == 0
+        weight = cloth.masses.sum() * GRAVITY
+        smooth, rough = (forces.sum(axis=0) / weight for forces in cloth.surface_forces)
+        assert abs(smooth[1]) < 1e-6
+        assert smooth[2] == pytest.approx(-0.5, abs=0.13)  # the middle row of vertices lies on both
+        assert smooth[2] + rough[2] == pytest.approx(-1.0, abs=1e-3)
+        assert cloth.velocities[:, 1].mean() == pytest.approx(0.05, rel=0.02)
+
+    def test_refusals(self) -> None:
+        corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+        with pytest.raises(ValueError, match="mu: must be in"):
+            Surface([[0, 1, 2]], corners, -0.1)
+        with pytest.raises(ValueError, match="thickness: must be finite and >= 0"):
+            Surface([[0, 1, 2]], corners, 0.1, -1.0)
+        with pytest.raises(ValueError, match=r"triangles: must be \(T, 3\)"):
+            Surface([[0, 1]], corners, 0.1)
+        with pytest.raises(ValueError, match=r"triangles: must index 3 vertices, got 0 \.\.\. 3"):
+            Surface([[0, 1, 3]], corners, 0.1)
+        with pytest.raises(ValueError, match="triangles: must have an area, and triangle 1 has none"):
+            Surface([[0, 1, 2], [0, 1, 1]], corners, 0.1)
+        with pytest.raises(ValueError, match="positions: must be finite, and are not at 0 s"):
+            Surface([[0, 1, 2]], np.full((3, 3), np.nan), 0.1)
+        with pytest.raises(ValueError, match=r"positions: must be \(N, 3\)"):
+            Surface([[0, 1, 2]], [0.0, 1.0, 2.0], 0.1)
+        with pytest.raises(ValueError, match="mu: of a surface must be one or of 1 sheets"):
+            Cloth(self.SHEET, MATERIAL, CERTIFIED, surfaces=[Surface([[0, 1, 2]], corners, [0.1, 0.2])])
+        cloth = Cloth(self.SHEET, MATERIAL, CERTIFIED, surfaces=[Surface([[0, 1, 2]], corners, 0.1)])
+        with pytest.raises(ValueError, match="positions: must not cross a surface"):
+            cloth.set_state(flat(self.SHEET)[:, [0, 2, 1]] + 0.01)
+        growing = Surface(
+            [[0, 1, 2]], lambda time: np.ones((3 + (time > 0.0), 3)) * np.eye(4)[: 3 + (time > 0.0), :3], 0.1
+        )
+        cloth = Cloth(self.SHEET, MATERIAL, CERTIFIED, surfaces=[growing])
+        with pytest.raises(ValueError, match="positions: of surfaces must keep their vertices"):
+            cloth.step(0.02)
+
+
 class TestNothingCrosses:
     @pytest.mark.parametrize("seed", range(3))
     def test_crumpled_sheet_that_falls(self, seed: int) -> None:
@@ -183,10 +347,10 @@ class TestRefusals:
         with pytest.raises(ValueError, match="mu: must be"):
             SelfContact(np.asarray(mu, float))
 
-    @pytest.mark.parametrize("thickness", [0.0, -1.0, float("nan")])
-    def test_thickness(self, thickness: float) -> None:
+    @pytest.mark.parametrize("thickness", [0.0, -1.0, float("nan"), [1e-4, 0.0], [[1e-4]]])
+    def test_thickness(self, thickness: object) -> None:
         with pytest.raises(ValueError, match="thickness: must be finite and > 0"):
-            SelfContact(0.5, thickness)
+            SelfContact(0.5, np.asarray(thickness))
 
     def test_thickness_of_a_fine_mesh(self) -> None:
         with pytest.raises(ValueError, match="thickness: must be less than the distance at rest"):
@@ -195,6 +359,8 @@ class TestRefusals:
     def test_number_of_sheets(self) -> None:
         with pytest.raises(ValueError, match="mu: must be of 1 sheets"):
             Cloth(self.MESH, MATERIAL, CERTIFIED, self_contact=SelfContact(np.full((2, 2), 0.1)))
+        with pytest.raises(ValueError, match="thickness: must be of 1 sheets"):
+            Cloth(self.MESH, MATERIAL, CERTIFIED, self_contact=SelfContact(0.1, [1e-4, 1e-4]))
 
     def test_state_that_crosses_itself(self) -> None:
         mesh = meshes.together(self.MESH, self.MESH)

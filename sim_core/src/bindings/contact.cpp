@@ -29,7 +29,7 @@ Surface surface_of(const Triangles& triangles, const Points3& x) {
   for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
     corners.push_back({triangles(t, 0), triangles(t, 1), triangles(t, 2)});
   }
-  return {corners, std::vector<int>(x.rows(), 0)};
+  return {corners, std::vector<int>(x.rows(), 0), Felt::Constant(1, 1, true)};
 }
 
 Buffer<double> buffer_of(const Points3& x) {

@@ -45,8 +45,9 @@ void Newton::evaluate(const Buffer<double>& x, bool with_matrix) {
 // R = M ((x - x_inertial)/dt^2 + c (x - x_start)/dt) + grad E, and the branch of each contact's law.
 Norms Newton::look(const StepProblem& problem, const Buffer<double>& x, double share) {
   const Stopwatch watch(phases.contact);
-  const double inertia = 1.0 / (problem.dt * problem.dt), viscous = problem.damping / problem.dt;
+  const double inertia = 1.0 / (problem.dt * problem.dt);
   for (int i = 0; i < assembly_.numbering.nodes; ++i) {
+    const double viscous = (problem.damping + assembly_.own_damping[i]) / problem.dt;
     at_node(residual, i) = assembly_.mass[i] * (inertia * (at_node(x, i) - at_node(problem.inertial, i)) +
                                                 viscous * (at_node(x, i) - at_node(problem.start, i))) +
                            at_node(assembly_.gradient, i);
@@ -89,7 +90,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   factors.of(problem.dt);
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
-  if (pairs) pairs->begin(problem.start, contact.stiffness, contact_share);
+  if (pairs) pairs->begin(problem.start, ends_, contact.stiffness, contact_share);
   Norms norms = look(problem, x);
   if (pairs) pairs->mark_best();
   const bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);

@@ -15,7 +15,7 @@ namespace sim_core {
 
 // What a step starts from and is driven by.
 struct StepProblem {
-  double dt, damping;              // s, 1/s
+  double dt, damping;              // s, 1/s: on top of the fabrics' own
   const Buffer<double>& start;     // (nodes, 4): positions at its start, m
   const Buffer<double>& inertial;  // (nodes, 4): where inertia and gravity alone lead, x0 + dt v0 + dt^2 g
   const Buffer<double>& velocity;  // (nodes, 4): at its start, m/s

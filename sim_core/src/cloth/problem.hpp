@@ -42,7 +42,8 @@ struct BendingData {
   const double* weights;   // (entries, 4): of H11, H22, 2 H12, and 0; 1/m^2
   const double* area;      // (triangles), m^2
   const double* spacing2;  // (triangles), m^2: square of the length over which a fold turns
-  double rigidity[6];      // 11 12 16 22 26 66, N m
+  const int* fabric;       // (triangles)
+  const double* rigidity;  // (fabrics, 6): 11 12 16 22 26 66, N m
   const int* slot_begin;   // (triangles): first slot of the lower pairs (i, j <= i) of the stencil, in order
   const int* slots;        // scalar slots of (i, j) and (j, i), -1 for held nodes
 };

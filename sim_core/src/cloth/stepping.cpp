@@ -50,6 +50,10 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
     const int node = numbering.node[numbering.vertices + s];
     at_node(x, node) += share * (drive.slopes.row(s).transpose() - at_node(x, node));
   }
+  for (int o = 0; o < numbering.others; ++o) {
+    const int node = numbering.node[numbering.vertices + numbering.slopes + o];
+    at_node(x, node) += share * (drive.others.row(o).transpose() - at_node(x, node));
+  }
 }
 
 void Stepper::advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report) {
@@ -155,6 +159,8 @@ void Stepper::check(double dt, const Drive& drive) {
     refuse("held: must have a row for each held vertex");
   }
   if (drive.slopes.rows() != numbering.slopes) refuse("slopes: must have a row for each clamped edge");
+  if (drive.others.rows() != numbering.others) refuse("surfaces: must keep their vertices");
+  if (!drive.others.allFinite()) refuse("surfaces: positions must be finite");
   if (!drive.held.allFinite() || !drive.slopes.allFinite() || !drive.gravity.allFinite()) {
     refuse("held, slopes and gravity: must be finite");
   }

@@ -109,7 +109,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
       const auto& corner = surface.triangles[*t];
       if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any()) continue;
-      if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
+      if (!surface.feel(vertex, corner[0]) || std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
       add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}}, x, reach);
     }
   }
@@ -122,6 +122,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
       const auto& a = surface.edges[*i];
       for (const int* j = i + 1; j < edges.end(cell); ++j) {
         const auto& b = surface.edges[*j];
+        if (!surface.feel(a[0], b[0])) continue;
         if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1] || !boxes[*i].meets(boxes[*j])) continue;
         // Boxes that meet in many cells count in the one with the lowest corner of what they share.
         if (edges.cell_at(boxes[*i].low.max(boxes[*j].low)) != cell) continue;

@@ -51,15 +51,19 @@ Vector3d admissible(const PairSight& sight) {
 }  // namespace
 
 Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
-  Vector3d out = Vector3d::Zero();
+  Vector3d out = given;
   for (int c = 0; c < 4; ++c) {
     if (who.node[c] < free_nodes) out += weights[c] * at_node(change, who.node[c]).cast<double>();
   }
   return out;
 }
 
+Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
+  return row.force - row.stiffness * motion(change, free_nodes);
+}
+
 Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
-    : near(std::move(surface), settings.thickness, margin),
+    : near(std::move(surface), *std::max_element(settings.thickness.begin(), settings.thickness.end()), margin),
       settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
@@ -70,8 +74,10 @@ void Pairs::restart() {
   pairs_.clear();
 }
 
-void Pairs::begin(const Buffer<double>& start, const std::vector<double>& stiffness, double share) {
+void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const std::vector<double>& stiffness,
+                  double share) {
   start_ = &start;
+  ends_ = &ends;
   for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
   base_ = kept_;
 }
@@ -170,23 +176,30 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   const double distance = rho.norm();
   least_distance_ = std::min(least_distance_, distance);
   double softness = 0.0;
-  for (int c = 0; c < 4; ++c) softness += weights[c] * weights[c] * softness_[who.node[c]];
+  Vector3d given = Vector3d::Zero();
+  for (int c = 0; c < 4; ++c) {
+    const int node = who.node[c];
+    softness += weights[c] * weights[c] * softness_[node];
+    if (node >= free_nodes_) given += weights[c] * (at_node(*ends_, node) - at_node(x, node));
+  }
   if (!(softness > 0.0) || !(distance > 0.0)) return;
   const Vector3d n = rho / distance;
   // The way of the first over the second, less that by which rho turns with them.
   const Matrix3d turn = axes(who.kind, at) * axes(who.kind, before).transpose();
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
-  const std::vector<int>& sheet = near.surface.sheet_of_node;
-  const double mu = settings_.mu(sheet[who.node[0]], sheet[who.node[3]]);
+  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
+  const double mu = settings_.mu(a, b), thickness = 0.5 * (settings_.thickness[a] + settings_.thickness[b]);
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
   pairs_.push_back(
       {who,
        feature,
        weights,
-       {distance - settings_.thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, proximal_share / softness},
-       first - 0.5 * rho});
+       {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, proximal_share / softness},
+       first - 0.5 * rho,
+       thickness,
+       given});
 }
 
 // Pairs take the forces they had. The force of one that is gone goes to the most alike of those that are new and have
@@ -224,7 +237,7 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
       pairs_[heir].sight.force += force;
       continue;
     }
-    best = hand_on_share * settings_.thickness;
+    best = hand_on_share * orphan->thickness;
     for (std::size_t i = 0; i < pairs_.size(); ++i) {
       const double far = (pairs_[i].middle - orphan->middle).norm();
       const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
@@ -242,7 +255,6 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
 void Pairs::merge() {
   const std::size_t count = pairs_.size();
   const Vector3d across(0.62, 0.55, 0.56);  // along no edge of a mesh that is aligned with the axes
-  const double radius = merge_share * settings_.thickness;
   std::vector<std::pair<double, std::size_t>> line(count);
   for (std::size_t i = 0; i < count; ++i) line[i] = {across.dot(pairs_[i].middle), i};
   std::sort(line.begin(), line.end());
@@ -256,6 +268,7 @@ void Pairs::merge() {
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
+    const double radius = merge_share * pairs_[i].thickness;
     const auto take = [&](std::size_t j) {
       if (gone[j] || (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius) return;
       const Vector3d& force = pairs_[j].sight.force;
@@ -303,7 +316,7 @@ bool Pairs::activate(const Buffer<float>& change) {
   bool changed = false;
   for (Pair& pair : pairs_) {
     if (!pair.added) continue;
-    const Vector3d force = pair.sight.force + pair.row.force - pair.row.stiffness * pair.motion(change, free_nodes_);
+    const Vector3d force = pair.sight.force + pair.force_change(change, free_nodes_);
     if (force.dot(pair.sight.normal) >= 0.0) continue;
     pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.sight.force};
     pair.added = false;
@@ -314,7 +327,7 @@ bool Pairs::activate(const Buffer<float>& change) {
     for (Pair& pair : pairs_) {
       if (pair.who.kind != kind || pair.bears() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes_);
-      if (!(pair.sight.gap + pair.sight.normal.dot(motion) < -predicted_gap * settings_.thickness)) continue;
+      if (!(pair.sight.gap + pair.sight.normal.dot(motion) < -predicted_gap * pair.thickness)) continue;
       pair.row = closing_row(pair.sight, motion);
       pair.added = any = true;
     }
@@ -325,7 +338,7 @@ bool Pairs::activate(const Buffer<float>& change) {
 
 void Pairs::solved(const Buffer<float>& change) {
   for (Pair& pair : pairs_) {
-    pair.change = pair.row.force - pair.row.stiffness * pair.motion(change, free_nodes_);
+    pair.change = pair.force_change(change, free_nodes_);
     pair.added = pair.released = false;
   }
   base_ = pairs_;
@@ -356,10 +369,10 @@ PairData Pairs::rows() {
 
 void Pairs::subtract_right_side(Buffer<float>& force) const {
   for (const Pair& pair : pairs_) {
-    if (pair.row.force.isZero(0.0)) continue;
+    const Vector3d change = pair.row.force - pair.row.stiffness * pair.given;
+    if (change.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] < free_nodes_)
-        at_node(force, pair.who.node[c]) -= (pair.weights[c] * pair.row.force).cast<float>();
+      if (pair.who.node[c] < free_nodes_) at_node(force, pair.who.node[c]) -= (pair.weights[c] * change).cast<float>();
     }
   }
 }

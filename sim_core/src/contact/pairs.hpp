@@ -12,9 +12,10 @@
 
 namespace sim_core {
 
+// Of sheets and surfaces.
 struct PairSettings {
-  double thickness;    // m
-  Eigen::MatrixXd mu;  // (sheets, sheets)
+  std::vector<double> thickness;  // m: two keep the mean of theirs apart
+  Eigen::MatrixXd mu;             // of each two; negative where they do not feel each other
 };
 
 struct Pair {
@@ -23,13 +24,17 @@ struct Pair {
                 // edge
   Eigen::Vector4d weights;
   PairSight sight;
-  Eigen::Vector3d middle;                            // of the two points, m
+  Eigen::Vector3d middle;  // of the two points, m
+  double thickness;        // m
+  Eigen::Vector3d given;   // m: of its motion, by nodes that are held and not yet at their ends
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force by the last linear problem, N
   PairRow row{};
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
 
   bool bears() const { return row.mode != contact_open; }
+  // Of its first point over its second, m, and the change of its force by it, N.
   Eigen::Vector3d motion(const Buffer<float>& change, int free_nodes) const;
+  Eigen::Vector3d force_change(const Buffer<float>& change, int free_nodes) const;
 };
 
 class Pairs {
@@ -41,9 +46,10 @@ class Pairs {
 
   // Forgets all forces.
   void restart();
-  // An attempt at a step begins at `start`, with the forces that were kept last; `stiffness`: of the free nodes, which
-  // are `share` of their own.
-  void begin(const Buffer<double>& start, const std::vector<double>& stiffness, double share);
+  // An attempt at a step begins at `start`, with the forces that were kept last, and takes held nodes to `ends`;
+  // `stiffness`: of the free nodes, which are `share` of their own.
+  void begin(const Buffer<double>& start, const Buffer<double>& ends, const std::vector<double>& stiffness,
+             double share);
   // A step ended.
   void keep();
 
@@ -85,7 +91,7 @@ class Pairs {
   int free_nodes_;
   double least_distance_;
   std::vector<Pair> pairs_, base_, kept_, best_;  // sorted by kind, first, feature
-  const Buffer<double>* start_ = nullptr;
+  const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   std::vector<double> softness_;  // of all nodes, m/N: 0 where held
   std::vector<int> nodes_;
   Buffer<float> weights_, stiffness_;

@@ -7,8 +7,8 @@
 
 namespace sim_core {
 
-// Knows which pairs are near: all that can come within `thickness` while no node has moved further than `margin` from
-// where it was, whatever common way all of them have come.
+// Knows which pairs are near: all that can come within `thickness`, the largest, while no node has moved further than
+// `margin` from where it was, whatever common way all of them have come.
 class Neighbourhood {
  public:
   Neighbourhood(Surface surface, double thickness, double margin);

@@ -5,10 +5,11 @@
 
 namespace sim_core {
 
-Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in)
+Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in, Felt felt_in)
     : triangles(std::move(triangles_in)),
       triangles_of_node(sheet_of_node_in.size(), 0),
-      sheet_of_node(std::move(sheet_of_node_in)) {
+      sheet_of_node(std::move(sheet_of_node_in)),
+      felt(std::move(felt_in)) {
   for (const auto& corners : triangles) {
     for (int c = 0; c < 3; ++c) {
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];

@@ -275,7 +275,7 @@ def drop_and_drag(
     held = held_by_holders(mesh)
     floor = [plane(mu)]
     cloth = Cloth(mesh, fabric_of(fabric), settings, held=held, kernel=kernel)
-    hung = hang(mesh, cloth.fabric, seed=seed, kernel=kernel)
+    hung = hang(mesh, cloth.fabrics[0], seed=seed, kernel=kernel)
     cloth.set_state(hung.positions)
     motion = motion_of(cloth, floor, hung.positions[held], hung.tilt)
     weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
