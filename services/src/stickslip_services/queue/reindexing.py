@@ -24,11 +24,15 @@ from stickslip_services.catalog.versions import (
     version_exists,
 )
 from stickslip_services.database.database import Database
-from stickslip_services.database.tables import tasks
+from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.planning import expand
-from stickslip_services.queue.submitting import insert_job
+from stickslip_services.queue.planning import pieces
+from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
+from stickslip_services.queue.terms import Terms
+
+PIECE = 10_000
+"""Samples that are planned at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +80,16 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
 
 def _take_in(database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float) -> bool:
     """Write a version down as the work of a job that has ended; return False where it is known."""
-    plan = expand(manifest.spec, manifest.builds, certificate=manifest.certificate)
+    terms = Terms(manifest.builds, manifest.certificate)
     with database.write() as connection:
         if version_exists(connection, manifest.dataset, manifest.version):
             return False
         with ledger(connection, made_at) as book:
-            insert_job(book, manifest.spec, plan)
-            task = connection.scalar(select(tasks.c.seq).where(tasks.c.key == plan.publish_key))
+            job = insert_job(book, manifest.spec)
+            begin_planning(book, job, terms)
+            for piece in pieces(manifest.spec, terms, size=PIECE):
+                plan_piece(book, job, piece)
+            task = connection.scalar(select(jobs.c.publish_task).where(jobs.c.seq == job))
             assert task is not None
             connection.execute(
                 update(tasks)
