@@ -31,14 +31,14 @@ import tensorstore
 import torch
 import zarr
 from numpy.typing import NDArray
-from stickslip_schemas.arrays import ArrayLayout, describe
+from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.chunks import encode_shard
 from stickslip_schemas.codecs import axes_order, encode_sample, zstd_level
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
-from stickslip_schemas.layout import layout
+from stickslip_schemas.layout import layout, samples_per_file
 from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.tasks import FileEntry
@@ -105,7 +105,7 @@ def write(root: Path, clips: Bytes, samples_per_shard: int = 64) -> ClothDragSpe
     for array in layout(spec):
         if array.name not in arrays:
             arrays[array.name] = np.full((len(clips), *array.shape), array.fill, dtype=array.dtype)
-        _write_array(group, root, array, arrays[array.name], samples_per_shard)
+        _write_array(group, root, array, arrays[array.name], samples_per_file(array, spec, FORMAT))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # consolidated metadata are no part of the Zarr v3 specification yet
         zarr.consolidate_metadata(group.store)

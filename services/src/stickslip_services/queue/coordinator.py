@@ -61,7 +61,13 @@ from stickslip_services.queue.jobs import (
     show_job,
     unplanned_jobs,
 )
-from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
+from stickslip_services.queue.leasing import (
+    compose_leases,
+    grant_leases,
+    has_ready_task,
+    renew_all_leases,
+    renew_leases,
+)
 from stickslip_services.queue.ledger import RUNNABLE, Ledger
 from stickslip_services.queue.planner import Planner, release_claims
 from stickslip_services.queue.planning import Plan, collector_at_rest, expand
@@ -294,7 +300,10 @@ class Coordinator:
             return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
         with self._book() as book:
             worker = _unsuperseded(book.connection, worker.id)
-            leases = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
+            grants = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
+        # What a task builds on has ended: nobody needs to be kept from writing while the tasks are composed.
+        with self.database.read() as connection:
+            leases = compose_leases(connection, grants, self.store.publish)
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:

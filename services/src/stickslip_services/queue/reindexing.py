@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import select, update
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal
+from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.states import TaskState
-from stickslip_schemas.store import ShownVersion, Store
+from stickslip_schemas.store import ShownVersion, Store, in_parallel
 from stickslip_schemas.tasks import PublishOutput
 
 from stickslip_services.catalog.versions import (
@@ -69,10 +69,15 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     if (dataset_id(manifest.spec), manifest.version) != place:
         raise ValueError(f"the manifest is that of {dataset_id(manifest.spec)}, v{manifest.version}")
     own = {MANIFEST_NAME: sha256(content), GROUP_NAME: sha256(group), SEAL_NAME: sha256(seal)}
-    for path, digest in (own | {file.path: file.sha256 for file in manifest.files}).items():
+    listed = list(Contents(manifest, lambda file: store.read_shown(*place, file.path)).files())
+
+    def put_back(shown: tuple[str, Sha256]) -> None:
+        path, digest = shown
         if not store.exists(digest, size=1):
             store.publish(store.read_shown(*place, path))
-    size = manifest.size + len(content) + len(group) + len(seal)
+
+    in_parallel(put_back, (own | {file.path: file.sha256 for file in listed}).items())
+    size = sum(file.size for file in listed) + len(content) + len(group) + len(seal)
     output = PublishOutput(manifest=own[MANIFEST_NAME], group=own[GROUP_NAME], bytes=size)
     read_version(store, output)  # every file is there
     return manifest, output
