@@ -95,7 +95,7 @@ def describe(client: httpx.Client, where: str) -> str:
     near = contact[np.isfinite(contact)]
     return (
         f"  accepted {manifest.valid_count} of {manifest.sample_count} ({manifest.acceptance_rate:.2%})"
-        f"{'; lost: ' + str(dict(reasons)) if reasons else '; nothing was lost'}; {manifest.size / 1e6:.1f} MB\n"
+        f"{'; lost: ' + str(dict(reasons)) if reasons else '; nothing was lost'}; {sum(file.size for file in manifest.files) / 1e6:.1f} MB\n"
         f"  multistable {multistable.mean():.2%}; come back to themselves {len(near) / len(slots):.2%}, "
         f"nearest {near.min(initial=np.inf):.4f} L; reach median {np.median(reach):.3f}, largest {reach.max():.3f} L"
     )

@@ -140,6 +140,7 @@ def export(
     huggingface: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
+    mds: Annotated[Path | None, typer.Option(metavar="DIR", help="shards for MosaicML Streaming")] = None,
     arrays: ArraysOption = None,
     split: SplitOption = None,
     where: WhereOption = None,
@@ -160,6 +161,7 @@ def export(
         "--hdf5": hdf5,
         "--webdataset": webdataset,
         "--huggingface": huggingface,
+        "--mds": mds,
         "--arrays": arrays,
         "--split": split,
         "--gzip": gzip,
