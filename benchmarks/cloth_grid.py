@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from stickslip_sim_core import build_info, drop_and_drag, fabric_names
-from stickslip_sim_core.scenes.cloth_drag import DRAG, DROP, LEGS, duration_of
+from stickslip_sim_core.stage import DRAG, DROP, LEGS, duration_of
 
 FRICTIONS = tuple(round(0.1 * i, 1) for i in range(16))
 

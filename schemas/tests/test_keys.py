@@ -240,6 +240,11 @@ def test_documents_of_samples_are_those_that_are_keyed() -> None:
             "materials": {"mine": own},
             "axes": cloth | {"viewpoint": "high", "angular_speed": 2.0},
         },
+        {
+            "kind": "cloth_on_cloth",
+            "materials": {"mine": own},
+            "axes": cloth | {"viewpoint": "left", "substrate_material": ["mine", "camel-ponte-roma"]},
+        },
     ]
     for document in documents:
         spec = job_spec_adapter.validate_python(document)

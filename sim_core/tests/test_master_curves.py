@@ -200,6 +200,70 @@ def test_shapes() -> None:
     assert master_curves.lateral_buckling([0.5, 1.0], 0.3).shape == (2,)
 
 
+class TestHeavyFold:
+    @pytest.mark.parametrize("gap", [1e-4, 1.0 / 16.0, 0.3])
+    def test_against_scipy(self, gap: float) -> None:
+        """In one part, and with the tangent's angle from a guess of its own."""
+
+        def rate(s: Floats, y: Floats, p: Floats) -> Floats:
+            pull = p[1] + p[2] * s
+            bend = p[0] * np.sin(y[0]) - pull * np.cos(y[0])
+            out: Floats = p[2] * np.stack([y[1], bend, np.cos(y[0]), np.sin(y[0])])
+            return out
+
+        def ends(a: Floats, b: Floats, p: Floats) -> Floats:
+            return np.array([*a, b[0] - np.pi, b[1], b[3] - gap])
+
+        s = np.linspace(0.0, 1.0, 101)
+        angle = np.where(s < 0.5, np.pi * 1.3 * np.sin(np.pi * s) ** 2, np.pi * (1.0 + 0.3 * np.sin(np.pi * s) ** 2))
+        x, y = (np.cumsum(rate(angle)) * 0.05 for rate in (np.cos, np.sin))
+        guess = np.stack([angle, np.gradient(angle, 0.05), x, y])
+        found = solve_bvp(rate, ends, s, guess, np.array([0.0, -3.0, 5.0]), tol=1e-9, max_nodes=100_000)
+        assert found.success
+        assert found.p is not None
+        fine = found.sol(np.linspace(0.0, 1.0, 20_001))
+        fold = master_curves.heavy_fold(gap)
+        assert found.p[0] == pytest.approx(-0.5 * gap, abs=1e-8)  # whatever the rest
+        assert fold.height == pytest.approx(fine[3].max(), rel=1e-7)
+        assert fold.loop_length == pytest.approx(found.p[2], rel=1e-7)
+        assert fold.nose_to_landing == pytest.approx(fine[2].max() - fine[2, -1], rel=1e-7)
+
+    def test_arguments(self) -> None:
+        with pytest.raises(ValueError, match=r"gap: must be in \(0, 0\.5\], got 0\.0"):
+            master_curves.heavy_fold(0.0)
+
+
+class TestCapstan:
+    def test_without_bending_it_is_eulers(self) -> None:
+        mu = np.array([0.0, 0.1, 0.8, 1.5])
+        assert master_curves.capstan(mu, 2.0) == pytest.approx(np.exp(2.0 * mu), rel=1e-12)
+
+    @pytest.mark.parametrize("bending", [0.01, 0.2])
+    @pytest.mark.parametrize("mu", [0.1, 0.7])
+    def test_tension_along_the_cylinder(self, mu: float, bending: float) -> None:
+        """In the strip where it lies, T' = mu (T - B) and the pressure per width is (T - B) / R, from end to end."""
+        light, wrap = 1.0, 2.5
+        heavy = float(master_curves.capstan(mu, wrap, bending))
+        begin, end = (np.arccos(1.0 - bending / tension) for tension in (light, heavy))
+        on_cylinder = light + mu * np.sqrt(2.0 * light * bending - bending**2)
+        lying = solve_ivp(
+            lambda _, tension: mu * (tension - bending), (begin, wrap - end), [on_cylinder], rtol=1e-11, atol=1e-12
+        )
+        leaving = float(lying.y[0, -1]) + mu * np.sqrt(2.0 * heavy * bending - bending**2)
+        assert leaving == pytest.approx(heavy, rel=1e-9)
+
+    def test_no_friction_no_difference(self) -> None:
+        assert master_curves.capstan(0.0, 3.0, 0.1) == pytest.approx(1.0, abs=1e-12)
+
+    def test_arguments(self) -> None:
+        with pytest.raises(ValueError, match="mu: must be in"):
+            master_curves.capstan(-0.1, 1.0)
+        with pytest.raises(ValueError, match="bending: must be in"):
+            master_curves.capstan(0.1, 1.0, 1.0)
+        with pytest.raises(ValueError, match="wrap: must be above"):
+            master_curves.capstan(0.1, 0.1, 0.5)
+
+
 def test_arguments() -> None:
     with pytest.raises(ValueError, match=r"gamma: must be finite and > 0, got 0\.0"):
         master_curves.cantilever([1.0, 0.0])

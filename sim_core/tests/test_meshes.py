@@ -102,3 +102,16 @@ def test_bad_counts_and_patterns() -> None:
         meshes.grid(1.0, 1.0, 2, -1)
     with pytest.raises(ValueError, match="diagonals: must be alternating, left, right or random, got 'up'"):
         meshes.grid(1.0, 1.0, 2, 2, "up")  # type: ignore[arg-type]
+
+
+def test_sheets_lie_side_by_side() -> None:
+    a, b = meshes.grid(0.1, 0.2, 3, 4), meshes.unstructured(0.05, 0.05, 0.01, 2)
+    both = meshes.together(a, b)
+    assert both.triangles[: len(a.triangles)] == pytest.approx(a.triangles)
+    assert both.triangles[len(a.triangles) :] - len(a.rest) == pytest.approx(b.triangles)
+    first, second = both.rest[: len(a.rest)], both.rest[len(a.rest) :]
+    assert second[:, 0].min() > first[:, 0].max()
+    assert np.ptp(second - b.rest, axis=0) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert np.ptp(first - a.rest, axis=0) == pytest.approx([0.0, 0.0], abs=1e-15)
+    with pytest.raises(ValueError, match="parts: must not be empty"):
+        meshes.together()

@@ -52,6 +52,9 @@ from stickslip_services.webhooks import Messenger
 
 logger = logging.getLogger(__name__)
 
+PLAN_SECONDS = 0.2
+"""Time between two looks for jobs that are to be planned [s]."""
+
 GRACE_SECONDS = 3
 """How long open requests (event streams) may go on after a signal to stop [s]."""
 
@@ -69,6 +72,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         keepers = [
             asyncio.create_task(_for_ever(coordinator.sweep, every)),
             asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+            asyncio.create_task(_for_ever(coordinator.plan_large_jobs, PLAN_SECONDS)),
             asyncio.create_task(_for_ever(messenger.deliver, every)),
             asyncio.create_task(coordinator.database.listen(coordinator.bell.ring)),
         ]

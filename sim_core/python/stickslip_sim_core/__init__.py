@@ -3,15 +3,17 @@
 from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Body, Cloth, box, plane, sphere
+from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, Surface, box, plane, sphere
 from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
 from stickslip_sim_core.rods.general import solve_general_rods
 from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import reach, self_contact_distance
 from stickslip_sim_core.rods.multistability import OtherMinima, other_minima
 from stickslip_sim_core.rods.solve import RodSolution, solve_rods
-from stickslip_sim_core.scenes.cloth_drag import DropAndDrag, drop_and_drag
+from stickslip_sim_core.scenes.cloth_drag import drop_and_drag
+from stickslip_sim_core.scenes.cloth_on_cloth import drop_on_cloth
 from stickslip_sim_core.scenes.cloth_sphere import RotatingSphere, rotating_sphere
+from stickslip_sim_core.stage import DropAndDrag
 
 __all__ = [
     "PRESETS",
@@ -23,13 +25,17 @@ __all__ = [
     "NaturalCurvature",
     "NaturalFit",
     "OtherMinima",
+    "PairForces",
     "ParameterFit",
     "RodSolution",
     "RotatingSphere",
+    "SelfContact",
     "SolverSettings",
+    "Surface",
     "box",
     "build_info",
     "drop_and_drag",
+    "drop_on_cloth",
     "fabric",
     "fabric_names",
     "fit_natural_curvature",

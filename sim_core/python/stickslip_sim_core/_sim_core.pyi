@@ -90,6 +90,9 @@ def check_mesh(rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), ord
     Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.
     """
 
+def sheet_count(rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')]) -> int:
+    """Internal: number of pieces of a mesh that hang together."""
+
 def self_intersections(positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')]) -> int:
     """Internal: see stickslip_sim_core.self_intersections."""
 
@@ -137,16 +140,26 @@ class StepReport:
     @property
     def sliding(self) -> int: ...
 
+    @property
+    def pairs(self) -> int:
+        """Pairs of cloth with cloth that bear."""
+
+    @property
+    def least_distance(self) -> float:
+        """
+        Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.
+        """
+
 class ClothSolver:
     """Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp."""
 
-    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], density: float, stretching: Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], rigidity: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str = '') -> None: ...
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')] | None, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int]) -> None: ...
 
-    def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
+    def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], surfaces: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
 
-    def step(self, dt: float, gravity: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], held: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], bodies: Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], damping: float) -> StepReport: ...
+    def step(self, dt: float, gravity: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], held: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], surfaces: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], bodies: Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], damping: float) -> StepReport: ...
 
-    def advance(self, begin: float, end: float, motion: Callable[[float], tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]]]], damping: float) -> StepReport: ...
+    def advance(self, begin: float, end: float, motion: Callable[[float], tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Sequence[tuple[int, float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]]]], damping: float) -> StepReport: ...
 
     def last_dt(self) -> float: ...
 
@@ -161,6 +174,10 @@ class ClothSolver:
     def contacts(self) -> list[int]: ...
 
     def sliding(self) -> list[int]: ...
+
+    def surface_forces(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
+
+    def pair_forces(self) -> tuple[Annotated[NDArray[numpy.int32], dict(shape=(None, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], list[int]]: ...
 
     def masses(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')]: ...
 
@@ -181,3 +198,22 @@ class ClothSolver:
     def factor_floats(self) -> int: ...
 
     def kernel(self) -> str: ...
+
+def closest_weights(edges: bool, x: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')]) -> Annotated[NDArray[numpy.float64], dict(shape=(4), order='C')]:
+    """Internal: see contact/closest.hpp."""
+
+def safe_share(edges: bool, x: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')], to: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')], keep: float) -> float:
+    """Internal: see contact/closest.hpp."""
+
+def contact_candidates(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], x: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], reach: float) -> list[list[int]]:
+    """
+    Internal: kind (0: vertex and triangle, 1: edges) and vertices of near pairs.
+    """
+
+def cap_motion(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], start: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], end: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], thickness: float, margin: float) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]:
+    """Internal: see contact/path.hpp."""
+
+def pair_law(gap: float, normal: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], slip: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], force: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], mu: float, stiffness: float, proximal: float) -> tuple[int, Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float]:
+    """
+    Internal: mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.
+    """

@@ -1,12 +1,15 @@
 #include "bindings/cloth.hpp"
 
 #include <nanobind/eigen/dense.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/function.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <functional>
 #include <tuple>
 
@@ -24,10 +27,13 @@ namespace {
 using Table = Eigen::Matrix<double, 6, 4, Eigen::RowMajor>;
 using BodyTuple = std::tuple<int, double, Eigen::Vector3d, Eigen::Vector3d, Eigen::Matrix3d>;
 
-using MotionCallback = std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>>(double time)>;
+using FabricTuple = std::tuple<double, Table, Eigen::Matrix3d, double>;
+
+using MotionCallback =
+    std::function<std::tuple<Points3, Points3, Points3, Points3, std::vector<BodyTuple>>(double time)>;
 
 struct DriveNow {
-  Points3 gravity, held, slopes;
+  Points3 gravity, held, slopes, surfaces;
   std::vector<Body> bodies;
 };
 
@@ -44,6 +50,13 @@ void bind_cloth(nb::module_& m) {
       "check_mesh", [](const Points2& rest, const Triangles& triangles) { ClothMesh(rest, triangles); }, "rest"_a,
       "triangles"_a,
       "Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.");
+  m.def(
+      "sheet_count",
+      [](const Points2& rest, const Triangles& triangles) {
+        const std::vector<int> sheets = ClothMesh(rest, triangles).sheets();
+        return 1 + *std::max_element(sheets.begin(), sheets.end());
+      },
+      "rest"_a, "triangles"_a, "Internal: number of pieces of a mesh that hang together.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def("cloth_kernels", &cloth_kernels, "Internal: cloth kernels this processor can run, narrowest first.");
@@ -59,33 +72,44 @@ void bind_cloth(nb::module_& m) {
       .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
       .def_ro("halvings", &StepReport::halvings)
       .def_ro("contacts", &StepReport::contacts)
-      .def_ro("sliding", &StepReport::sliding);
+      .def_ro("sliding", &StepReport::sliding)
+      .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear.")
+      .def_ro("least_distance", &StepReport::least_distance,
+              "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
       .def(
           "__init__",
-          [](ClothSolver* self, const Points2& rest, const Triangles& triangles, double density,
-             const Table& stretching, const Eigen::Matrix3d& rigidity, const std::vector<std::int32_t>& held,
-             const Edges& clamped, double tolerance, int newton_max, int krylov_max, double krylov_tolerance,
-             int refactor_after, int patience, int halvings_max, double step_error, int coarsest, int finest,
-             const std::string& kernel) {
+          [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
+             const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, const Edges& clamped,
+             double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
+             int patience, int halvings_max, double step_error, int coarsest, int finest, const std::string& kernel,
+             const std::vector<double>& thickness, const std::optional<Eigen::MatrixXd>& mu,
+             const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex) {
+            std::vector<ClothProperties> list;
+            for (const auto& [density, stretching, rigidity, damping] : fabrics) {
+              list.push_back({density, {stretching}, rigidity, damping});
+            }
             new (self) ClothSolver(
-                rest, triangles, {density, {stretching}, rigidity}, held, clamped,
+                rest, triangles, list, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                {step_error, coarsest, finest}, kernel);
+                {step_error, coarsest, finest}, kernel,
+                mu ? std::optional<PairSettings>({thickness, *mu}) : std::nullopt,
+                {surface_triangles, surface_of_vertex});
           },
-          "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "held"_a, "clamped"_a, nb::kw_only(),
-          "tolerance"_a, "newton_max"_a, "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a,
-          "halvings_max"_a, "step_error"_a, "coarsest"_a, "finest"_a, "kernel"_a = "")
-      .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a)
+          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
+          "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
+          "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "surface_triangles"_a,
+          "surface_of_vertex"_a)
+      .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a)
       .def(
           "step",
           [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
-             const std::vector<BodyTuple>& bodies, double damping) {
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies, double damping) {
             const std::vector<Body> list = bodies_of(bodies);
             nb::gil_scoped_release release;
-            return self.step(dt, gravity, held, slopes, list, damping);
+            return self.step(dt, gravity, held, slopes, surfaces, list, damping);
           },
-          "dt"_a, "gravity"_a, "held"_a, "slopes"_a, "bodies"_a, "damping"_a)
+          "dt"_a, "gravity"_a, "held"_a, "slopes"_a, "surfaces"_a, "bodies"_a, "damping"_a)
       .def(
           "advance",
           [](ClothSolver& self, double begin, double end, const MotionCallback& motion, double damping) {
@@ -93,9 +117,9 @@ void bind_cloth(nb::module_& m) {
             nb::gil_scoped_release release;
             return self.advance(begin, end, [&](double time) -> Drive {
               nb::gil_scoped_acquire acquire;
-              auto [gravity, held, slopes, bodies] = motion(time);
-              now = {gravity, held, slopes, bodies_of(bodies)};
-              return {now.gravity, now.held, now.slopes, now.bodies, damping};
+              auto [gravity, held, slopes, surfaces, bodies] = motion(time);
+              now = {gravity, held, slopes, surfaces, bodies_of(bodies)};
+              return {now.gravity, now.held, now.slopes, now.surfaces, now.bodies, damping};
             });
           },
           "begin"_a, "end"_a, "motion"_a, "damping"_a)
@@ -106,6 +130,12 @@ void bind_cloth(nb::module_& m) {
       .def("reactions", &ClothSolver::reactions)
       .def("contacts", &ClothSolver::contacts)
       .def("sliding", &ClothSolver::sliding)
+      .def("surface_forces", &ClothSolver::surface_forces)
+      .def("pair_forces",
+           [](const ClothSolver& self) {
+             const ClothSolver::PairForces p = self.pair_forces();
+             return std::make_tuple(p.vertices, p.weights, p.forces, p.distance, p.sliding);
+           })
       .def("masses", &ClothSolver::masses)
       .def(
           "energies",

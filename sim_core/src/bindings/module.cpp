@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "bindings/cloth.hpp"
+#include "bindings/contact.hpp"
 #include "build_info.hpp"
 #include "rods/chain.hpp"
 #include "rods/derivatives.hpp"
@@ -229,4 +230,5 @@ NB_MODULE(_sim_core, m) {
       "Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one "
       "level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.");
   sim_core::bind_cloth(m);
+  sim_core::bind_contact(m);
 }

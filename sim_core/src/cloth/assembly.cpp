@@ -13,19 +13,19 @@ constexpr double fold_smallest = 0.01;
 
 }  // namespace
 
-Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const ClothProperties& properties,
-                   const std::vector<std::int32_t>& held, const Edges& clamped)
+Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
+                   const std::vector<std::int32_t>& held, const Edges& clamped, int others)
     : kernel(kernel_in),
-      stencils(bending_stencils(mesh, properties.rigidity, clamped)),
-      compact_stencils(bending_stencils(mesh, properties.rigidity, clamped, true)),
-      numbering(mesh, stencils, compact_stencils, held, static_cast<int>(clamped.rows())),
+      stencils(bending_stencils(mesh, fabrics, clamped)),
+      compact_stencils(bending_stencils(mesh, fabrics, clamped, true)),
+      numbering(mesh, stencils, compact_stencils, held, static_cast<int>(clamped.rows()), others),
       mass_of_vertex(Eigen::VectorXd::Zero(mesh.rest.rows())),
       mass(numbering.nodes, 0.0),
+      own_damping(numbering.nodes, 0.0),
       gradient(4L * numbering.nodes, 0.0),
-      membrane_(mesh, numbering, properties.stretching),
-      bending_(mesh, stencils, properties.rigidity, numbering, numbering.bending),
-      compact_bending_(mesh, compact_stencils, properties.rigidity, numbering, numbering.compact_bending),
-      rigidity_size_(properties.rigidity.cwiseAbs().maxCoeff()),
+      membrane_(mesh, numbering, fabrics),
+      bending_(mesh, stencils, fabrics, numbering, numbering.bending),
+      compact_bending_(mesh, compact_stencils, fabrics, numbering, numbering.compact_bending),
       scalars_(numbering.bending.node.size(), 0.0f),
       blocks_(12 * numbering.membrane.node.size(), 0.0f),
       diagonal_(numbering.free_nodes, 0.0f),
@@ -33,7 +33,12 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Cl
       assembled_stiffening_(2 * mesh.triangles.rows(), -1.0f),
       unused_(4L * numbering.nodes, 0.0) {
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
-    for (int c = 0; c < 3; ++c) mass_of_vertex[mesh.triangles(t, c)] += properties.density * mesh.area[t] / 3.0;
+    const ClothProperties& fabric = fabrics.at(t);
+    rigidity_scale_.push_back(static_cast<float>(1.0 / fabric.rigidity.cwiseAbs().maxCoeff()));
+    for (int c = 0; c < 3; ++c) {
+      mass_of_vertex[mesh.triangles(t, c)] += fabric.density * mesh.area[t] / 3.0;
+      own_damping[numbering.node[mesh.triangles(t, c)]] = fabric.damping;
+    }
   }
   for (int i = 0; i < numbering.vertices; ++i) mass[numbering.node[i]] = mass_of_vertex[i];
   for (int i = 0; i < numbering.free_nodes; ++i) {
@@ -48,7 +53,8 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Cl
             numbering.membrane.node.data(),
             blocks_.data(),
             diagonal_.data(),
-            &folds_};
+            &folds_,
+            nullptr};
   reserve_folds();
 }
 
@@ -75,10 +81,9 @@ void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
 
 void Assembly::assemble_bending() {
   float change_max = 0.0f;
-  const float scale = static_cast<float>(1.0 / rigidity_size_);
-  for (std::size_t t = 0; t < stiffening_.size(); t += 2) {
-    change_max = std::max({change_max, std::abs(stiffening_[t] - assembled_stiffening_[t]),
-                           scale * std::abs(stiffening_[t + 1] - assembled_stiffening_[t + 1])});
+  for (std::size_t t = 0; t < rigidity_scale_.size(); ++t) {
+    change_max = std::max({change_max, std::abs(stiffening_[2 * t] - assembled_stiffening_[2 * t]),
+                           rigidity_scale_[t] * std::abs(stiffening_[2 * t + 1] - assembled_stiffening_[2 * t + 1])});
   }
   if (!exact && !(change_max > stiffening_change)) return;
   std::fill(scalars_.begin(), scalars_.end(), 0.0f);
@@ -88,7 +93,7 @@ void Assembly::assemble_bending() {
 
 void Assembly::set_diagonal(double dt, double damping) {
   for (int i = 0; i < numbering.free_nodes; ++i) {
-    diagonal_[i] = static_cast<float>(mass[i] * (1.0 / (dt * dt) + damping / dt));
+    diagonal_[i] = static_cast<float>(mass[i] * (1.0 / (dt * dt) + (damping + own_damping[i]) / dt));
   }
 }
 
@@ -110,6 +115,7 @@ ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbe
   out.bending_node = numbering.compact_bending.node.data();
   out.bending = numbers.scalars.data();
   out.folds = &no_folds_;
+  out.pairs = nullptr;
   return out;
 }
 

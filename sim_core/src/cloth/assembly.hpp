@@ -21,15 +21,17 @@ struct NeighbourNumbers {
 
 class Assembly {
  public:
-  Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const ClothProperties& properties,
-           const std::vector<std::int32_t>& held, const Edges& clamped);
+  // `others`: vertices of surfaces.
+  Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
+           const std::vector<std::int32_t>& held, const Edges& clamped, int others);
   Assembly(const Assembly&) = delete;
 
   const ClothKernel kernel;
   const std::vector<Stencil> stencils, compact_stencils;
   const Numbering numbering;
   Eigen::VectorXd mass_of_vertex;  // kg
-  Buffer<double> mass;             // (nodes), 0 for slopes
+  Buffer<double> mass;             // (nodes), 0 for slopes and others
+  Buffer<double> own_damping;      // (nodes): of the fabrics, 1/s
 
   // At the positions last evaluated.
   Buffer<double> gradient;                             // (nodes, 4), N
@@ -43,7 +45,7 @@ class Assembly {
   void evaluate(const Buffer<double>& x, bool with_matrix);
   // The table's stiffness at the positions x; it stays for the whole step.
   void read_table(const Buffer<double>& x) { membrane_.read_table(x); }
-  // Inertia and damping [1/s] of a step of dt.
+  // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
   void set_diagonal(double dt, double damping);
   void clear_diagonal();
   // Mean of a node's block on the diagonal, N/m.
@@ -59,7 +61,7 @@ class Assembly {
 
   Membrane membrane_;
   Bending bending_, compact_bending_;
-  double rigidity_size_;
+  std::vector<float> rigidity_scale_;                      // (triangles): 1 over the largest of its fabric, 1/(N m)
   std::vector<int> bending_diagonal_, membrane_diagonal_;  // slots
   Buffer<float> scalars_, blocks_, diagonal_;
   Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)

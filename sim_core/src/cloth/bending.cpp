@@ -2,8 +2,9 @@
 
 namespace sim_core {
 
-Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const Rigidity& d,
-                 const Numbering& numbering, const Pattern& pattern) {
+Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const Fabrics& fabrics,
+                 const Numbering& numbering, const Pattern& pattern)
+    : fabric_(fabrics.of_triangle) {
   const int count = static_cast<int>(stencils.size());
   for (int t = 0; t < count; ++t) {
     const Stencil& stencil = stencils[t];
@@ -24,15 +25,12 @@ Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, co
     area_.push_back(mesh.area[t]);
     spacing2_.push_back(2.0 * mesh.area[t]);
   }
-  data_ = {count,
-           begin_.data(),
-           nodes_.data(),
-           weights_.data(),
-           area_.data(),
-           spacing2_.data(),
-           {d(0, 0), d(0, 1), d(0, 2), d(1, 1), d(1, 2), d(2, 2)},
-           slot_begin_.data(),
-           slots_.data()};
+  for (const ClothProperties& fabric : fabrics.list) {
+    const Rigidity& d = fabric.rigidity;
+    rigidity_.insert(rigidity_.end(), {d(0, 0), d(0, 1), d(0, 2), d(1, 1), d(1, 2), d(2, 2)});
+  }
+  data_ = {count,          begin_.data(),    nodes_.data(),      weights_.data(), area_.data(), spacing2_.data(),
+           fabric_.data(), rigidity_.data(), slot_begin_.data(), slots_.data()};
 }
 
 }  // namespace sim_core

@@ -6,8 +6,6 @@
 namespace sim_core {
 namespace {
 
-// Contact stiffness in the factor over a node's own.
-constexpr float factor_share = 100.0f;
 // Factors that are kept.
 constexpr std::size_t pool_size = 3;
 
@@ -41,27 +39,9 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
   excess_ = fresh_ = -1;
 }
 
-// Contact as a penalty: k n n^T where a node slips, and against a turn of friction; k in all directions where it
-// sticks.
 void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact) {
-  const int free_nodes = assembly.numbering.free_nodes;
-  for (int i = 0; i < free_nodes; ++i) {
-    float* own = &added_[6L * i];
-    std::fill(own, own + 6, 0.0f);
-    if (contact.mode[i] == contact_open) continue;
-    const float k = factor_share * static_cast<float>(assembly.own_stiffness(i));
-    const float* n = &contact.normal[4L * i];
-    const float* t = &contact.direction[4L * i];
-    const float side = contact.mode[i] == contact_stick ? k : std::min(contact.turning[i], k);
-    const float along = contact.mode[i] == contact_stick ? k : 0.0f;
-    // k n n^T + along t t^T + side (1 - n n^T - t t^T)
-    int e = 0;
-    for (int r = 0; r < 3; ++r) {
-      for (int c = r; c < 3; ++c) {
-        own[e++] = (k - side) * n[r] * n[c] + (along - side) * t[r] * t[c] + (r == c ? side : 0.0f);
-      }
-    }
-  }
+  for (int i = 0; i < assembly.numbering.free_nodes; ++i)
+    contact.penalty(i, assembly.own_stiffness(i), &added_[6L * i]);
   assembly.kernel.factor(view_, matrix_, {added_.data()});
   modes_ = contact.mode;
 }

@@ -190,7 +190,9 @@ Factor FactorStorage::view() {
           tiles.data(),
           panel.data(),
           updates.data(),
-          local.data()};
+          local.data(),
+          nullptr,
+          nullptr};
 }
 
 }  // namespace sim_core

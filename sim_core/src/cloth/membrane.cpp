@@ -6,14 +6,9 @@
 
 namespace sim_core {
 
-bool StretchTable::constant() const {
-  for (int r = 1; r < 6; ++r) {
-    if (k.row(r) != k.row(0)) return false;
-  }
-  return true;
-}
-
-Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const StretchTable& table) : table_(table) {
+Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabrics& fabrics)
+    : constant_(std::all_of(fabrics.list.begin(), fabrics.list.end(),
+                            [](const ClothProperties& fabric) { return fabric.stretching.constant(); })) {
   constexpr int W = membrane_lanes;
   const int count = static_cast<int>(mesh.triangles.rows()), groups = (count + W - 1) / W;
   nodes_.assign(3 * W * groups, 0);
@@ -35,7 +30,8 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Stre
     const Eigen::Matrix2d inverse = edges.inverse();  // rows: gradients of the shape functions
     for (int c = 0; c < 4; ++c) shape_[(4 * group + c) * W + lane] = inverse(c / 2, c % 2);
     area_[group * W + lane] = mesh.area[t];
-    for (int c = 0; c < 4; ++c) stiffness_[(4 * group + c) * W + lane] = table.k(0, c);
+    tables_.push_back(fabrics.at(t).stretching);
+    for (int c = 0; c < 4; ++c) stiffness_[(4 * group + c) * W + lane] = tables_[t].k(0, c);
     int* slots = &slots_[9 * (group * W + lane)];
     const int pairs[9][2] = {{0, 1}, {1, 0}, {0, 2}, {2, 0}, {1, 2}, {2, 1}, {0, 0}, {1, 1}, {2, 2}};
     for (int k = 0; k < 9; ++k) slots[k] = numbering.membrane.slot(n[pairs[k][0]], n[pairs[k][1]]);
@@ -49,7 +45,7 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Stre
 }
 
 void Membrane::read_table(const Buffer<double>& x) {
-  if (table_.constant()) return;
+  if (constant_) return;
   for (int group = 0; group < data_.groups; ++group) {
     for (int lane = 0; lane < membrane_lanes; ++lane) {
       if (area_[group * membrane_lanes + lane] != 0.0) read_table(x, group, lane);
@@ -83,9 +79,10 @@ void Membrane::read_table(const Buffer<double>& x, int group, int lane) {
   const double place = std::min(angle / (M_PI / 8.0), 4.0);
   const int row = std::min(static_cast<int>(place), 3);
   const double between = place - row;
+  const StretchTable& table = tables_[group * W + lane];
   for (int c = 0; c < 4; ++c) {
-    const double far = (1.0 - between) * table_.k(1 + row, c) + between * table_.k(2 + row, c);
-    stiffness_[(4 * group + c) * W + lane] = (1.0 - share) * table_.k(0, c) + share * far;
+    const double far = (1.0 - between) * table.k(1 + row, c) + between * table.k(2 + row, c);
+    stiffness_[(4 * group + c) * W + lane] = (1.0 - share) * table.k(0, c) + share * far;
   }
 }
 

@@ -1,6 +1,8 @@
 // Stretching: triangles in groups, and the table of their stiffness.
 #pragma once
 
+#include <vector>
+
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
 #include "cloth/properties.hpp"
@@ -10,7 +12,7 @@ namespace sim_core {
 
 class Membrane {
  public:
-  Membrane(const ClothMesh& mesh, const Numbering& numbering, const StretchTable& table);
+  Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabrics& fabrics);
   Membrane(const Membrane&) = delete;
 
   const MembraneData& data() const { return data_; }
@@ -21,7 +23,8 @@ class Membrane {
  private:
   void read_table(const Buffer<double>& x, int group, int lane);
 
-  StretchTable table_;
+  std::vector<StretchTable> tables_;  // of the triangles
+  bool constant_;
   Buffer<int> nodes_, slots_;
   Buffer<double> shape_, area_, stiffness_;
   MembraneData data_{};

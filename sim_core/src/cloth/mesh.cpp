@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <map>
+#include <numeric>
 #include <utility>
 
 #include "cloth/refusal.hpp"
@@ -53,6 +54,22 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
   for (Eigen::Index v = 0; v < rest.rows(); ++v) {
     if (!used[v]) refuse(text("rest: every vertex must belong to a triangle, and ", v, " does not"));
   }
+}
+
+std::vector<int> ClothMesh::sheets() const {
+  std::vector<int> root(rest.rows()), sheet(rest.rows());
+  std::iota(root.begin(), root.end(), 0);
+  const auto find = [&](int i) {
+    while (root[i] != i) i = root[i] = root[root[i]];
+    return i;
+  };
+  for (const Edge& edge : edges) {
+    const int a = find(edge.a), b = find(edge.b);
+    root[std::max(a, b)] = std::min(a, b);
+  }
+  int count = 0;
+  for (int i = 0; i < static_cast<int>(sheet.size()); ++i) sheet[i] = find(i) == i ? count++ : sheet[find(i)];
+  return sheet;
 }
 
 }  // namespace sim_core

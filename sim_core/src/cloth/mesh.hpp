@@ -29,6 +29,9 @@ struct ClothMesh {
 
   // Throws std::invalid_argument, naming the field, unless this is a triangulation of a surface with positive areas.
   ClothMesh(Points2 rest, Triangles triangles);
+
+  // Sheet of each vertex: pieces that hang together, in the order of their first vertices.
+  std::vector<int> sheets() const;
 };
 
 }  // namespace sim_core

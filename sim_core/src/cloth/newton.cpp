@@ -14,6 +14,14 @@ using Eigen::Vector3d;
 constexpr double contact_share = 0.1;
 // Iterations after which a contact that turns back is held.
 constexpr int reversals_from = 4;
+// With pairs: rounds of making pairs bear in an iteration, and the tolerance of GMRES, which predicts their gaps.
+constexpr int rounds_max = 6;
+constexpr double pairs_tolerance = 1e-4;
+// A gap or a slip of a pair that counts as much as the tolerance does, m.
+constexpr double length_tolerance = 2e-9;
+// Where pairs that say nearly the same contradict each other, their forces grow apart until one lets go: by so much
+// more from one iteration to the next while the error falls by less than to this share.
+constexpr double hurry = 4.0, hurry_max = 1024.0, stalled = 0.5;
 
 }  // namespace
 
@@ -35,15 +43,25 @@ void Newton::evaluate(const Buffer<double>& x, bool with_matrix) {
 }
 
 // R = M ((x - x_inertial)/dt^2 + c (x - x_start)/dt) + grad E, and the branch of each contact's law.
-Norms Newton::look(const StepProblem& problem, const Buffer<double>& x) {
+Norms Newton::look(const StepProblem& problem, const Buffer<double>& x, double share) {
   const Stopwatch watch(phases.contact);
-  const double inertia = 1.0 / (problem.dt * problem.dt), viscous = problem.damping / problem.dt;
+  const double inertia = 1.0 / (problem.dt * problem.dt);
   for (int i = 0; i < assembly_.numbering.nodes; ++i) {
+    const double viscous = (problem.damping + assembly_.own_damping[i]) / problem.dt;
     at_node(residual, i) = assembly_.mass[i] * (inertia * (at_node(x, i) - at_node(problem.inertial, i)) +
                                                 viscous * (at_node(x, i) - at_node(problem.start, i))) +
                            at_node(assembly_.gradient, i);
   }
-  return contact.sort(x, problem.start, residual, problem.at_start, problem.at_end);
+  if (pairs) pairs->look(x, share, residual);
+  Norms norms = contact.sort(x, problem.start, residual, problem.at_start, problem.at_end);
+  if (pairs) pairs->count_errors(settings_.tolerance / length_tolerance, norms);
+  return norms;
+}
+
+// Whether held nodes are at their ends.
+bool Newton::arrived(const Buffer<double>& x) const {
+  return !pairs || std::equal(x.begin() + 4L * assembly_.numbering.free_nodes, x.end(),
+                              ends_.begin() + 4L * assembly_.numbering.free_nodes);
 }
 
 void Newton::predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const {
@@ -63,21 +81,28 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   const int free_nodes = assembly_.numbering.free_nodes;
   contact.hold_reversed = false;
   predict(problem, x, from_rest);
+  if (pairs) {
+    const Stopwatch watch(phases.contact);
+    ends_ = x;
+    pairs->near.cap(problem.start, x);
+  }
   assembly_.set_diagonal(problem.dt, problem.damping);
   factors.of(problem.dt);
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
+  if (pairs) pairs->begin(problem.start, ends_, contact.stiffness, contact_share);
   Norms norms = look(problem, x);
+  if (pairs) pairs->mark_best();
   const bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);
   std::vector<int> modes = contact.mode;
   double window[4];
   std::fill(window, window + 4, norms.squared);
   trial_ = best_ = x;
-  double least = norms.squared;
+  double least = norms.squared, forces_share = 1.0;
   for (int iteration = 0; iteration < iterations; ++iteration) {
     contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
-    if (iteration > 0 && norms.largest <= settings_.tolerance) break;
+    if (iteration > 0 && norms.largest <= settings_.tolerance && arrived(x)) break;
     if (!std::isfinite(norms.squared)) break;
     ++report.newton;
     correct(problem, x, krylov_tolerance, report);
@@ -88,34 +113,78 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     for (int cut = 0;; ++cut) {
       trial_ = x;
       for (int i = 0; i < 4 * free_nodes; ++i) trial_[i] += share * change_[i];
+      if (pairs) {
+        const Stopwatch watch(phases.contact);
+        std::copy(ends_.begin() + 4L * free_nodes, ends_.end(), trial_.begin() + 4L * free_nodes);
+        pairs->near.cap(x, trial_);
+      }
       evaluate(trial_, true);
-      next = look(problem, trial_);
+      next = look(problem, trial_, share * forces_share);
+      if (forces_share > 1.0 && next.squared > limit) {
+        forces_share = 1.0;
+        continue;
+      }
       if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5 || (iteration == 0 && resumed)) break;
       share *= 0.5;
     }
     for (int i = 0; i < free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
     modes = contact.mode;
     std::swap(x, trial_);
+    const bool stalls =
+        pairs && pairs->active() && share == 1.0 && next.squared > stalled * norms.squared && pairs->settled();
+    forces_share = stalls ? std::min(hurry * forces_share, hurry_max) : 1.0;
     norms = next;
     if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);
     window[iteration % 4] = norms.squared;
-    if (norms.squared < least) least = norms.squared, best_ = x;
+    if (norms.squared < least) {
+      least = norms.squared, best_ = x;
+      if (pairs) pairs->mark_best();
+    }
   }
   if (!(norms.largest <= settings_.tolerance)) {
     x = best_;
+    if (pairs) pairs->return_to_best();
     evaluate(x, true);
     norms = look(problem, x);
   }
-  return {norms.largest <= settings_.tolerance, norms.largest};
+  return {norms.largest <= settings_.tolerance && arrived(x), norms.largest};
 }
 
 // Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
 void Newton::correct(const StepProblem& problem, const Buffer<double>& x, double krylov_tolerance, StepReport& report) {
-  StaleFactor& factor = factors.latest();
+  if (pairs) force_ = contact.force;
+  if (!pairs || !pairs->active()) {
+    StaleFactor& factor = factors.latest();
+    {
+      const Stopwatch watch(phases.factorization);
+      report.factorizations += factor.renew(assembly_, x, contact, problem.dt, settings_);
+    }
+    const KrylovResult solved = solve_linear(factor.view(), krylov_tolerance);
+    factor.spent(solved.iterations);
+    report.krylov += solved.iterations;
+  } else {
+    correct_with_pairs(problem, x, report);
+  }
+  if (!pairs) return;
+  for (int round = 0; round < rounds_max && pairs->activate(change_); ++round) correct_with_pairs(problem, x, report);
+  pairs->solved(change_);
+}
+
+void Newton::correct_with_pairs(const StepProblem& problem, const Buffer<double>& x, StepReport& report) {
   {
     const Stopwatch watch(phases.factorization);
-    report.factorizations += factor.renew(assembly_, x, contact, problem.dt, settings_);
+    report.factorizations += pair_factor_.renew(assembly_, x, contact, *pairs, problem.dt, settings_);
   }
+  contact.force = force_;
+  pair_rows_ = pairs->rows();
+  assembly_.matrix.pairs = &pair_rows_;
+  const KrylovResult solved = solve_linear(pair_factor_.view(), std::min(settings_.krylov_tolerance, pairs_tolerance));
+  assembly_.matrix.pairs = nullptr;
+  pair_factor_.spent(solved.iterations);
+  report.krylov += solved.iterations;
+}
+
+KrylovResult Newton::solve_linear(const Factor& factor, double krylov_tolerance) {
   const Stopwatch watch(phases.krylov);
   subtract_corrections();
   double size = 0.0;
@@ -123,18 +192,19 @@ void Newton::correct(const StepProblem& problem, const Buffer<double>& x, double
   size = std::sqrt(size);
   const double tolerance = std::max(krylov_tolerance, 0.3 * settings_.tolerance / std::max(size, 1e-300));
   const KrylovResult solved =
-      assembly_.kernel.krylov(assembly_.matrix, factor.view(), contact.rows(), contact.force.data(), change_.data(),
+      assembly_.kernel.krylov(assembly_.matrix, factor, contact.rows(), contact.force.data(), change_.data(),
                               work_.data(), settings_.krylov_max, std::min(tolerance, 0.5));
-  factor.spent(solved.iterations);
-  report.krylov += solved.iterations;
   for (int i = 0; i < 4 * assembly_.numbering.free_nodes; ++i) change_[i] += contact.correction[i];
+  return solved;
 }
 
-// What contact prescribes, `correction`, goes to the right-hand side.
+// What contact prescribes, `correction`, goes to the right-hand side, and what pairs' forces do of themselves.
 void Newton::subtract_corrections() {
   const Buffer<float>& correction = contact.correction;
-  if (std::all_of(correction.begin(), correction.end(), [](float c) { return c == 0.0f; })) return;
+  const bool with_pairs = assembly_.matrix.pairs != nullptr;
+  if (!with_pairs && std::all_of(correction.begin(), correction.end(), [](float c) { return c == 0.0f; })) return;
   assembly_.kernel.apply(assembly_.matrix, correction.data(), image_.data());
+  if (with_pairs) pairs->subtract_right_side(image_);
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     if (contact.mode[i] == contact_stick) continue;
     auto force = at_node(contact.force, i), pulled = at_node(image_, i);

@@ -1,18 +1,21 @@
 // One implicit step: M (x - x0 - dt v0)/dt^2 + c M (x - x0)/dt + grad E(x) = M g + contact, by Newton's method.
 #pragma once
 
+#include <memory>
 #include <vector>
 
 #include "cloth/assembly.hpp"
 #include "cloth/factor.hpp"
+#include "cloth/pair_factor.hpp"
 #include "cloth/settings.hpp"
+#include "contact/pairs.hpp"
 #include "contact/state.hpp"
 
 namespace sim_core {
 
 // What a step starts from and is driven by.
 struct StepProblem {
-  double dt, damping;              // s, 1/s
+  double dt, damping;              // s, 1/s: on top of the fabrics' own
   const Buffer<double>& start;     // (nodes, 4): positions at its start, m
   const Buffer<double>& inertial;  // (nodes, 4): where inertia and gravity alone lead, x0 + dt v0 + dt^2 g
   const Buffer<double>& velocity;  // (nodes, 4): at its start, m/s
@@ -31,12 +34,13 @@ class Newton {
 
   ContactState contact;
   FactorPool factors;
-  Buffer<double> residual;  // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
+  std::unique_ptr<Pairs> pairs;  // of cloth with cloth; null where it does not feel itself
+  Buffer<double> residual;       // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
   ClothPhases phases;
 
   // Solves for the free nodes of x, or leaves the best found in it; its held nodes are at their ends. `from_rest`:
   // begins at the start of the step, not where the velocity leads. GMRES stops at `krylov_tolerance` of its right-hand
-  // side.
+  // side. Nothing crosses on the way from the start of the step, held nodes included, which arrive as pairs let them.
   StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report,
                     double krylov_tolerance);
 
@@ -46,14 +50,20 @@ class Newton {
   void evaluate(const Buffer<double>& x, bool with_matrix);
 
  private:
-  Norms look(const StepProblem& problem, const Buffer<double>& x);
+  // `share`: of the last changes of the pairs' forces.
+  Norms look(const StepProblem& problem, const Buffer<double>& x, double share = 0.0);
   void correct(const StepProblem& problem, const Buffer<double>& x, double krylov_tolerance, StepReport& report);
+  void correct_with_pairs(const StepProblem& problem, const Buffer<double>& x, StepReport& report);
+  KrylovResult solve_linear(const Factor& factor, double krylov_tolerance);
   void subtract_corrections();
+  bool arrived(const Buffer<double>& x) const;
 
   Assembly& assembly_;
   ClothSettings settings_;
-  Buffer<double> trial_, best_;
-  Buffer<float> change_, work_, image_;
+  PairFactor pair_factor_;
+  PairData pair_rows_{};
+  Buffer<double> trial_, best_, ends_;
+  Buffer<float> change_, work_, image_, force_;
 };
 
 }  // namespace sim_core

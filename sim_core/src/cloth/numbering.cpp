@@ -55,12 +55,15 @@ Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::
 }  // namespace
 
 Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
-                     const std::vector<std::int32_t>& held_vertices, int slopes_in)
-    : vertices(static_cast<int>(mesh.rest.rows())), slopes(slopes_in), nodes(vertices + slopes) {
+                     const std::vector<std::int32_t>& held_vertices, int slopes_in, int others_in)
+    : vertices(static_cast<int>(mesh.rest.rows())),
+      slopes(slopes_in),
+      others(others_in),
+      nodes(vertices + slopes + others) {
   const std::vector<int> free_vertices = free_of(vertices, held_vertices);
   free_nodes = static_cast<int>(free_vertices.size());
   std::vector<int> local(vertices, -1);
-  Points2 points(free_nodes, 2);
+  Eigen::MatrixXd points(free_nodes, 2);
   for (int i = 0; i < free_nodes; ++i) {
     local[free_vertices[i]] = i;
     points.row(i) = mesh.rest.row(free_vertices[i]);

@@ -11,11 +11,11 @@ constexpr int piece_max = 16;
 
 struct Dissector {
   const Graph& graph;
-  const Points2& points;
+  const Eigen::MatrixXd& points;
   Dissection out;
   std::vector<char> side;
 
-  Dissector(const Graph& graph_in, const Points2& points_in)
+  Dissector(const Graph& graph_in, const Eigen::MatrixXd& points_in)
       : graph(graph_in), points(points_in), side(graph_in.size(), 0) {}
 
   int emit(const std::vector<int>& pivots, const std::vector<int>& children) {
@@ -29,12 +29,13 @@ struct Dissector {
 
   int dissect(std::vector<int> nodes) {
     if (static_cast<int>(nodes.size()) <= piece_max) return emit(nodes, {});
-    Eigen::Vector2d low = points.row(nodes[0]), high = low;
+    Eigen::VectorXd low = points.row(nodes[0]), high = low;
     for (int i : nodes) {
       low = low.cwiseMin(points.row(i).transpose());
       high = high.cwiseMax(points.row(i).transpose());
     }
-    const int axis = high.x() - low.x() >= high.y() - low.y() ? 0 : 1;
+    int axis = 0;
+    (high - low).maxCoeff(&axis);
     std::sort(nodes.begin(), nodes.end(), [&](int a, int b) {
       const double u = points(a, axis), v = points(b, axis);
       return u != v ? u < v : a < b;
@@ -62,7 +63,7 @@ struct Dissector {
 
 }  // namespace
 
-Dissection nested_dissection(const Graph& graph, const Points2& points) {
+Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points) {
   Dissector dissector(graph, points);
   dissector.out.pivot_begin.push_back(0);
   std::vector<int> all(graph.size());

@@ -15,8 +15,8 @@ struct Dissection {
   std::vector<int> parent;       // (fronts): -1 at the root
 };
 
-// Bisects along the longer side of what is left, by the coordinates of the mesh at rest [George 1973].
-Dissection nested_dissection(const Graph& graph, const Points2& points);
+// Bisects along the longest side of what is left, by coordinates in the plane or in space [George 1973].
+Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points);
 
 // Which nodes each row of a matrix has entries for, in compressed rows: those of row i are node[begin[i]] ... ,
 // ascending.

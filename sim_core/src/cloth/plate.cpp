@@ -87,7 +87,7 @@ SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Ve
 
 }  // namespace
 
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped,
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, const Edges& clamped,
                                       bool compact) {
   const int vertices = static_cast<int>(mesh.rest.rows()), count = static_cast<int>(mesh.triangles.rows());
   std::vector<std::vector<int>> around(count);
@@ -155,6 +155,7 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rig
     }
     Eigen::Matrix3d project = Eigen::Matrix3d::Identity();
     if (!open.empty()) {
+      const Rigidity& rigidity = fabrics.at(t).rigidity;
       Eigen::MatrixXd n(3, open.size());
       for (std::size_t i = 0; i < open.size(); ++i) n.col(i) = open[i];
       project -= n * (n.transpose() * rigidity * n).ldlt().solve(n.transpose() * rigidity);

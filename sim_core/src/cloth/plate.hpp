@@ -4,11 +4,9 @@
 #include <Eigen/Core>
 #include <vector>
 
-#include "cloth/mesh.hpp"
+#include "cloth/properties.hpp"
 
 namespace sim_core {
-
-using Rigidity = Eigen::Matrix3d;  // D of (H11, H22, 2 H12), N m
 
 // Second derivatives of a triangle, (H11, H22, 2 H12), from the positions of `nodes`. Nodes from mesh.rest.rows() on
 // are the outward slopes that are prescribed at clamped edges, in their order.
@@ -21,7 +19,7 @@ struct Stencil {
 // slope d_e across the middle of the edge taken from a quadratic fitted to the nodes around [Morley 1968; the fit after
 // Grinspun et al. 2006]. At a free edge phi_e minimises the energy; at a clamped one d_e is given.
 // `compact`: the slope is that of the two triangles alone, an approximation that couples fewer nodes.
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Rigidity& rigidity, const Edges& clamped,
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, const Edges& clamped,
                                       bool compact = false);
 
 }  // namespace sim_core

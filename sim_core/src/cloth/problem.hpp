@@ -42,7 +42,8 @@ struct BendingData {
   const double* weights;   // (entries, 4): of H11, H22, 2 H12, and 0; 1/m^2
   const double* area;      // (triangles), m^2
   const double* spacing2;  // (triangles), m^2: square of the length over which a fold turns
-  double rigidity[6];      // 11 12 16 22 26 66, N m
+  const int* fabric;       // (triangles)
+  const double* rigidity;  // (fabrics, 6): 11 12 16 22 26 66, N m
   const int* slot_begin;   // (triangles): first slot of the lower pairs (i, j <= i) of the stencil, in order
   const int* slots;        // scalar slots of (i, j) and (j, i), -1 for held nodes
 };
@@ -59,7 +60,15 @@ struct FoldData {
   float* coefficients;  // (triangles, 2): aa, ab
 };
 
-// K = mass + bending (x) 1 + membrane + folds, over the free nodes.
+// Pairs of cloth with cloth that bear: each takes its force from the motion v = sum w_i dx_i of its four nodes.
+struct PairData {
+  int count;
+  const int* nodes;        // (count, 4), -1 for held ones
+  const float* weights;    // (count, 4)
+  const float* stiffness;  // (count, 3, 4): columns, N/m
+};
+
+// K = mass + bending (x) 1 + membrane + folds + pairs, over the free nodes.
 struct ClothMatrix {
   int nodes;
   const int* bending_begin;  // (nodes + 1)
@@ -70,6 +79,7 @@ struct ClothMatrix {
   float* membrane;  // (blocks, 3, 4): columns
   float* diagonal;  // (nodes): mass / dt^2 and damping, N/m
   const FoldData* folds;
+  const PairData* pairs;  // may be null
 };
 
 // State of a node in the linear problem of contact.
@@ -113,7 +123,9 @@ struct Factor {
   float* tiles;
   float* panel;  // the front that is being made
   float* updates;
-  float* local;  // one front's right-hand side
+  float* local;      // one front's right-hand side
+  const int* order;  // nodes by their place in a factor of its own order, or null
+  float* ordered;    // a vector in that order
 };
 
 // A node keeps its own stiffness, and in contact some more: the factor need not be exact.

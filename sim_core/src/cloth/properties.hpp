@@ -2,10 +2,13 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <vector>
 
-#include "cloth/plate.hpp"
+#include "cloth/mesh.hpp"
 
 namespace sim_core {
+
+using Rigidity = Eigen::Matrix3d;  // D of (H11, H22, 2 H12), N m
 
 // Stiffness against stretching after [Wang et al. 2011]: k0 ... k3 [N/m] of the energy k0 G00^2/2 + k1 G00 G11 +
 // k2 G11^2/2 + k3 G01^2. Row 0 holds at no strain, rows 1 ... 5 at `table_stretch` with the larger principal stretch
@@ -20,6 +23,17 @@ struct ClothProperties {
   double density;  // kg/m^2
   StretchTable stretching;
   Rigidity rigidity;
+  double damping;  // proportional to mass, 1/s
+};
+
+// The fabrics of a cloth: one for all of its sheets, or one for each.
+struct Fabrics {
+  std::vector<ClothProperties> list;
+  std::vector<int> of_triangle;
+
+  // Throws std::invalid_argument, naming `fabric`, where there are too many or too few.
+  Fabrics(const ClothMesh& mesh, std::vector<ClothProperties> list);
+  const ClothProperties& at(Eigen::Index triangle) const { return list[of_triangle[triangle]]; }
 };
 
 }  // namespace sim_core

@@ -1,6 +1,9 @@
 // Numbers by which the solver steps, and what a step reports.
 #pragma once
 
+#include <algorithm>
+#include <limits>
+
 namespace sim_core {
 
 struct ClothSettings {
@@ -17,8 +20,9 @@ struct StepReport {
   bool converged = true;
   double residual = 0.0;           // N: worst over the substeps
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
-  int substeps = 0, newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0;
-  double factorizations = 0.0;  // whole ones, and shares of those in part
+  int substeps = 0, newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
+  double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
+  double factorizations = 0.0;                                      // whole ones, and shares of those in part
 
   void add_work(const StepReport& other) {
     newton += other.newton;
@@ -36,6 +40,8 @@ struct StepReport {
     if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
     contacts = other.contacts;
     sliding = other.sliding;
+    pairs = other.pairs;
+    least_distance = std::min(least_distance, other.least_distance);
   }
 };
 

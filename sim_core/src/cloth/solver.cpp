@@ -5,6 +5,7 @@
 #include <numeric>
 
 #include "cloth/control.hpp"
+#include "cloth/intersections.hpp"
 #include "cloth/kernels/choice.hpp"
 #include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
@@ -34,23 +35,82 @@ struct LinearSolve {
   }
 };
 
+// How far nodes move before pairs are looked for anew, over the side of a cell.
+constexpr double margin_share = 0.15;
+
+using Triples = std::vector<std::array<int, 3>>;
+
+void append(const Triangles& triangles, const int* node, Triples& out) {
+  for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
+    out.push_back({node[triangles(t, 0)], node[triangles(t, 1)], node[triangles(t, 2)]});
+  }
+}
+
+// Throws std::invalid_argument, naming the field, where the cloth would feel itself at rest.
+void check_thickness(const ClothMesh& mesh, const std::vector<int>& sheets, const PairSettings& settings) {
+  Buffer<double> rest(4L * mesh.rest.rows(), 0.0);
+  for (Eigen::Index i = 0; i < mesh.rest.rows(); ++i) at_node(rest, i).head<2>() = mesh.rest.row(i).transpose();
+  std::vector<int> vertices(mesh.rest.rows());
+  std::iota(vertices.begin(), vertices.end(), 0);
+  Triples triangles;
+  append(mesh.triangles, vertices.data(), triangles);
+  const Eigen::Index count = settings.mu.rows();
+  Felt felt = Felt::Constant(count, count, false);  // sheets lie somewhere at rest, not on each other
+  for (Eigen::Index s = 0; s < count; ++s) felt(s, s) = settings.mu(s, s) >= 0.0;
+  const double reach = *std::max_element(settings.thickness.begin(), settings.thickness.end());
+  for (const Candidate& pair : candidates(Surface(triangles, sheets, felt), rest, reach)) {
+    const FourPoints at = points_of(pair, rest);
+    const double thickness = settings.thickness[sheets[pair.node[0]]];
+    if (between_closest(closest_weights(pair.kind, at), at).norm() > thickness) continue;
+    refuse(text("thickness: must be less than the distance at rest of vertices and edges that do not meet, and vertex ",
+                pair.node[0], " is nearer to one than ", thickness, " m"));
+  }
+}
+
+std::unique_ptr<Pairs> pairs_of(const ClothMesh& mesh, const Numbering& numbering, const PairSettings& settings,
+                                const SurfaceMeshes& surfaces) {
+  const std::vector<int> sheets = mesh.sheets();
+  check_thickness(mesh, sheets, settings);
+  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
+  std::vector<int> sheet_of_node(numbering.nodes, -1);
+  for (int i = 0; i < numbering.vertices; ++i) sheet_of_node[numbering.node[i]] = sheets[i];
+  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  for (int i = 0; i < numbering.others; ++i) sheet_of_node[others[i]] = count + surfaces.surface_of_vertex[i];
+  Triples triangles;
+  append(mesh.triangles, numbering.node.data(), triangles);
+  append(surfaces.triangles, others, triangles);
+  Surface surface(std::move(triangles), std::move(sheet_of_node), (settings.mu.array() >= 0.0).matrix());
+  const double cell = std::sqrt(2.0 * mesh.area.mean());
+  return std::make_unique<Pairs>(std::move(surface), settings, margin_share * cell, numbering.free_nodes);
+}
+
 }  // namespace
 
 struct ClothSolver::Impl {
+  const ClothMesh mesh;
+  const SurfaceMeshes surfaces;
+  const bool feels_itself;
   Assembly assembly;
   Stepper stepper;
   StepController controller;
   Newton& newton;
   const Numbering& numbering;
 
-  Impl(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
+  Impl(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
        const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-       const StepControl& control, const std::string& kernel)
-      : assembly(cloth_kernel_named(kernel), ClothMesh(rest, triangles), properties, held, clamped),
+       const StepControl& control, const std::string& kernel, const std::optional<PairSettings>& touch,
+       const SurfaceMeshes& surfaces_in)
+      : mesh(rest, triangles),
+        surfaces(surfaces_in),
+        feels_itself(touch && touch->mu(0, 0) >= 0.0),
+        assembly(cloth_kernel_named(kernel), mesh, Fabrics(mesh, fabrics), held, clamped,
+                 static_cast<int>(surfaces.surface_of_vertex.size())),
         stepper(assembly, settings),
         controller(stepper, control),
         newton(stepper.newton),
-        numbering(assembly.numbering) {}
+        numbering(assembly.numbering) {
+    if (touch) newton.pairs = pairs_of(mesh, numbering, *touch, surfaces);
+  }
 
   void load(const Points3& positions, const Points3& slopes, Buffer<double>& into) const {
     if (positions.rows() != numbering.vertices) refuse("positions: must have a row for each vertex");
@@ -62,6 +122,25 @@ struct ClothSolver::Impl {
     }
   }
 
+  void load_surfaces(const Points3& positions, Buffer<double>& into) const {
+    if (positions.rows() != numbering.others) refuse("surfaces: must keep their vertices");
+    if (!positions.allFinite()) refuse("surfaces: positions must be finite");
+    for (int i = 0; i < numbering.others; ++i) at_node(into, other(i)) = positions.row(i).transpose();
+  }
+
+  int other(int i) const { return numbering.node[numbering.vertices + numbering.slopes + i]; }
+
+  // Whether cloth crosses what it feels.
+  bool crosses(const Points3& positions, const Points3& others) const {
+    Points3 points(positions.rows() + others.rows(), 3);
+    points << positions, others;
+    Triangles all(mesh.triangles.rows() + surfaces.triangles.rows(), 3);
+    all << mesh.triangles, (surfaces.triangles.array() + static_cast<std::int32_t>(positions.rows())).matrix();
+    int unfelt = self_intersections(others, surfaces.triangles);
+    if (!feels_itself) unfelt += self_intersections(positions, mesh.triangles);
+    return self_intersections(points, all) > unfelt;
+  }
+
   Points3 unload(const Buffer<double>& from) const {
     Points3 out(numbering.vertices, 3);
     for (int i = 0; i < numbering.vertices; ++i) out.row(i) = at_node(from, numbering.node[i]).transpose();
@@ -69,22 +148,29 @@ struct ClothSolver::Impl {
   }
 };
 
-ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
+ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
                          const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-                         const StepControl& control, const std::string& kernel)
-    : impl_(std::make_unique<Impl>(rest, triangles, properties, held, clamped, settings, control, kernel)) {}
+                         const StepControl& control, const std::string& kernel,
+                         const std::optional<PairSettings>& touch, const SurfaceMeshes& surfaces)
+    : impl_(std::make_unique<Impl>(rest, triangles, fabrics, held, clamped, settings, control, kernel, touch,
+                                   surfaces)) {}
 ClothSolver::~ClothSolver() = default;
 
-void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes) {
+void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes,
+                            const Points3& surfaces) {
   impl_->load(positions, slopes, impl_->stepper.x);
+  impl_->load_surfaces(surfaces, impl_->stepper.x);
+  if (impl_->newton.pairs && impl_->crosses(positions, surfaces)) {
+    refuse("positions: must not cross a surface, and cloth that feels itself must not cross itself");
+  }
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
   impl_->stepper.restart();
   impl_->controller.restart();
 }
 
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
-                             const std::vector<Body>& bodies, double damping) {
-  return impl_->stepper.step(dt, {gravity, held, slopes, bodies, damping});
+                             const Points3& surfaces, const std::vector<Body>& bodies, double damping) {
+  return impl_->stepper.step(dt, {gravity, held, slopes, surfaces, bodies, damping});
 }
 
 StepReport ClothSolver::advance(double begin, double end, const Motion& motion) {
@@ -110,6 +196,37 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   std::vector<std::int32_t> out(numbering.vertices, 0);
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
+  }
+  return out;
+}
+
+Points3 ClothSolver::surface_forces() const {
+  Points3 out(impl_->numbering.others, 3);
+  for (int i = 0; i < impl_->numbering.others; ++i) {
+    out.row(i) = -at_node(impl_->newton.residual, impl_->other(i)).transpose();
+  }
+  return out;
+}
+
+ClothSolver::PairForces ClothSolver::pair_forces() const {
+  const Numbering& numbering = impl_->numbering;
+  std::vector<const Pair*> some;
+  if (impl_->newton.pairs) {
+    for (const Pair& pair : impl_->newton.pairs->list()) {
+      if (!pair.sight.force.isZero(0.0)) some.push_back(&pair);
+    }
+  }
+  const auto count = static_cast<Eigen::Index>(some.size());
+  PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), {}};
+  for (Eigen::Index p = 0; p < count; ++p) {
+    for (int c = 0; c < 4; ++c) {
+      const int vertex = numbering.vertex[some[p]->who.node[c]];
+      out.vertices(p, c) = vertex < numbering.vertices ? vertex : vertex - numbering.slopes;
+    }
+    out.weights.row(p) = some[p]->weights.transpose();
+    out.forces.row(p) = some[p]->sight.force.transpose();
+    out.distance[p] = some[p]->sight.gap + some[p]->thickness;
+    out.sliding.push_back(some[p]->row.mode == contact_slip);
   }
   return out;
 }

@@ -1,10 +1,11 @@
-// Dynamics of a piece of cloth in contact with moving bodies: implicit Euler, exact Coulomb friction.
+// Dynamics of cloth in contact with moving bodies, itself and moving surfaces: implicit Euler, exact Coulomb friction.
 #pragma once
 
 #include <Eigen/Core>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -13,24 +14,34 @@
 #include "cloth/properties.hpp"
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
+#include "contact/pairs.hpp"
 
 namespace sim_core {
 
+// Triangles that are no cloth, and which surface each of their vertices belongs to.
+struct SurfaceMeshes {
+  Triangles triangles;
+  std::vector<std::int32_t> surface_of_vertex;
+};
+
 class ClothSolver {
  public:
-  // `kernel`: level of the kernels, "" for the widest that this processor runs. `held`: vertices whose positions are
-  // prescribed; `clamped`: boundary edges whose outward slope is prescribed.
-  ClothSolver(const Points2& rest, const Triangles& triangles, const ClothProperties& properties,
+  // `kernel`: level of the kernels, "" for the widest that this processor runs. `fabrics`: one, or one of each sheet.
+  // `held`: vertices whose positions are prescribed; `clamped`: boundary edges whose outward slope is prescribed;
+  // `touch`: how the sheets, and then the surfaces, feel each other, if any do.
+  ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-              const StepControl& control, const std::string& kernel = "");
+              const StepControl& control, const std::string& kernel = "",
+              const std::optional<PairSettings>& touch = std::nullopt, const SurfaceMeshes& surfaces = {});
   ~ClothSolver();
 
-  void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes);
+  // `surfaces`: positions of their vertices.
+  void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes, const Points3& surfaces);
 
-  // `gravity`: acceleration of each vertex; `held` and `slopes`: at the end of the step; bodies keep their number and
-  // order from step to step. `damping`: mass-proportional, 1/s.
+  // `gravity`: acceleration of each vertex; `held`, `slopes` and `surfaces`: at the end of the step; bodies keep their
+  // number and order from step to step. `damping`: mass-proportional, 1/s, on top of the fabrics' own.
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
-                  const std::vector<Body>& bodies, double damping);
+                  const Points3& surfaces, const std::vector<Body>& bodies, double damping);
 
   // From `begin` to `end` by steps of the controller's choice; all intervals are equally long.
   StepReport advance(double begin, double end, const Motion& motion);
@@ -45,6 +56,20 @@ class ClothSolver {
   // Which body each vertex touches (-1: none), and whether it slides.
   std::vector<std::int32_t> contacts() const;
   std::vector<std::int32_t> sliding() const;
+
+  // Force of the cloth on each vertex of the surfaces at the end of the last step, N.
+  Points3 surface_forces() const;
+
+  // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices of surfaces come
+  // after those of the cloth.
+  struct PairForces {
+    Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
+    Eigen::Matrix<double, Eigen::Dynamic, 4, Eigen::RowMajor> weights;
+    Points3 forces;            // N: on sum w_i x_i
+    Eigen::VectorXd distance;  // m
+    std::vector<std::int32_t> sliding;
+  };
+  PairForces pair_forces() const;
 
   struct Energies {
     double membrane, bending;

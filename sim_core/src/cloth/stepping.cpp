@@ -29,6 +29,7 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings)
 void Stepper::restart() {
   started_ = false;
   newton.contact.forget();
+  if (newton.pairs) newton.pairs->restart();
 }
 
 // Sets where inertia leads, and the ends of what is held, for the part from `begin` to `end` of the step.
@@ -49,6 +50,10 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
     const int node = numbering.node[numbering.vertices + s];
     at_node(x, node) += share * (drive.slopes.row(s).transpose() - at_node(x, node));
   }
+  for (int o = 0; o < numbering.others; ++o) {
+    const int node = numbering.node[numbering.vertices + numbering.slopes + o];
+    at_node(x, node) += share * (drive.others.row(o).transpose() - at_node(x, node));
+  }
 }
 
 void Stepper::advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report) {
@@ -60,6 +65,7 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
   }
   const Buffer<double> from = x;
   drive_nodes(begin, end, part, drive);
+  const Buffer<double> driven = x;
   assembly_.read_table(start_);
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
   const bool deepest = depth == settings_.halvings_max;
@@ -71,6 +77,7 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
                            settings_.krylov_tolerance);
     // Modes of contact that flip to and fro under exact solves settle under loose ones.
     if (!outcome.converged) {
+      x = driven;
       outcome =
           newton.solve(problem, x, deepest, settings_.newton_max, report, std::max(loose, settings_.krylov_tolerance));
     }
@@ -92,6 +99,10 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
 // Makes the state that was solved for that of the cloth.
 void Stepper::take(double dt, double residual, StepReport& report) {
   newton.contact.keep(dt);
+  if (newton.pairs) {
+    newton.pairs->keep();
+    report.least_distance = std::min(report.least_distance, newton.pairs->least_distance());
+  }
   ++report.substeps;
   if (!(residual <= report.residual)) report.residual = residual;  // a NaN stays
   momentum_rate_.setZero();
@@ -137,6 +148,7 @@ void Stepper::count_contacts(StepReport& report) const {
     report.contacts += mode != contact_open;
     report.sliding += mode == contact_slip;
   }
+  if (newton.pairs) report.pairs = newton.pairs->bearing();
 }
 
 void Stepper::check(double dt, const Drive& drive) {
@@ -147,6 +159,8 @@ void Stepper::check(double dt, const Drive& drive) {
     refuse("held: must have a row for each held vertex");
   }
   if (drive.slopes.rows() != numbering.slopes) refuse("slopes: must have a row for each clamped edge");
+  if (drive.others.rows() != numbering.others) refuse("surfaces: must keep their vertices");
+  if (!drive.others.allFinite()) refuse("surfaces: positions must be finite");
   if (!drive.held.allFinite() || !drive.slopes.allFinite() || !drive.gravity.allFinite()) {
     refuse("held, slopes and gravity: must be finite");
   }

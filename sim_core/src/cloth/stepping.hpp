@@ -12,8 +12,9 @@ struct Drive {
   const Points3& gravity;  // (V, 3), m/s^2
   const Points3& held;     // (held, 3), m
   const Points3& slopes;   // (clamped edges, 3)
+  const Points3& others;   // (vertices of surfaces, 3), m
   const std::vector<Body>& bodies;
-  double damping;  // 1/s
+  double damping;  // 1/s: on top of the fabrics' own
 };
 
 class Stepper {

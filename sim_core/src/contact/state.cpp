@@ -1,11 +1,19 @@
 #include "contact/state.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
 namespace sim_core {
 
 using Eigen::Vector3d;
+
+namespace {
+
+// Contact stiffness in a factor over a node's own.
+constexpr float factor_share = 100.0f;
+
+}  // namespace
 
 void Norms::count(double force_squared) {
   squared += force_squared;
@@ -25,6 +33,23 @@ ContactState::ContactState(int free_nodes)
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), mu.data(), turning.data()};
+}
+
+void ContactState::penalty(int node, double own, float* out) const {
+  std::fill(out, out + 6, 0.0f);
+  if (mode[node] == contact_open) return;
+  const float k = factor_share * static_cast<float>(own);
+  const float* n = &normal[4L * node];
+  const float* t = &direction[4L * node];
+  const float side = mode[node] == contact_stick ? k : std::min(turning[node], k);
+  const float along = mode[node] == contact_stick ? k : 0.0f;
+  // k n n^T + along t t^T + side (1 - n n^T - t t^T)
+  int e = 0;
+  for (int r = 0; r < 3; ++r) {
+    for (int c = r; c < 3; ++c) {
+      out[e++] = (k - side) * n[r] * n[c] + (along - side) * t[r] * t[c] + (r == c ? side : 0.0f);
+    }
+  }
 }
 
 Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,

@@ -44,6 +44,10 @@ class ContactState {
 
   ContactRows rows() const;
 
+  // Contact of a node as a penalty, for factors: xx xy xz yy yz zz, N/m. k n n^T where it slips, and against a turn of
+  // friction; k in all directions where it sticks; k by the node's own stiffness.
+  void penalty(int node, double own, float* out) const;
+
  private:
   ContactSight sight(int node, int body, const Gap& gap, const Buffer<double>& x, const Buffer<double>& start,
                      const Buffer<double>& residual, const std::vector<Body>& at_start,

@@ -17,6 +17,7 @@ from stickslip_schemas.samples import SPLITS
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.export import content as content_module
+from stickslip_training.export import mds
 from stickslip_training.export.content import Content
 from typer.testing import CliRunner
 
@@ -142,6 +143,36 @@ def test_huggingface_is_the_source(source: Any, tmp_path: Path, monkeypatch: pyt
                 assert rows.features[name].names == list(map(str, arrays[name].categories))
 
 
+def test_mds_is_the_source(source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    streaming = pytest.importorskip(
+        "streaming",
+        reason="mosaicml-streaming is not installed; it wants numpy < 2.2: docs/export.md says how to test it",
+    )
+    monkeypatch.setattr(mds, "FILE_BYTES", 2 * sum(array.sample_bytes for array in layout(source.spec)) + 100)
+    target = tmp_path / "out"
+    export(source, "--mds", target)
+    wanted = expected(source)
+    arrays = {array.name: array for array in layout(source.spec)} | {"slot": content_module.SLOT}
+    for code, split in enumerate(SPLITS):
+        own = wanted["split"] == code
+        assert (target / split).exists() == own.any()
+        if not own.any():
+            continue
+        assert len(list((target / split).glob("*.mds"))) > 1 or own.sum() < 3
+        rows = streaming.StreamingDataset(
+            local=str(target), split=split, shuffle=False, batch_size=1, validate_hash="sha256"
+        )
+        assert len(rows) == own.sum()
+        found = [rows[place] for place in range(len(rows))]
+        assert set(found[0]) == set(wanted)
+        for name, values in wanted.items():
+            column = np.stack([sample[name] for sample in found])
+            if arrays[name].dtype == "bool":
+                column = column.view(bool)
+            assert same(column, values[own]), name
+    assert (target / "source-manifest.json").read_bytes() == (source.root / "manifest.json").read_bytes()
+
+
 def test_parquet_has_the_types_of_the_source(clips: Any, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     pytest.importorskip("datasets", reason="datasets is not installed")
@@ -215,7 +246,7 @@ def test_the_same_export_has_the_same_bytes(clips: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "an export needs one of --hdf5, --webdataset, --huggingface, and has none"),
+        ([], "an export needs one of --hdf5, --webdataset, --huggingface, --mds, and has none"),
         (["--webdataset", "OUT", "--huggingface", "OUT"], "and has --webdataset, --huggingface"),
         (["--webdataset", "OUT", "--gzip", "3"], "--gzip is for --hdf5 only"),
         (["--webdataset", "OUT", "--arrays", "movie"], "'movie' is none of them"),

@@ -2,13 +2,15 @@
 
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Body, Cloth, box, plane, sphere
+from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, box, plane, sphere
 
 __all__ = [
     "PRESETS",
     "Body",
     "Cloth",
     "Fabric",
+    "PairForces",
+    "SelfContact",
     "SolverSettings",
     "box",
     "fabric",

@@ -69,6 +69,24 @@ def grid(
     return Mesh(rest, triangles.astype(np.int32))
 
 
+def together(*parts: Mesh) -> Mesh:
+    """Return a mesh of several sheets, which lie side by side at rest; vertices keep their order, part by part.
+
+    Raises:
+        ValueError: There is no part.
+    """
+    if not parts:
+        raise ValueError("parts: must not be empty")
+    rest, triangles, right, count = [], [], 0.0, 0
+    for part in parts:
+        low, high = part.rest[:, 0].min(), part.rest[:, 0].max()
+        rest.append(part.rest + np.array([right - low, 0.0]))
+        triangles.append(part.triangles + count)
+        right += 1.1 * (high - low)
+        count += len(part.rest)
+    return Mesh(np.concatenate(rest), np.concatenate(triangles).astype(np.int32))
+
+
 def unstructured(width: float, length: float, spacing: float, seed: int = 0) -> Mesh:
     """Triangulate [-width/2, width/2] x [-length/2, length/2] by a Delaunay mesh of scattered vertices.
 

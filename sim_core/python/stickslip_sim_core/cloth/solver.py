@@ -1,4 +1,4 @@
-"""Pieces of cloth that move in contact with bodies: the thin face of the C++ solver."""
+"""Cloth that moves in contact with bodies, itself and surfaces: the thin face of the C++ solver."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh
+from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.meshes import Mesh
@@ -25,6 +25,11 @@ RESIDUAL_PATCH = 0.005**2
 GRAVITY = 9.81
 """[m/s^2]"""
 
+THICKNESS = 5e-4
+"""Of cloth that feels itself or a surface, unless another is given [m]."""
+
+BodyTuple = tuple[int, float, Floats, Floats, Floats]
+
 
 @dataclass(frozen=True)
 class Body:
@@ -40,7 +45,7 @@ class Body:
         if not 0.0 <= self.mu <= MU_MAX:
             raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {self.mu}")
 
-    def as_tuple(self) -> tuple[int, float, Floats, Floats, Floats]:
+    def as_tuple(self) -> BodyTuple:
         """Return what the C++ core takes."""
         return (
             self.shape,
@@ -78,21 +83,142 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
     return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
 
 
+@dataclass(frozen=True, eq=False)
+class SelfContact:
+    """How cloth feels itself and other cloth: nothing crosses, with exact Coulomb friction.
+
+    Raises:
+        ValueError: A number breaks its rule.
+    """
+
+    mu: float | ArrayLike
+    """Coefficient of friction, 0 ... 10; of several sheets, those of each two: (S, S), symmetric. Sheets are the pieces
+    of the mesh that hang together, in the order of their first vertices."""
+
+    thickness: float | ArrayLike = THICKNESS
+    """Of the sheets [m], or of each: (S,). Two sheets stay the mean of theirs apart, from middle to middle; a sheet of
+    its own must be less than the distance at rest of any of its vertices and edges that do not meet."""
+
+    def __post_init__(self) -> None:
+        mu = np.asarray(self.mu, float)
+        if not ((mu >= 0.0) & (mu <= MU_MAX)).all():
+            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {mu.tolist()}")
+        if mu.ndim and not (mu.ndim == 2 and mu.shape[0] == mu.shape[1] and (mu == mu.T).all()):
+            raise ValueError(f"mu: must be a number or a symmetric matrix, got {mu.tolist()}")
+        thickness = np.asarray(self.thickness, float)
+        if thickness.ndim > 1 or not (np.isfinite(thickness) & (thickness > 0.0)).all():
+            raise ValueError(f"thickness: must be finite and > 0, one or one a sheet, got {thickness.tolist()}")
+
+    def of_sheets(self, sheets: int) -> tuple[Floats, Floats]:
+        """Return mu of each two of so many sheets (S, S), and their thicknesses (S,) [m].
+
+        Raises:
+            ValueError: There are more or less in `mu` or in `thickness`.
+        """
+        mu, thickness = np.asarray(self.mu, float), np.asarray(self.thickness, float)
+        if mu.ndim and mu.shape != (sheets, sheets):
+            raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
+        if thickness.ndim and thickness.shape != (sheets,):
+            raise ValueError(f"thickness: must be of {sheets} sheets, got {thickness.tolist()}")
+        return np.broadcast_to(mu, (sheets, sheets)).copy(), np.broadcast_to(thickness, sheets).copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles that cloth touches, from either side, and whose vertices move as you say: a body of any shape.
+
+    It may be open or closed, cross itself, and bend as it moves. Nothing tells its inside from its outside: cloth that
+    starts on one side stays there. It is felt as cloth is, by pairs of closest points (see `SelfContact`).
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+
+    triangles: ArrayLike
+    """(T, 3): vertices of each triangle."""
+
+    positions: ArrayLike | Callable[[float], ArrayLike]
+    """(N, 3) [m], or a function of the time [s] that returns them. In each step vertices move on straight lines."""
+
+    mu: float | ArrayLike
+    """Coefficient of friction with the cloth, 0 ... 10; or with each of its sheets: (S,)."""
+
+    thickness: float = THICKNESS
+    """Of a skin around the triangles, half of it on each side [m]: cloth stays half of this and half of its own
+    thickness away from them. May be 0."""
+
+    def __post_init__(self) -> None:
+        mu = np.asarray(self.mu, float)
+        if mu.ndim > 1 or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
+            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
+        if not (np.isfinite(self.thickness) and self.thickness >= 0.0):
+            raise ValueError(f"thickness: must be finite and >= 0, got {self.thickness}")
+        triangles = np.array(self.triangles, dtype=np.int32)
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
+            raise ValueError(f"triangles: must be (T, 3) numbers of vertices, got shape {triangles.shape}")
+        object.__setattr__(self, "triangles", triangles)
+        corners = self.at(0.0)
+        if triangles.min() < 0 or triangles.max() >= len(corners):
+            raise ValueError(
+                f"triangles: must index {len(corners)} vertices, got {triangles.min()} ... {triangles.max()}"
+            )
+        a, b, c = np.moveaxis(corners[triangles], 1, 0)
+        flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) == 0.0)
+        if len(flat):
+            raise ValueError(f"triangles: must have an area, and triangle {flat[0]} has none")
+
+    def at(self, time: float) -> Floats:
+        """Return the positions of the vertices at a time [s]: (N, 3) [m].
+
+        Raises:
+            ValueError: They are not (N, 3) or not finite.
+        """
+        found = np.ascontiguousarray(self.positions(time) if callable(self.positions) else self.positions, dtype=float)
+        if found.ndim != 2 or found.shape[1] != 3:
+            raise ValueError(f"positions: must be (N, 3), got shape {found.shape} at {time:g} s")
+        if not np.isfinite(found).all():
+            raise ValueError(f"positions: must be finite, and are not at {time:g} s")
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class PairForces:
+    """Forces of cloth on cloth and surfaces: P pairs of closest points."""
+
+    vertices: NDArray[np.int32]
+    """(P, 4); those of surfaces come after those of the cloth."""
+
+    weights: Floats
+    """(P, 4): the force acts on each vertex by its weight."""
+
+    forces: Floats
+    """(P, 3) [N]"""
+
+    distance: Floats
+    """(P,) [m]"""
+
+    sliding: NDArray[np.bool_]
+    """(P,)"""
+
+
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
 """What drives a cloth at a time [s]: gravity (V, 3), positions of held vertices (K, 3), bodies."""
 
 
 class Cloth:
-    """A piece of cloth, its state, and the settings by which it is stepped.
+    """Cloth, its state, and the settings by which it is stepped: a sheet, or several in one mesh.
 
     Args:
-        mesh: The cloth at rest.
-        fabric: What it is made of.
+        mesh: The cloth at rest; `meshes.together` puts several sheets into one.
+        fabric: What it is made of; or what each sheet is made of: sheets are the pieces of the mesh that hang together,
+            in the order of their first vertices.
         preset: Solver settings.
         held: (K,) vertices whose positions are prescribed.
         clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
             outward normal of the rest plane.
-        force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the cloth.
+        self_contact: How it feels itself, and its sheets each other; None: it does not, and passes through itself.
+        surfaces: Triangles that it touches. They are where they are at the time of the cloth.
+        force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the lightest fabric.
         kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
             that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
 
@@ -103,28 +229,37 @@ class Cloth:
     def __init__(
         self,
         mesh: Mesh,
-        fabric: Fabric,
+        fabric: Fabric | Sequence[Fabric],
         preset: SolverSettings,
         *,
         held: ArrayLike = (),
         clamped: ArrayLike | None = None,
+        self_contact: SelfContact | None = None,
+        surfaces: Sequence[Surface] = (),
         force_scale: float | None = None,
         kernel: str | None = None,
     ) -> None:
-        self.mesh, self.fabric, self.preset = mesh, fabric, preset
+        self.mesh, self.preset = mesh, preset
+        self.fabrics = (fabric,) if isinstance(fabric, Fabric) else tuple(fabric)
+        """One, or one of each sheet."""
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
         edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
         self.slopes = np.zeros((len(edges), 3))
         check_mesh(mesh.rest, mesh.triangles)
-        patch_weight = fabric.density * RESIDUAL_PATCH * GRAVITY
+        self.surfaces = tuple(surfaces)
+        self.self_contact = self_contact
+        self.time = 0.0
+        """[s]"""
+        sizes = [len(surface.at(self.time)) for surface in self.surfaces]
+        corners = [np.asarray(surface.triangles) for surface in self.surfaces]
+        mu, thickness = self._touch(sheet_count(mesh.rest, mesh.triangles))
+        patch_weight = min((fabric.density for fabric in self.fabrics), default=np.nan) * RESIDUAL_PATCH * GRAVITY
         self.force_scale = patch_weight if force_scale is None else force_scale
         """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given."""
         self._solver = ClothSolver(
             mesh.rest,
             mesh.triangles,
-            fabric.density,
-            fabric.stretching,
-            fabric.rigidity,
+            [(fabric.density, fabric.stretching, fabric.rigidity, fabric.damping) for fabric in self.fabrics],
             self.held.tolist(),
             edges,
             tolerance=preset.tolerance * self.force_scale,
@@ -138,8 +273,17 @@ class Cloth:
             coarsest=preset.coarsest,
             finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
+            thickness=thickness.tolist(),
+            mu=mu,
+            surface_triangles=np.concatenate(
+                [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))], dtype=np.int32
+            ),
+            surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
         )
-        self.time = 0.0
+        self._surface_sizes = sizes
+        self.least_distance = np.inf
+        """Of pieces of cloth that do not hang together, and of cloth and surfaces, at the ends of all steps [m]; inf
+        where none came near."""
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
@@ -147,6 +291,27 @@ class Cloth:
         self.factorizations = 0.0
         """Whole ones, and shares of those in part."""
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
+
+    def _touch(self, sheets: int) -> tuple[Floats | None, Floats]:
+        """Return mu of each two sheets and surfaces, or None; -1 where they do not feel each other; and thicknesses."""
+        if not self.self_contact and not self.surfaces:
+            return None, np.empty(0)
+        mu = np.full((sheets + len(self.surfaces),) * 2, -1.0)
+        thickness = np.full(sheets, THICKNESS)
+        if self.self_contact:
+            mu[:sheets, :sheets], thickness = self.self_contact.of_sheets(sheets)
+        for column, surface in enumerate(self.surfaces, start=sheets):
+            own = np.asarray(surface.mu, float)
+            if own.ndim and own.shape != (sheets,):
+                raise ValueError(f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}")
+            mu[:sheets, column] = mu[column, :sheets] = own
+        return mu, np.append(thickness, [surface.thickness for surface in self.surfaces])
+
+    def _surfaces_at(self, time: float) -> Floats:
+        found = [surface.at(time) for surface in self.surfaces]
+        if [len(one) for one in found] != self._surface_sizes:
+            raise ValueError(f"positions: of surfaces must keep their vertices, and do not at {time:g} s")
+        return np.concatenate([np.empty((0, 3)), *found])
 
     @property
     def kernel(self) -> str:
@@ -183,15 +348,32 @@ class Cloth:
         """(V,): whether a vertex slides on its body."""
         return np.asarray(self._solver.sliding(), dtype=bool)
 
+    @property
+    def pair_forces(self) -> PairForces:
+        """Forces of cloth on cloth and surfaces at the end of the last step."""
+        vertices, weights, forces, distance, sliding = self._solver.pair_forces()
+        return PairForces(vertices, weights, forces, distance, np.asarray(sliding, dtype=bool))
+
+    @property
+    def surface_forces(self) -> list[Floats]:
+        """Forces of the cloth on the vertices of each surface at the end of the last step: (N, 3) [N]."""
+        return np.split(np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1])
+
     def set_state(
         self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
     ) -> None:
-        """Put the cloth somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3)."""
+        """Put the cloth somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3).
+
+        Surfaces are where they are at the time of the cloth.
+
+        Raises:
+            ValueError: The cloth crosses a surface, or itself although it feels itself; or an array has another shape.
+        """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
         if slopes is not None:
             self.slopes = np.asarray(slopes, float)
-        self._solver.set_state(at, speed, self.slopes)
+        self._solver.set_state(at, speed, self.slopes, self._surfaces_at(self.time))
 
     def step(
         self,
@@ -204,7 +386,8 @@ class Cloth:
     ) -> StepReport:
         """Advance by dt [s]; positions of held vertices (K, 3), slopes and bodies are those at its end.
 
-        In the first step after `set_state` bodies are taken to have been where they are.
+        In the first step after `set_state` bodies are taken to have been where they are. Surfaces move to where they
+        are at the end of the step.
 
         `damping` is proportional to mass [1/s]; that of the fabric is added.
         A step that does not converge is counted and its best iterate kept.
@@ -213,7 +396,13 @@ class Cloth:
             self.slopes = np.asarray(slopes, float)
         ends = np.asarray(held, float).reshape(-1, 3)
         report = self._solver.step(
-            dt, self.gravity, ends, self.slopes, [body.as_tuple() for body in bodies], damping + self.fabric.damping
+            dt,
+            self.gravity,
+            ends,
+            self.slopes,
+            self._surfaces_at(self.time + dt),
+            [body.as_tuple() for body in bodies],
+            damping,
         )
         self.time += dt
         return self._count(report)
@@ -225,14 +414,15 @@ class Cloth:
         [m/s^2], positions of the held vertices (K, 3) [m], and the bodies.
         """
 
-        def drive(time: float) -> tuple[Floats, Floats, Floats, list[tuple[int, float, Floats, Floats, Floats]]]:
+        def drive(time: float) -> tuple[Floats, Floats, Floats, Floats, list[BodyTuple]]:
             gravity, held, bodies = motion(time)
-            return gravity, np.asarray(held, float).reshape(-1, 3), self.slopes, [body.as_tuple() for body in bodies]
+            ends = np.asarray(held, float).reshape(-1, 3)
+            return gravity, ends, self.slopes, self._surfaces_at(time), [body.as_tuple() for body in bodies]
 
         if self.preset.step_error is None:
             report = self._advance_evenly(end, motion, damping)
         else:
-            report = self._count(self._solver.advance(self.time, end, drive, damping + self.fabric.damping))
+            report = self._count(self._solver.advance(self.time, end, drive, damping))
             self.gravity = motion(end)[0]
         self.time = end
         return report
@@ -246,7 +436,10 @@ class Cloth:
         return report
 
     def contact_force(self) -> Floats:
-        """Return the force of bodies on the cloth [N] in the last step: change of momentum less weight and holders."""
+        """Return the force of bodies and surfaces on the cloth [N] in the last step.
+
+        It is the change of momentum less weight and holders.
+        """
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
         force: Floats = np.asarray(self._solver.momentum_rate()) - weight - holders
@@ -263,6 +456,7 @@ class Cloth:
         self.factorizations += report.factorizations
         self.flips += report.flips
         self.halvings += report.halvings
+        self.least_distance = min(self.least_distance, report.least_distance)
         return report
 
     def softest(self) -> float:

@@ -11,6 +11,7 @@ from stickslip_sim_core.protocols import (
     lateral_buckling,
     rod_cantilever,
     rod_lateral_buckling,
+    stacked_incline,
     stick_slip,
 )
 from stickslip_sim_core.protocols.certification import CERTIFICATION, Certification
@@ -25,6 +26,7 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
         "cantilever": cantilever.run,
         "lateral-buckling": lateral_buckling.run,
         "inclined-plane": inclined_plane.run,
+        "stacked-incline": stacked_incline.run,
     }
 )
 

@@ -21,6 +21,7 @@ _EXACT: Mapping[str, Callable[[Floats], Floats]] = {
     "cantilever": master_curves.cantilever,
     "rod-cantilever": master_curves.cantilever,
     "inclined-plane": lambda mu: mu,
+    "stacked-incline": lambda mu: mu,
     "stick-slip": lambda mu: mu,
     "rod-lateral-buckling": lambda poisson: np.full_like(poisson, master_curves.lateral_buckling_rod()),
 }

@@ -393,6 +393,126 @@ def _boundary(poisson: float) -> _Boundary:
     return _Boundary(poisson)
 
 
+def capstan(mu: ArrayLike, wrap: float, bending: float = 0.0) -> Floats:
+    """Return T2/T1, the ratio of the tensions of a heavy pull and a light one, of a strip that slides over a cylinder.
+
+    A strip without weight, of stiffness D against bending, goes over a cylinder of radius R. With B = D / (2 R^2) each
+    free end meets the cylinder where 1 - cos(phi_i) = B / T_i, and presses on it there with sqrt(2 T_i B - B^2), which
+    rubs, too:
+
+        N1 = T1 - B + mu sqrt(2 T1 B - B^2),   T2 - B - mu sqrt(2 T2 B - B^2) = N1 exp(mu (wrap - phi_1 - phi_2)).
+
+    Without bending it is Euler's exp(mu wrap) [Euler 1769; Stuart 1961].
+
+    Args:
+        mu: Coefficient of friction, >= 0, any shape.
+        wrap: Angle between the far directions of both ends [rad], > 0.
+        bending: B / T1, in [0, 1).
+
+    Raises:
+        ValueError: An argument breaks its rule, or the strip does not lie on the cylinder.
+    """
+    values = _within("mu", mu, 0.0, np.inf)
+    _positive("wrap", wrap)
+    _within("bending", bending, 0.0, 1.0 - 1e-12)
+    return np.array([_capstan(float(m), float(wrap), float(bending)) for m in values.ravel()]).reshape(values.shape)
+
+
+def _capstan(mu: float, wrap: float, bending: float) -> float:
+    first = np.arccos(1.0 - bending)
+    if not wrap > 2.0 * first:
+        raise ValueError(f"wrap: must be above {2.0 * first:.4g} rad at bending = {bending}, got {wrap}")
+    light = 1.0 - bending + mu * np.sqrt(2.0 * bending - bending**2)
+
+    def missed(heavy: float) -> float:
+        tail = mu * np.sqrt(2.0 * heavy * bending - bending**2)
+        lying = wrap - first - np.arccos(1.0 - bending / heavy)
+        return float((heavy - bending - tail) / (light * np.exp(mu * lying)) - 1.0)
+
+    low, high = 1.0, 2.0
+    while missed(high) < 0.0:
+        high *= 2.0
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if missed(middle) < 0.0 else (low, middle)
+    return 0.5 * (low + high)
+
+
+@dataclass(frozen=True)
+class HeavyFold:
+    """A fold at rest, in units of the gravito-bending length L_gb = (D / (rho g))^(1/3)."""
+
+    height: float
+    """Of its highest point over the layer below."""
+
+    loop_length: float
+    """Of the strip between where it lifts off and where it lands."""
+
+    nose_to_landing: float
+    """Horizontal distance."""
+
+
+@lru_cache
+def heavy_fold(gap: float) -> HeavyFold:
+    """Return the shape of a strip that is folded onto itself on a floor under its own weight.
+
+    With theta the angle of the tangent, which lifts off at s = 0 and lands on the layer below at the height `gap`,
+    kappa = theta', and the force (H, V + s) in the strip,
+
+        kappa' = H sin(theta) - (V + s) cos(theta),   x' = cos(theta),   y' = sin(theta),
+        theta = kappa = y = 0 at s = 0,   theta = pi, kappa = 0, y = gap at the end.
+
+    kappa^2/2 + n . t - y is constant, so that H = -gap/2 whatever the rest: friction changes nothing. It is
+    solved in three parts, up to the nose, up to the top and up to the landing.
+
+    Args:
+        gap: Height of the upper layer over the lower one where it lands, over L_gb, in (0, 0.5].
+
+    Raises:
+        ValueError: The gap breaks its rule.
+    """
+    _within("gap", gap, 0.0, 0.5, open_below=True)
+
+    def change(_: Floats, y: Numbers, p: Numbers) -> Numbers:
+        H, V = p[:2]
+        out, begun = [], 0.0 * p[0]
+        for part in range(3):
+            theta, kappa = y[4 * part], y[4 * part + 1]
+            length = p[2 + part]
+            pull = V + begun + length * y[12]
+            out += [kappa, H * np.sin(theta) - pull * np.cos(theta), np.cos(theta), np.sin(theta)]
+            out[-4:] = [length * rate for rate in out[-4:]]
+            begun = begun + length
+        return np.stack([*out, 1.0 + 0.0 * y[12]])
+
+    def ends(first: Numbers, last: Numbers, p: Numbers) -> Numbers:
+        joined = [first[4 + i] - last[i] for i in range(8)]
+        landing = [last[8] - np.pi, last[9], last[11] - gap]
+        return np.stack([*first[:4], first[12], last[0] - np.pi / 2.0, last[4] - np.pi, *joined, *landing])
+
+    # A guess that rises to 1.17 pi and comes back: the solution for gap = 1/16, by eye.
+    s = np.linspace(0.0, 1.0, 9)
+    rise, over, back = np.pi / 2.0 * s**2, np.pi / 2.0 * (1.0 + s), np.pi * (1.0 + 0.17 * np.sin(np.pi * s))
+    lengths = np.array([1.5, 0.9, 2.25])
+    y = np.zeros((13, 9))
+    x = height = 0.0
+    for part, (theta, length) in enumerate(zip((rise, over, back), lengths, strict=True)):
+        step = length / 8.0
+        y[4 * part], y[4 * part + 1] = theta, np.gradient(theta, step)
+        for row, start, rate in ((2, x, np.cos(theta)), (3, height, np.sin(theta))):
+            y[4 * part + row] = start + step * np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1])))
+        x, height = y[4 * part + 2, -1], y[4 * part + 3, -1]
+    y[12] = s
+    found = boundary_value.solve(change, ends, s, y, np.array([-0.5 * gap, -3.7, *lengths]))
+    if not (found.y[8].max() > np.pi and found.parameters[2:].min() > 0.0 and found.parameters[1] < 0.0):
+        raise NotSolvedError(f"heavy_fold: the solution at gap = {gap} is not the fold")
+    return HeavyFold(
+        height=float(found.y[7, -1]),
+        loop_length=float(found.parameters[2:].sum()),
+        nose_to_landing=float(found.y[2, -1] - found.y[10, -1]),
+    )
+
+
 def _checked_poisson(poisson: float) -> float:
     if not 0.0 <= poisson <= 0.5:
         raise ValueError(f"poisson: must be in [0, 0.5], got {poisson}")

@@ -63,8 +63,8 @@ double bending(const BendingData& data, const double* x, double* gradient, float
   int entries = 0;
   if (folds) folds->count = 0;
   double energy = 0.0;
-  const double* d = data.rigidity;
   for (int t = 0; t < data.triangles; ++t) {
+    const double* d = data.rigidity + 6L * data.fabric[t];
     const int begin = data.begin[t], end = data.begin[t + 1];
     NodeD h0{}, h1{}, h2{};
     for (int i = begin; i < end; ++i) {
@@ -113,8 +113,8 @@ double bending(const BendingData& data, const double* x, double* gradient, float
 }
 
 void bending_matrix(const BendingData& data, const float* stiffening, float* scalars) {
-  const double* d = data.rigidity;
   for (int t = 0; t < data.triangles; ++t) {
+    const double* d = data.rigidity + 6L * data.fabric[t];
     const int begin = data.begin[t], count = data.begin[t + 1] - begin;
     const double r = data.area[t] * stiffening[2L * t], u = data.area[t] * stiffening[2L * t + 1];
     const int* slot = data.slots + 2L * data.slot_begin[t];

@@ -24,6 +24,22 @@ inline void add_folds(const FoldData& folds, const Node* in, Node* out) {
   }
 }
 
+inline void add_pairs(const PairData& pairs, const Node* in, Node* out) {
+  for (int p = 0; p < pairs.count; ++p) {
+    const int* nodes = pairs.nodes + 4L * p;
+    const float* weights = pairs.weights + 4L * p;
+    const Node* column = reinterpret_cast<const Node*>(pairs.stiffness) + 3L * p;
+    Node motion{};
+    for (int c = 0; c < 4; ++c) {
+      if (nodes[c] >= 0) motion += spread(weights[c]) * in[nodes[c]];
+    }
+    const Node force = column[0] * spread(motion[0]) + column[1] * spread(motion[1]) + column[2] * spread(motion[2]);
+    for (int c = 0; c < 4; ++c) {
+      if (nodes[c] >= 0) out[nodes[c]] += spread(weights[c]) * force;
+    }
+  }
+}
+
 void apply(const ClothMatrix& matrix, const float* x, float* y) {
   const Node* in = reinterpret_cast<const Node*>(x);
   Node* out = reinterpret_cast<Node*>(y);
@@ -45,6 +61,7 @@ void apply(const ClothMatrix& matrix, const float* x, float* y) {
     out[i] = sum + other;
   }
   add_folds(*matrix.folds, in, out);
+  if (matrix.pairs) add_pairs(*matrix.pairs, in, out);
 }
 
 }  // namespace

@@ -75,8 +75,8 @@ inline void backward(const float* tile, float* y, int below) {
   for (int q = 0; q < width; ++q) y[q] = sum_of(sum[q]);
 }
 
-// x = K^-1 b; `x` may be `b`.
-void solve(const Factor& factor, int nodes, const float* b, float* x) {
+// In the factor's own order of nodes.
+void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
   if (x != b) __builtin_memcpy(x, b, 16L * nodes);
   float* y = factor.local;
   for (int front = 0; front < factor.fronts; ++front) {
@@ -153,6 +153,16 @@ void solve(const Factor& factor, int nodes, const float* b, float* x) {
       for (int c = 0; c < 3; ++c) own[4 * i + c] = y[3 * i + c];
     }
   }
+}
+
+// x = K^-1 b; `x` may be `b`.
+void solve(const Factor& factor, int nodes, const float* b, float* x) {
+  if (!factor.order) return solve_in_order(factor, nodes, b, x);
+  const Node* from = reinterpret_cast<const Node*>(b);
+  Node *ordered = reinterpret_cast<Node*>(factor.ordered), *to = reinterpret_cast<Node*>(x);
+  for (int i = 0; i < nodes; ++i) ordered[i] = from[factor.order[i]];
+  solve_in_order(factor, nodes, factor.ordered, factor.ordered);
+  for (int i = 0; i < nodes; ++i) to[factor.order[i]] = ordered[i];
 }
 
 }  // namespace

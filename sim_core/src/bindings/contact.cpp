@@ -1,0 +1,86 @@
+#include "bindings/contact.hpp"
+
+#include <nanobind/eigen/dense.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <tuple>
+
+#include "cloth/mesh.hpp"
+#include "contact/pair_law.hpp"
+#include "contact/path.hpp"
+
+namespace sim_core {
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using Four = Eigen::Matrix<double, 4, 3, Eigen::RowMajor>;
+
+FourPoints four(const Four& x) { return {x.row(0), x.row(1), x.row(2), x.row(3)}; }
+
+PairKind kind_of(bool edges) { return edges ? PairKind::edge_edge : PairKind::vertex_triangle; }
+
+Surface surface_of(const Triangles& triangles, const Points3& x) {
+  std::vector<std::array<int, 3>> corners;
+  for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
+    corners.push_back({triangles(t, 0), triangles(t, 1), triangles(t, 2)});
+  }
+  return {corners, std::vector<int>(x.rows(), 0), Felt::Constant(1, 1, true)};
+}
+
+Buffer<double> buffer_of(const Points3& x) {
+  Buffer<double> out(4 * x.rows(), 0.0);
+  for (int i = 0; i < x.rows(); ++i) at_node(out, i) = x.row(i).transpose();
+  return out;
+}
+
+}  // namespace
+
+void bind_contact(nb::module_& m) {
+  m.def(
+      "closest_weights", [](bool edges, const Four& x) { return closest_weights(kind_of(edges), four(x)); }, "edges"_a,
+      "x"_a, "Internal: see contact/closest.hpp.");
+  m.def(
+      "safe_share",
+      [](bool edges, const Four& x, const Four& to, double keep) {
+        return safe_share(kind_of(edges), four(x), four(to), keep);
+      },
+      "edges"_a, "x"_a, "to"_a, "keep"_a, "Internal: see contact/closest.hpp.");
+  m.def(
+      "contact_candidates",
+      [](const Triangles& triangles, const Points3& x, double reach) {
+        std::vector<std::array<int, 5>> out;
+        for (const Candidate& pair : candidates(surface_of(triangles, x), buffer_of(x), reach)) {
+          out.push_back({static_cast<int>(pair.kind), pair.node[0], pair.node[1], pair.node[2], pair.node[3]});
+        }
+        return out;
+      },
+      "triangles"_a, "x"_a, "reach"_a, "Internal: kind (0: vertex and triangle, 1: edges) and vertices of near pairs.");
+  m.def(
+      "cap_motion",
+      [](const Triangles& triangles, const Points3& from, const Points3& to, double thickness, double margin) {
+        Buffer<double> end = buffer_of(to);
+        Neighbourhood near(surface_of(triangles, from), thickness, margin);
+        near.cap(buffer_of(from), end);
+        Points3 out(to.rows(), 3);
+        for (int i = 0; i < to.rows(); ++i) out.row(i) = at_node(end, i).transpose();
+        return out;
+      },
+      "triangles"_a, "start"_a, "end"_a, "thickness"_a, "margin"_a, "Internal: see contact/path.hpp.");
+  m.def(
+      "pair_law",
+      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force,
+         double mu, double stiffness, double proximal) {
+        const PairSight sight{gap, normal, slip, force, mu, stiffness, proximal};
+        const PairRow row = pair_row(sight);
+        return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(sight));
+      },
+      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "proximal"_a,
+      "Internal: mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.");
+}
+
+}  // namespace sim_core

@@ -1,0 +1,140 @@
+#include "contact/candidates.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace sim_core {
+namespace {
+
+using Eigen::Array3d;
+
+struct Box {
+  Array3d low, high;
+  bool meets(const Box& other) const { return (low <= other.high).all() && (other.low <= high).all(); }
+};
+
+template <std::size_t count>
+Box box_of(const std::array<int, count>& nodes, const Buffer<double>& x, double margin) {
+  Box box{at_node(x, nodes[0]).array(), at_node(x, nodes[0]).array()};
+  for (std::size_t c = 1; c < count; ++c) {
+    box.low = box.low.min(at_node(x, nodes[c]).array());
+    box.high = box.high.max(at_node(x, nodes[c]).array());
+  }
+  box.low -= margin;
+  box.high += margin;
+  return box;
+}
+
+// Boxes sorted into cells; cell c holds items[begin[c]] ... , ascending.
+class Grid {
+ public:
+  explicit Grid(const std::vector<Box>& boxes) {
+    Box all = boxes[0];
+    double extent = 0.0;
+    for (const Box& box : boxes) {
+      all.low = all.low.min(box.low);
+      all.high = all.high.max(box.high);
+      extent += (box.high - box.low).maxCoeff();
+    }
+    low_ = all.low;
+    size_ = extent / static_cast<double>(boxes.size());
+    const double cells_max = cells_per_item * static_cast<double>(boxes.size()) + 64.0;
+    while ((((all.high - low_) / size_).floor() + 1.0).prod() > cells_max) size_ *= 1.25;
+    count_ = (((all.high - low_) / size_).floor() + 1.0).cast<int>();
+    begin_.assign(static_cast<std::size_t>(count_.prod()) + 1, 0);
+    for (const Box& box : boxes) visit(box, [&](int cell) { ++begin_[cell + 1]; });
+    for (std::size_t c = 1; c < begin_.size(); ++c) begin_[c] += begin_[c - 1];
+    items_.resize(begin_.back());
+    std::vector<int> next(begin_.begin(), begin_.end() - 1);
+    for (std::size_t i = 0; i < boxes.size(); ++i) {
+      visit(boxes[i], [&](int cell) { items_[next[cell]++] = static_cast<int>(i); });
+    }
+  }
+
+  int cells() const { return static_cast<int>(begin_.size()) - 1; }
+  // -1 outside.
+  int cell_at(const Array3d& p) const {
+    const Eigen::Array3i at = place(p);
+    return (at >= 0).all() && (at < count_).all() ? index(at) : -1;
+  }
+  const int* begin(int cell) const { return items_.data() + begin_[cell]; }
+  const int* end(int cell) const { return items_.data() + begin_[cell + 1]; }
+
+ private:
+  static constexpr double cells_per_item = 8.0;
+
+  Eigen::Array3i place(const Array3d& p) const { return ((p - low_) / size_).floor().cast<int>(); }
+  int index(const Eigen::Array3i& at) const { return (at[2] * count_[1] + at[1]) * count_[0] + at[0]; }
+  template <class Call>
+  void visit(const Box& box, const Call& call) const {
+    const Eigen::Array3i from = place(box.low), to = place(box.high);
+    for (int z = from[2]; z <= to[2]; ++z) {
+      for (int y = from[1]; y <= to[1]; ++y) {
+        for (int x = from[0]; x <= to[0]; ++x) call((z * count_[1] + y) * count_[0] + x);
+      }
+    }
+  }
+
+  Array3d low_;
+  double size_ = 0.0;
+  Eigen::Array3i count_;
+  std::vector<int> begin_, items_;
+};
+
+void add_if_near(std::vector<Candidate>& out, const Candidate& pair, const Buffer<double>& x, double reach) {
+  const FourPoints at = points_of(pair, x);
+  if (between_closest(closest_weights(pair.kind, at), at).squaredNorm() <= reach * reach) out.push_back(pair);
+}
+
+}  // namespace
+
+FourPoints points_of(const Candidate& pair, const Buffer<double>& x) {
+  return {at_node(x, pair.node[0]), at_node(x, pair.node[1]), at_node(x, pair.node[2]), at_node(x, pair.node[3])};
+}
+
+std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach) {
+  std::vector<Candidate> out;
+  std::vector<Box> boxes;
+  for (const auto& corners : surface.triangles) boxes.push_back(box_of(corners, x, reach));
+  if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(), [](const Box& box) {
+        return box.low.isFinite().all() && box.high.isFinite().all();
+      })) {
+    return out;
+  }
+  const Grid around_triangles(boxes);
+  for (int vertex : surface.vertices) {
+    const Array3d p = at_node(x, vertex).array();
+    const int cell = around_triangles.cell_at(p);
+    if (cell < 0) continue;
+    for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
+      const auto& corner = surface.triangles[*t];
+      if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any()) continue;
+      if (!surface.feel(vertex, corner[0]) || std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
+      add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}}, x, reach);
+    }
+  }
+  const std::size_t vertex_pairs = out.size();
+  boxes.clear();
+  for (const auto& ends : surface.edges) boxes.push_back(box_of(ends, x, 0.5 * reach));
+  const Grid edges(boxes);
+  for (int cell = 0; cell < edges.cells(); ++cell) {
+    for (const int* i = edges.begin(cell); i < edges.end(cell); ++i) {
+      const auto& a = surface.edges[*i];
+      for (const int* j = i + 1; j < edges.end(cell); ++j) {
+        const auto& b = surface.edges[*j];
+        if (!surface.feel(a[0], b[0])) continue;
+        if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1] || !boxes[*i].meets(boxes[*j])) continue;
+        // Boxes that meet in many cells count in the one with the lowest corner of what they share.
+        if (edges.cell_at(boxes[*i].low.max(boxes[*j].low)) != cell) continue;
+        add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}}, x, reach);
+      }
+    }
+  }
+  std::sort(out.begin() + static_cast<std::ptrdiff_t>(vertex_pairs), out.end(),
+            [](const Candidate& p, const Candidate& q) {
+              return p.first != q.first ? p.first < q.first : p.second < q.second;
+            });
+  return out;
+}
+
+}  // namespace sim_core

@@ -1,0 +1,39 @@
+// Closest points of a point and a triangle, and of two segments, as weights of their four nodes.
+//
+// The vector between them is rho = sum w_i x_i: from the triangle to the point with w = (1, -b), b barycentric, and
+// from the second segment to the first with w = (1 - s, s, -(1 - t), -t). At an optimum its length changes by n . sum
+// w_i dx_i, n = rho/|rho|, whatever the weights do: they are stationary.
+#pragma once
+
+#include <Eigen/Core>
+#include <array>
+
+namespace sim_core {
+
+using FourPoints = std::array<Eigen::Vector3d, 4>;
+
+// Which four points: a point and the three of a triangle, or the two and two of segments.
+enum class PairKind : int { vertex_triangle = 0, edge_edge = 1 };
+
+// Barycentric coordinates of the point of the triangle abc that is closest to p; those that are zero are exactly so
+// [Ericson 2005, 5.1.5].
+Eigen::Vector3d closest_on_triangle(const Eigen::Vector3d& p, const Eigen::Vector3d& a, const Eigen::Vector3d& b,
+                                    const Eigen::Vector3d& c);
+
+// The same for the four points of a pair [Ericson 2005, 5.1.5 and 5.1.9]. Segments that are parallel have one of their
+// closest points.
+Eigen::Vector4d closest_weights(PairKind kind, const FourPoints& x);
+
+// rho.
+inline Eigen::Vector3d between_closest(const Eigen::Vector4d& weights, const FourPoints& x) {
+  return weights[0] * x[0] + weights[1] * x[1] + weights[2] * x[2] + weights[3] * x[3];
+}
+
+// Squared sine of the angle of the two segments.
+double crossing_squared(const FourPoints& x);
+
+// A share of the straight motion from x to `to` up to which the distance stays above `keep` times that at x; 1 if it
+// does to the end. Never too large, and too small by little [Li et al. 2021, additive CCD, Algorithm 1].
+double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep);
+
+}  // namespace sim_core

@@ -1,0 +1,48 @@
+// Coulomb's law between two pieces of cloth, exactly, at one pair of closest points, and its row of Newton's system.
+//
+// The pair's force r [N] is an unknown of its own: it acts with w_i r on the nodes of the pair (contact/closest.hpp).
+// With the gap g = |rho| - thickness, the slip u and a stiffness k that decides how fast the search goes, not where it
+// ends, the law is [Alart & Curnier 1991, Eqs. 10-12]
+//
+//     r_N = max(0, r_N - k g),   r_T = projection of tau on the disc of radius mu r_N,  tau = r_T - k u.
+//
+// Newton's method takes the derivative of the branch at hand, with a proximal term [Rockafellar 1976], by which pairs
+// that say the same do no harm: c + dc + dr/kappa = 0. It vanishes as the iteration converges. With the pair's motion v
+// = sum w_i dx_i the row is dr = force - stiffness v:
+//
+//     open :  stiffness 0                 force -r
+//     stick:  kappa 1                     -kappa (g n + u)
+//     slip :  kappa (n + mu t) n^T + s P  -kappa g n + (mu r_N - t . r_T - mu kappa g) t - (s / (beta k)) P r_T
+//
+// with t = tau/|tau|, beta = mu r_N/|tau|, P = 1 - n n^T - t t^T and s = min(kappa, beta k/(1 - beta)), by which
+// friction turns with the slip.
+#pragma once
+
+#include <Eigen/Core>
+
+namespace sim_core {
+
+struct PairSight {
+  double gap;                      // m
+  Eigen::Vector3d normal;          // from the second to the first
+  Eigen::Vector3d slip;            // m: of the first over the second since the start of the step, across the normal
+  Eigen::Vector3d force;           // N: on the first
+  double mu, stiffness, proximal;  // k and kappa, N/m
+};
+
+struct PairRow {
+  int mode = 0;                                         // ContactMode
+  Eigen::Matrix3d stiffness = Eigen::Matrix3d::Zero();  // N/m
+  Eigen::Matrix3d symmetric = Eigen::Matrix3d::Zero();  // its part for the factor: without mu kappa t n^T
+  Eigen::Vector3d force = Eigen::Vector3d::Zero();      // N
+};
+
+// The branch that holds there. A pair that sinks in is about to bear more than r_N: it sticks up to mu (r_N - k g).
+PairRow pair_row(const PairSight& sight);
+// The branch of a pair that `motion` closes, whatever its gap and force are now: it sticks if it slips by no more than
+// mu times what it would sink in, and it slips else.
+PairRow closing_row(const PairSight& sight, const Eigen::Vector3d& motion);
+// Square of the force by which the law is missed, N^2.
+double pair_error_squared(const PairSight& sight);
+
+}  // namespace sim_core

@@ -1,0 +1,380 @@
+#include "contact/pairs.hpp"
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <tuple>
+#include <utility>
+
+namespace sim_core {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+using Eigen::Vector4d;
+
+// Stiffness of the law, and of the proximal term, over that of a pair's nodes.
+constexpr double law_share = 0.1, proximal_share = 10.0;
+// A pair whose predicted gap is below minus so much of the thickness is made to bear.
+constexpr double predicted_gap = 0.02;
+// Edges whose squared sine is smaller have no pair, nor have those that are closest nearer to an end than so much of
+// their length: vertices have one there.
+constexpr double crossing_least = 0.01, end_share = 1e-3;
+// Cosine up to which a force is handed on from one normal to another.
+constexpr double hand_on_cosine = 0.5;
+// Pairs whose middles are nearer than so much of the thickness are one; forces are handed on up to so far.
+constexpr double merge_share = 0.2, hand_on_share = 0.5;
+
+auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
+
+// Axes that turn with a pair's triangle, or with its edges.
+Matrix3d axes(PairKind kind, const FourPoints& x) {
+  const Vector3d a = kind == PairKind::vertex_triangle ? Vector3d(x[2] - x[1]) : Vector3d(x[1] - x[0]);
+  const Vector3d b = kind == PairKind::vertex_triangle ? Vector3d(x[3] - x[1]) : Vector3d(x[3] - x[2]);
+  Matrix3d out;
+  out.col(0) = a.normalized();
+  out.col(2) = a.cross(b).normalized();
+  out.col(1) = out.col(2).cross(out.col(0));
+  return out;
+}
+
+// The force on the cone that is nearest along the normal and across it.
+Vector3d admissible(const PairSight& sight) {
+  const double pressing = std::max(sight.force.dot(sight.normal), 0.0), bound = sight.mu * pressing;
+  const Vector3d across = sight.force - sight.force.dot(sight.normal) * sight.normal;
+  const double size = across.norm();
+  return pressing * sight.normal + (size > bound ? Vector3d(bound / size * across) : across);
+}
+
+}  // namespace
+
+Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
+  Vector3d out = given;
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] < free_nodes) out += weights[c] * at_node(change, who.node[c]).cast<double>();
+  }
+  return out;
+}
+
+Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
+  return row.force - row.stiffness * motion(change, free_nodes);
+}
+
+Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
+    : near(std::move(surface), *std::max_element(settings.thickness.begin(), settings.thickness.end()), margin),
+      settings_(settings),
+      free_nodes_(free_nodes),
+      least_distance_(std::numeric_limits<double>::infinity()),
+      softness_(near.surface.sheet_of_node.size(), 0.0) {}
+
+void Pairs::restart() {
+  kept_.clear();
+  pairs_.clear();
+}
+
+void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const std::vector<double>& stiffness,
+                  double share) {
+  start_ = &start;
+  ends_ = &ends;
+  for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
+  base_ = kept_;
+}
+
+void Pairs::keep() {
+  kept_.clear();
+  for (const Pair& pair : pairs_) {
+    if (pair.sight.force.isZero(0.0)) continue;
+    kept_.push_back(pair);
+    kept_.back().change.setZero();
+  }
+}
+
+void Pairs::look(const Buffer<double>& x, double share, Buffer<double>& residual) {
+  select(x);
+  hand_on(base_, share);
+  merge();
+  for (Pair& pair : pairs_) {
+    if (share > 1.0) pair.sight.force = admissible(pair.sight);
+    pair.row = pair_row(pair.sight);
+    if (pair.sight.force.isZero(0.0)) continue;
+    for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.sight.force;
+  }
+}
+
+// The pairs of closest points at x. A vertex may be closest to an edge or a corner of a triangle: the pair counts once,
+// and where all triangles around agree, since else there is a point in one of them that is closer.
+void Pairs::select(const Buffer<double>& x) {
+  struct Found {
+    int feature, candidate;
+    Vector4d weights;
+  };
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
+  const std::vector<Candidate>& candidates = near.pairs(x);
+  pairs_.clear();
+  least_distance_ = std::numeric_limits<double>::infinity();
+  std::vector<Found> found;
+  std::size_t c = 0;
+  while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
+    const int vertex = candidates[c].first;
+    found.clear();
+    for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
+         ++c) {
+      const Candidate& who = candidates[c];
+      const Vector4d weights = closest_weights(who.kind, points_of(who, x));
+      int corners = 0, corner = 0, opposite = 0;
+      for (int i = 0; i < 3; ++i) {
+        if (weights[1 + i] != 0.0) {
+          ++corners;
+          corner = i;
+        } else {
+          opposite = i;
+        }
+      }
+      const int feature = corners == 3   ? who.second
+                          : corners == 2 ? triangles + surface.triangle_edges[who.second][opposite]
+                                         : triangles + edges + who.node[1 + corner];
+      found.push_back({feature, static_cast<int>(c), weights});
+    }
+    std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
+      return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
+    });
+    for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
+      const int feature = found[i].feature;
+      while (next < found.size() && found[next].feature == feature) ++next;
+      const int around = feature < triangles           ? 1
+                         : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
+                                                       : surface.triangles_of_node[feature - triangles - edges];
+      if (static_cast<int>(next - i) != around) continue;
+      if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
+        const int other = feature - triangles - edges;
+        const auto first = std::lower_bound(pairs_.begin(), pairs_.end(), other,
+                                            [](const Pair& pair, int who) { return pair.who.first < who; });
+        if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
+              return pair.who.first == other && pair.feature == triangles + edges + vertex;
+            })) {
+          continue;
+        }
+      }
+      add(candidates[found[i].candidate], feature, found[i].weights, x);
+    }
+  }
+  for (; c < candidates.size(); ++c) {
+    const Candidate& who = candidates[c];
+    const FourPoints at = points_of(who, x);
+    const Vector4d weights = closest_weights(who.kind, at);
+    if (weights.cwiseAbs().minCoeff() < end_share || crossing_squared(at) < crossing_least) continue;
+    add(who, who.second, weights, x);
+  }
+}
+
+void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, const Buffer<double>& x) {
+  const FourPoints at = points_of(who, x), before = points_of(who, *start_);
+  const Vector3d rho = between_closest(weights, at);
+  const double distance = rho.norm();
+  least_distance_ = std::min(least_distance_, distance);
+  double softness = 0.0;
+  Vector3d given = Vector3d::Zero();
+  for (int c = 0; c < 4; ++c) {
+    const int node = who.node[c];
+    softness += weights[c] * weights[c] * softness_[node];
+    if (node >= free_nodes_) given += weights[c] * (at_node(*ends_, node) - at_node(x, node));
+  }
+  if (!(softness > 0.0) || !(distance > 0.0)) return;
+  const Vector3d n = rho / distance;
+  // The way of the first over the second, less that by which rho turns with them.
+  const Matrix3d turn = axes(who.kind, at) * axes(who.kind, before).transpose();
+  Vector3d slip = rho - turn * between_closest(weights, before);
+  slip -= slip.dot(n) * n;
+  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
+  const double mu = settings_.mu(a, b), thickness = 0.5 * (settings_.thickness[a] + settings_.thickness[b]);
+  const Vector3d first =
+      who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
+  pairs_.push_back(
+      {who,
+       feature,
+       weights,
+       {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, proximal_share / softness},
+       first - 0.5 * rho,
+       thickness,
+       given});
+}
+
+// Pairs take the forces they had. The force of one that is gone goes to the most alike of those that are new and have
+// the vertex, or an edge, in common: the closest feature has changed.
+void Pairs::hand_on(const std::vector<Pair>& before, double share) {
+  std::vector<const Pair*> orphans;
+  std::vector<std::size_t> fresh;
+  std::size_t o = 0;
+  for (std::size_t i = 0; i < pairs_.size(); ++i) {
+    for (; o < before.size() && key(before[o]) < key(pairs_[i]); ++o) orphans.push_back(&before[o]);
+    if (o < before.size() && key(before[o]) == key(pairs_[i])) {
+      pairs_[i].sight.force = before[o].sight.force + share * before[o].change;
+      ++o;
+    } else {
+      fresh.push_back(i);
+    }
+  }
+  for (; o < before.size(); ++o) orphans.push_back(&before[o]);
+  for (const Pair* orphan : orphans) {
+    const Vector3d force = orphan->sight.force + share * orphan->change;
+    if (force.isZero(0.0)) continue;
+    std::size_t heir = pairs_.size();
+    double best = hand_on_cosine;
+    for (std::size_t i : fresh) {
+      const Candidate &a = pairs_[i].who, &b = orphan->who;
+      if (a.kind != b.kind) continue;
+      const bool common = a.kind == PairKind::vertex_triangle ? a.first == b.first
+                                                              : a.first == b.first || a.second == b.second ||
+                                                                    a.first == b.second || a.second == b.first;
+      if (!common) continue;
+      const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
+      if (alike > best) best = alike, heir = i;
+    }
+    if (heir < pairs_.size()) {
+      pairs_[heir].sight.force += force;
+      continue;
+    }
+    best = hand_on_share * orphan->thickness;
+    for (std::size_t i = 0; i < pairs_.size(); ++i) {
+      const double far = (pairs_[i].middle - orphan->middle).norm();
+      const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
+      if (far < best && std::abs(alike) > hand_on_cosine) best = far, heir = i;
+    }
+    if (heir < pairs_.size()) {
+      pairs_[heir].sight.force += pairs_[heir].sight.normal.dot(orphan->sight.normal) > 0.0 ? force : Vector3d(-force);
+    }
+  }
+}
+
+// Leaves one of the pairs that are at nearly the same place, as where a vertex lies on a vertex: they would say the
+// same but for rounding, and contradict each other. One that has a force stays before one that has none, and then the
+// closer one; it takes the forces of the others.
+void Pairs::merge() {
+  const std::size_t count = pairs_.size();
+  const Vector3d across(0.62, 0.55, 0.56);  // along no edge of a mesh that is aligned with the axes
+  std::vector<std::pair<double, std::size_t>> line(count);
+  for (std::size_t i = 0; i < count; ++i) line[i] = {across.dot(pairs_[i].middle), i};
+  std::sort(line.begin(), line.end());
+  std::vector<std::size_t> place(count), order(count);
+  for (std::size_t l = 0; l < count; ++l) place[line[l].second] = l;
+  std::iota(order.begin(), order.end(), std::size_t{0});
+  std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
+    const bool free_a = pairs_[a].sight.force.isZero(0.0), free_b = pairs_[b].sight.force.isZero(0.0);
+    return free_a != free_b ? free_b : pairs_[a].sight.gap < pairs_[b].sight.gap;
+  });
+  std::vector<char> gone(count, 0);
+  for (std::size_t i : order) {
+    if (gone[i]) continue;
+    const double radius = merge_share * pairs_[i].thickness;
+    const auto take = [&](std::size_t j) {
+      if (gone[j] || (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius) return;
+      const Vector3d& force = pairs_[j].sight.force;
+      pairs_[i].sight.force += pairs_[i].sight.normal.dot(pairs_[j].sight.normal) > 0.0 ? force : Vector3d(-force);
+      gone[j] = 1;
+    };
+    const double reach = 1.01 * radius;
+    for (std::size_t l = place[i]; l-- > 0 && line[place[i]].first - line[l].first < reach;) take(line[l].second);
+    for (std::size_t l = place[i] + 1; l < count && line[l].first - line[place[i]].first < reach; ++l)
+      take(line[l].second);
+  }
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < count; ++i) {
+    if (gone[i]) continue;
+    if (kept != i) pairs_[kept] = pairs_[i];
+    ++kept;
+  }
+  pairs_.erase(pairs_.begin() + static_cast<std::ptrdiff_t>(kept), pairs_.end());
+}
+
+void Pairs::count_errors(double stiffness, Norms& norms) const {
+  for (const Pair& pair : pairs_) {
+    PairSight sight = pair.sight;
+    sight.stiffness = stiffness;
+    const double error = pair_error_squared(sight);
+    if (error != 0.0) norms.count(error);
+  }
+}
+
+bool Pairs::settled() const {
+  return std::equal(pairs_.begin(), pairs_.end(), base_.begin(), base_.end(),
+                    [](const Pair& a, const Pair& b) { return key(a) == key(b) && a.row.mode == b.row.mode; });
+}
+
+bool Pairs::active() const {
+  return std::any_of(pairs_.begin(), pairs_.end(),
+                     [](const Pair& pair) { return pair.bears() || !pair.sight.force.isZero(0.0); });
+}
+
+int Pairs::bearing() const {
+  return static_cast<int>(std::count_if(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.bears(); }));
+}
+
+bool Pairs::activate(const Buffer<float>& change) {
+  bool changed = false;
+  for (Pair& pair : pairs_) {
+    if (!pair.added) continue;
+    const Vector3d force = pair.sight.force + pair.force_change(change, free_nodes_);
+    if (force.dot(pair.sight.normal) >= 0.0) continue;
+    pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.sight.force};
+    pair.added = false;
+    pair.released = changed = true;
+  }
+  for (PairKind kind : {PairKind::vertex_triangle, PairKind::edge_edge}) {
+    bool any = false;
+    for (Pair& pair : pairs_) {
+      if (pair.who.kind != kind || pair.bears() || pair.released) continue;
+      const Vector3d motion = pair.motion(change, free_nodes_);
+      if (!(pair.sight.gap + pair.sight.normal.dot(motion) < -predicted_gap * pair.thickness)) continue;
+      pair.row = closing_row(pair.sight, motion);
+      pair.added = any = true;
+    }
+    if (any) return true;
+  }
+  return changed;
+}
+
+void Pairs::solved(const Buffer<float>& change) {
+  for (Pair& pair : pairs_) {
+    pair.change = pair.force_change(change, free_nodes_);
+    pair.added = pair.released = false;
+  }
+  base_ = pairs_;
+}
+
+void Pairs::return_to_best() {
+  base_ = best_;
+  for (Pair& pair : base_) pair.change.setZero();
+}
+
+PairData Pairs::rows() {
+  nodes_.clear();
+  weights_.clear();
+  stiffness_.clear();
+  for (const Pair& pair : pairs_) {
+    if (!pair.bears()) continue;
+    for (int c = 0; c < 4; ++c) {
+      nodes_.push_back(pair.who.node[c] < free_nodes_ ? pair.who.node[c] : -1);
+      weights_.push_back(static_cast<float>(pair.weights[c]));
+    }
+    for (int column = 0; column < 3; ++column) {
+      for (int r = 0; r < 3; ++r) stiffness_.push_back(static_cast<float>(pair.row.stiffness(r, column)));
+      stiffness_.push_back(0.0f);
+    }
+  }
+  return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
+}
+
+void Pairs::subtract_right_side(Buffer<float>& force) const {
+  for (const Pair& pair : pairs_) {
+    const Vector3d change = pair.row.force - pair.row.stiffness * pair.given;
+    if (change.isZero(0.0)) continue;
+    for (int c = 0; c < 4; ++c) {
+      if (pair.who.node[c] < free_nodes_) at_node(force, pair.who.node[c]) -= (pair.weights[c] * change).cast<float>();
+    }
+  }
+}
+
+}  // namespace sim_core

@@ -1,0 +1,100 @@
+// Contacts of cloth with itself and with other cloth: which pairs of closest points there are, their forces, and their
+// rows of Newton's system.
+#pragma once
+
+#include <Eigen/Core>
+#include <vector>
+
+#include "cloth/problem.hpp"
+#include "contact/pair_law.hpp"
+#include "contact/path.hpp"
+#include "contact/state.hpp"
+
+namespace sim_core {
+
+// Of sheets and surfaces.
+struct PairSettings {
+  std::vector<double> thickness;  // m: two keep the mean of theirs apart
+  Eigen::MatrixXd mu;             // of each two; negative where they do not feel each other
+};
+
+struct Pair {
+  Candidate who;
+  int feature;  // that is closest to a vertex: a triangle, an edge after them, or a node after these; or the second
+                // edge
+  Eigen::Vector4d weights;
+  PairSight sight;
+  Eigen::Vector3d middle;  // of the two points, m
+  double thickness;        // m
+  Eigen::Vector3d given;   // m: of its motion, by nodes that are held and not yet at their ends
+  Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force by the last linear problem, N
+  PairRow row{};
+  bool added = false, released = false;  // in the linear problem at hand, whatever the law says
+
+  bool bears() const { return row.mode != contact_open; }
+  // Of its first point over its second, m, and the change of its force by it, N.
+  Eigen::Vector3d motion(const Buffer<float>& change, int free_nodes) const;
+  Eigen::Vector3d force_change(const Buffer<float>& change, int free_nodes) const;
+};
+
+class Pairs {
+ public:
+  // `margin`: how far nodes move before pairs are looked for anew, m.
+  Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes);
+
+  Neighbourhood near;
+
+  // Forgets all forces.
+  void restart();
+  // An attempt at a step begins at `start`, with the forces that were kept last, and takes held nodes to `ends`;
+  // `stiffness`: of the free nodes, which are `share` of their own.
+  void begin(const Buffer<double>& start, const Buffer<double>& ends, const std::vector<double>& stiffness,
+             double share);
+  // A step ended.
+  void keep();
+
+  // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual. With a
+  // share above 1 forces stay on their cones.
+  void look(const Buffer<double>& x, double share, Buffer<double>& residual);
+  // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
+  void count_errors(double stiffness, Norms& norms) const;
+  // Whether all pairs are in the branches that they were in at the last linear problem.
+  bool settled() const;
+  const std::vector<Pair>& list() const { return pairs_; }
+  // Whether there is a force or a pair that bears.
+  bool active() const;
+
+  // After a linear problem: makes pairs bear that would come too near, vertices before edges, and lets go of those
+  // added ones that would pull. Returns whether the problem is another one now.
+  bool activate(const Buffer<float>& change);
+  // Takes over the forces' changes that belong to the solved motion.
+  void solved(const Buffer<float>& change);
+  // Keeps the pairs at hand as the best; back to them, without changes.
+  void mark_best() { best_ = pairs_; }
+  void return_to_best();
+
+  // The rows, for the product with the matrix; and minus their right-hand side, to be subtracted from the nodes'.
+  PairData rows();
+  void subtract_right_side(Buffer<float>& force) const;
+
+  int bearing() const;
+  // Least distance of any two pieces that do not hang together at the last look, m; infinite where none is near.
+  double least_distance() const { return least_distance_; }
+
+ private:
+  void select(const Buffer<double>& x);
+  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x);
+  void hand_on(const std::vector<Pair>& before, double share);
+  void merge();
+
+  PairSettings settings_;
+  int free_nodes_;
+  double least_distance_;
+  std::vector<Pair> pairs_, base_, kept_, best_;  // sorted by kind, first, feature
+  const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
+  std::vector<double> softness_;  // of all nodes, m/N: 0 where held
+  std::vector<int> nodes_;
+  Buffer<float> weights_, stiffness_;
+};
+
+}  // namespace sim_core

@@ -1,0 +1,39 @@
+// How far nodes may move so that nothing crosses.
+#pragma once
+
+#include <vector>
+
+#include "contact/candidates.hpp"
+
+namespace sim_core {
+
+// Knows which pairs are near: all that can come within `thickness`, the largest, while no node has moved further than
+// `margin` from where it was, whatever common way all of them have come.
+class Neighbourhood {
+ public:
+  Neighbourhood(Surface surface, double thickness, double margin);
+
+  const Surface surface;
+  const double thickness;
+
+  // The pairs, for positions x.
+  const std::vector<Candidate>& pairs(const Buffer<double>& x);
+
+  // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance, so that nothing
+  // crosses on the straight ways between: each node by as much as its pairs demand. Returns whether nothing was moved.
+  bool cap(const Buffer<double>& from, Buffer<double>& to);
+
+  int rebuilds = 0;
+
+ private:
+  double moved(const Buffer<double>& from, const Buffer<double>& to) const;
+  void rebuild(const Buffer<double>& x);
+  bool cap_near(const Buffer<double>& from, Buffer<double>& to);
+
+  double margin_;
+  std::vector<Candidate> pairs_;
+  Buffer<double> reference_;
+  std::vector<double> share_;
+};
+
+}  // namespace sim_core

@@ -1,0 +1,38 @@
+#include "contact/surface.hpp"
+
+#include <algorithm>
+#include <utility>
+
+namespace sim_core {
+
+Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in, Felt felt_in)
+    : triangles(std::move(triangles_in)),
+      triangles_of_node(sheet_of_node_in.size(), 0),
+      sheet_of_node(std::move(sheet_of_node_in)),
+      felt(std::move(felt_in)) {
+  for (const auto& corners : triangles) {
+    for (int c = 0; c < 3; ++c) {
+      const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
+      edges.push_back({std::min(i, j), std::max(i, j)});
+      ++triangles_of_node[corners[c]];
+    }
+  }
+  std::sort(edges.begin(), edges.end());
+  edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
+  triangles_of_edge.assign(edges.size(), 0);
+  for (const auto& corners : triangles) {
+    std::array<int, 3> own;
+    for (int c = 0; c < 3; ++c) {
+      const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
+      const std::array<int, 2> edge{std::min(i, j), std::max(i, j)};
+      own[c] = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), edge) - edges.begin());
+      ++triangles_of_edge[own[c]];
+    }
+    triangle_edges.push_back(own);
+  }
+  for (std::size_t i = 0; i < triangles_of_node.size(); ++i) {
+    if (triangles_of_node[i] > 0) vertices.push_back(static_cast<int>(i));
+  }
+}
+
+}  // namespace sim_core
