@@ -17,7 +17,7 @@ from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import keyed_points, samples
 from stickslip_services.queue.planning import expand
-from stickslip_services.queue.terms import terms_for
+from stickslip_services.queue.terms import Terms, terms_for
 from stickslip_services.testing import BUILDS
 from stickslip_sim_core import stage
 from stickslip_sim_core._sim_core import cloth_kernels
@@ -94,7 +94,7 @@ def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[J
     name = "cloth_drag" if issubclass(of, ClothSpec) else "rod_hang"
     spec = of.model_validate({"kind": name, "axes": cloth if issubclass(of, ClothSpec) else rods})
     with pytest.raises(UnknownKindError, match="kind must be one of"):
-        expand(spec, BUILDS)
+        expand(spec, Terms(BUILDS, None))
     with pytest.raises(UnknownKindError, match="kind must be one of"):
         layout(spec)
     with pytest.raises(UnknownKindError, match="kind must be one of"):
