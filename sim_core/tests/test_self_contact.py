@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core import Cloth, SelfContact, Surface, fabric, isotropic, plane, preset_named, self_intersections
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.protocols import pull_out, stacked_incline
+from stickslip_sim_core.protocols import stacked_incline
 from stickslip_sim_core.protocols.inclined_plane import tilted
 
 Floats = NDArray[np.float64]
@@ -104,16 +104,6 @@ class TestStack:
         assert result.passed
         assert result.settings["unconverged_steps"] == 0
         assert result.settings["least_distance_over_thickness"] >= 0.99  # type: ignore[operator]
-
-    @pytest.mark.parametrize("mesh", ["structured", "unstructured"])
-    def test_friction_of_both_sides_adds_up(self, mesh: str) -> None:
-        other = {"structured": "unstructured", "unstructured": "structured"}[mesh]
-        result = pull_out.run(friction=(0.3,), cells=5, **{mesh: 1, other: 0})  # type: ignore[arg-type]
-        assert result.error < 1e-3
-
-    def test_a_pull_that_is_not_steady_has_no_force(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(pull_out, "AT_MOST", 0.4)
-        assert not pull_out.run(friction=(0.3,), cells=5, unstructured=0).passed
 
     def test_a_stack_that_creeps_has_no_slip_angle(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(stacked_incline.Stack, "drift", lambda _: 2e-5)

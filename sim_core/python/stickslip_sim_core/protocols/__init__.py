@@ -9,7 +9,6 @@ from stickslip_sim_core.protocols import (
     cantilever,
     inclined_plane,
     lateral_buckling,
-    pull_out,
     rod_cantilever,
     rod_lateral_buckling,
     stacked_incline,
@@ -28,7 +27,6 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
         "lateral-buckling": lateral_buckling.run,
         "inclined-plane": inclined_plane.run,
         "stacked-incline": stacked_incline.run,
-        "pull-out": pull_out.run,
     }
 )
 
