@@ -19,13 +19,14 @@ from stickslip_schemas.chunks import encode_trajectory
 from stickslip_schemas.cloth import PICTURE_DECIBELS
 from stickslip_schemas.codecs import encode_clip
 from stickslip_schemas.jobs import Quality
-from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec, Viewpoint
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest, Pictures
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
+from stickslip_schemas.viewpoints import Viewpoint
 from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module
