@@ -9,6 +9,7 @@ from stickslip_sim_core.protocols import (
     cantilever,
     inclined_plane,
     lateral_buckling,
+    pull_out,
     rod_cantilever,
     rod_lateral_buckling,
     stacked_incline,
@@ -27,6 +28,7 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
         "lateral-buckling": lateral_buckling.run,
         "inclined-plane": inclined_plane.run,
         "stacked-incline": stacked_incline.run,
+        "pull-out": pull_out.run,
     }
 )
 
