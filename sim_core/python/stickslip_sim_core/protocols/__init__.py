@@ -7,6 +7,8 @@ from typing import Any
 from stickslip_sim_core.protocols import (
     bend_twist,
     cantilever,
+    capstan,
+    heavy_fold,
     inclined_plane,
     lateral_buckling,
     pull_out,
@@ -29,6 +31,8 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
         "inclined-plane": inclined_plane.run,
         "stacked-incline": stacked_incline.run,
         "pull-out": pull_out.run,
+        "heavy-fold": heavy_fold.run,
+        "capstan": capstan.run,
     }
 )
 

@@ -81,7 +81,7 @@ def run(
 
 
 class Fold:
-    """A strip, two cells wide, on a floor, with its upper part folded back over the lower one.
+    """A strip on a floor, with its upper part folded back over the lower one.
 
     Args:
         mu: Friction with itself and with the floor.
@@ -93,7 +93,7 @@ class Fold:
         loop = master_curves.heavy_fold(GAP).loop_length
         length = (LOWER + loop + UPPER) * BENDING_LENGTH
         cell = length / cells
-        mesh = meshes.grid(2.0 * cell, length, 2, cells)
+        mesh = strip_of(cell, cells)
         weight = DENSITY * GRAVITY * BENDING_LENGTH  # N/m
         self.cloth = Cloth(
             mesh,
@@ -102,7 +102,7 @@ class Fold:
             self_contact=SelfContact(mu, GAP * BENDING_LENGTH),
             force_scale=FORCE_SHARE * DENSITY * cell**2 * GRAVITY,
         )
-        self.along = mesh.rest[:, 1] + 0.5 * length
+        self.along = mesh.rest[:, 1]
         self.middle = np.flatnonzero(np.abs(mesh.rest[:, 0]) < 1e-3 * cell)
         self.landing_from = (LOWER + 0.7 * loop) * BENDING_LENGTH
         self.floor = [plane(mu)]
@@ -149,6 +149,21 @@ class Fold:
         surplus = lift[lies] - self.cloth.masses[lies] * GRAVITY
         landing = surplus @ at[lies, 0] / surplus.sum()
         return height / BENDING_LENGTH, float(nose - landing) / BENDING_LENGTH
+
+
+def strip_of(cell: float, cells: int) -> meshes.Mesh:
+    """Return a strip of equilateral triangles from y = 0 on, two rows wide: they leave most room for a thickness."""
+    rise, side, inner = np.sqrt(0.75) * cell, cell * np.arange(cells + 1), cell * (np.arange(cells) + 0.5)
+    rest = [np.column_stack([np.full(len(y), x), y]) for x, y in ((-rise, side), (0.0, inner), (rise, side))]
+    left, middle = np.arange(cells + 1), cells + 1 + np.arange(cells)
+    right = left + 2 * cells + 1
+    triangles = [
+        np.column_stack([left[:-1], middle, left[1:]]),
+        np.column_stack([left[1:-1], middle[:-1], middle[1:]]),
+        np.column_stack([right[:-1], right[1:], middle]),
+        np.column_stack([right[1:-1], middle[1:], middle[:-1]]),
+    ]
+    return meshes.Mesh(np.concatenate(rest), np.concatenate(triangles).astype(np.int32))
 
 
 def peak(values: np.ndarray) -> float:

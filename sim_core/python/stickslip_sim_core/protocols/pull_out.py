@@ -20,6 +20,7 @@ SPEED = 0.01  # m/s
 SLIDING = 1.0  # s: after which the force is measured
 MEASURED = 0.4  # s: over which its mean is taken
 ROUGH = 10.0  # friction of the floor
+LOWEST_MAX = 1e-5  # m: by which the lowest sheet may move
 
 # Of a node's weight: the force that residuals are measured in.
 FORCE_SHARE = 0.1
@@ -112,7 +113,7 @@ class Pulled:
         self.level = np.repeat([0, 1, 2], [len(part.rest) for part in parts])
         self.start = np.concatenate(
             [
-                np.column_stack([part.rest + [centre, 0.0], np.full(len(part.rest), level * THICKNESS)])
+                np.column_stack([part.rest + np.array([centre, 0.0]), np.full(len(part.rest), level * THICKNESS)])
                 for level, (part, centre) in enumerate(zip(parts, centres, strict=True))
             ]
         )
@@ -132,7 +133,7 @@ class Pulled:
         self.cloth.set_state(self.start)
 
     def force(self) -> tuple[float, float]:
-        """Return the force that draws the middle sheet over the load, and what it should be; NaN if the lowest moves.
+        """Return the force that draws the middle sheet over the load (NaN if the lowest one moves), and the master's.
 
         The load is what the holders of the upper sheet leave of its weight, and likewise for the middle one.
         """
@@ -149,8 +150,7 @@ class Pulled:
             forces.append(reactions[self.drawn, 0].sum())
             loads.append(weight[self.level == 2].sum() - reactions[self.rear, 2].sum())
             rests.append(weight[self.level == 1].sum() - reactions[self.drawn, 2].sum())
-        lowest = self.level == 0
-        if np.abs(cloth.positions - self.start)[lowest].max() > 1e-5:
-            return np.nan, np.nan
         load, rest = float(np.mean(loads)), float(np.mean(rests))
-        return float(np.mean(forces)) / load, UPPER * self.mu + OVER_LOWER * self.mu * (1.0 + rest / load)
+        moved = np.abs(cloth.positions - self.start)[self.level == 0].max()
+        force = float(np.mean(forces)) / load if moved < LOWEST_MAX else np.nan
+        return force, UPPER * self.mu + OVER_LOWER * self.mu * (1.0 + rest / load)
