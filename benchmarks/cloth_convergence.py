@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 from stickslip_sim_core import DropAndDrag, SolverSettings, build_info, drop_and_drag, preset_named
-from stickslip_sim_core.scenes.cloth_drag import FRAME_RATE, FRAMES
+from stickslip_sim_core.stage import FRAME_RATE, FRAMES
 
 STEADY = (22.0, 37.0)  # s
 

@@ -38,12 +38,12 @@ from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
 from stickslip_blender.geometry import FLOOR
 from stickslip_blender.ground_truth import ground_truth
+from stickslip_blender.holders import Holders
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import grained, look_of
 from stickslip_blender.multiplexed import encode
 from stickslip_blender.pixels import FrameReader
 from stickslip_blender.raster import Textures, Window, projected, see
-from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from stickslip_blender.clips import ClothRenderer
-from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.holders import Holders
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender

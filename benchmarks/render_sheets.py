@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.holders import Holders
 from stickslip_blender.preview import sheet
-from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.clips import shown_frames

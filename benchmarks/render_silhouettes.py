@@ -21,10 +21,10 @@ import numpy.typing as npt
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.engine import REFERENCE
+from stickslip_blender.holders import Holders
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.looks import look_of
 from stickslip_blender.raster import projected, see, window_about
-from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_blender.substrates import drawn_substrate
 from stickslip_blender.view import set_view
 from stickslip_schemas.cameras import load_rig

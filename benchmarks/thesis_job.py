@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,14 +87,15 @@ def run_job(client: httpx.Client, spec: dict[str, Any]) -> tuple[float, str]:
 def describe(client: httpx.Client, where: str) -> str:
     """Return what a dataset says of itself: what was lost, and its labels."""
     manifest = Manifest.model_validate_json(client.get(f"{where}/manifest").content)
-    reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
+    reasons = manifest.rejection_counts
+    size = client.get(where).json()["bytes"]
     with DatasetReader(f"{client.base_url}".rstrip("/") + where) as reader:
         slots = np.concatenate([reader.slots(split) for split in ("train", "validation", "test")])
         multistable, contact, reach = (reader.read(n, slots) for n in ("multistable", "self_contact_distance", "reach"))
     near = contact[np.isfinite(contact)]
     return (
         f"  accepted {manifest.valid_count} of {manifest.sample_count} ({manifest.acceptance_rate:.2%})"
-        f"{'; lost: ' + str(dict(reasons)) if reasons else '; nothing was lost'}; {manifest.size / 1e6:.1f} MB\n"
+        f"{f'; lost: {reasons}' if reasons else '; nothing was lost'}; {size / 1e6:.1f} MB\n"
         f"  multistable {multistable.mean():.2%}; come back to themselves {len(near) / len(slots):.2%}, "
         f"nearest {near.min(initial=np.inf):.4f} L; reach median {np.median(reach):.3f}, largest {reach.max():.3f} L"
     )

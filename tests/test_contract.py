@@ -17,12 +17,13 @@ from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import keyed_points, samples
 from stickslip_services.queue.planning import expand
-from stickslip_services.queue.terms import terms_for
+from stickslip_services.queue.terms import Terms, terms_for
 from stickslip_services.testing import BUILDS
+from stickslip_sim_core import stage
 from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth.solver import MU_MAX
 from stickslip_sim_core.protocols import CERTIFICATION
-from stickslip_sim_core.scenes import cloth_drag, cloth_sphere
+from stickslip_sim_core.scenes import cloth_sphere
 from stickslip_training.kinds import dataset_class
 from stickslip_workers.kinds import kind
 
@@ -38,7 +39,7 @@ def test_materials_presets_and_kernels_have_one_name() -> None:
 
 
 def test_instants_are_those_of_the_scenes() -> None:
-    assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (cloth_drag.FRAMES, cloth_drag.FRAME_RATE)
+    assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (stage.FRAMES, stage.FRAME_RATE)
     assert (ClothSphereSpec.instants, ClothSphereSpec.instants_per_second) == (
         cloth_sphere.FRAMES,
         cloth_sphere.FRAME_RATE,
@@ -93,7 +94,7 @@ def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[J
     name = "cloth_drag" if issubclass(of, ClothSpec) else "rod_hang"
     spec = of.model_validate({"kind": name, "axes": cloth if issubclass(of, ClothSpec) else rods})
     with pytest.raises(UnknownKindError, match="kind must be one of"):
-        expand(spec, BUILDS)
+        expand(spec, Terms(BUILDS, None))
     with pytest.raises(UnknownKindError, match="kind must be one of"):
         layout(spec)
     with pytest.raises(UnknownKindError, match="kind must be one of"):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from stickslip_blender.clips import ClothRenderer
-from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.holders import Holders
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.jobs import Quality

@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 import pytest
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Contents, Manifest
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.tasks import Rejection
@@ -50,6 +50,11 @@ def grid_spec(gammas: int = 30) -> dict[str, Any]:
     return spec
 
 
+def contents_of(*arguments: Any, **options: Any) -> Contents:
+    """Return what a made-up manifest lists."""
+    return Contents(manifest(*arguments, **options), lambda _: b"")
+
+
 def cells(page: str, name: str) -> list[tuple[int, str]]:
     """Return how many were lost in each cell of a map, and what the cell says."""
     (drawing,) = re.findall(rf'<svg role="img" aria-label="lost over {name}".*?</svg>', page, re.DOTALL)
@@ -59,7 +64,7 @@ def cells(page: str, name: str) -> list[tuple[int, str]]:
 
 
 def test_nothing_lost_is_said() -> None:
-    page = dataset_page(manifest(grid_spec()))
+    page = dataset_page(contents_of(grid_spec()))
     assert "<b>100.00%</b> accepted: 180 of" in page
     assert "No sample was rejected." in page
     assert "No region has lost a sample" in page
@@ -68,7 +73,7 @@ def test_nothing_lost_is_said() -> None:
 
 
 def test_maps_put_losses_where_they_were() -> None:
-    page = dataset_page(manifest(grid_spec(), lambda at: at["gamma"] < 200 and at["phi1"] > 15))
+    page = dataset_page(contents_of(grid_spec(), lambda at: at["gamma"] < 200 and at["phi1"] > 15))
     assert "<b>96.67%</b> accepted: 174 of" in page
     assert re.search(r"<td>out_of_frame</td><td>6</td><td>3.33%</td>", page)
     # 100 to 200 is the first of 12 cells of gamma: 3 weights, 2 twists, 1 of 3 curvatures.
@@ -89,7 +94,7 @@ def test_zipped_and_random_axes_are_mapped_where_there_are_samples() -> None:
         "phi0": {"type": "random", "low": 0.2, "high": 12.0, "num": 40, "seed": 3},
         "phi1": {"type": "random", "low": 6.0, "high": 20.0, "num": 40, "seed": 3},
     }
-    page = dataset_page(manifest(spec, lambda at: at["gamma"] > 900))
+    page = dataset_page(contents_of(spec, lambda at: at["gamma"] > 900))
     told = cells(page, "gamma and phi0")
     asked = [int(count) for _, text in told for count in re.findall(r"of (\d+) lost", text)]
     assert sum(asked) == 40
@@ -98,17 +103,17 @@ def test_zipped_and_random_axes_are_mapped_where_there_are_samples() -> None:
 
 def test_one_axis_has_no_map() -> None:
     spec = rods(gamma=(1.0, 2.0), phi1=3.0)
-    page = dataset_page(manifest(spec))
+    page = dataset_page(contents_of(spec))
     assert "fewer than two axes" in page
     assert "<svg" not in page
 
 
 def test_what_comes_from_elsewhere_is_escaped_and_long_lists_end() -> None:
-    page = dataset_page(manifest(grid_spec(100), lambda at: at["phi1"] > 15, message="<script>"))
+    page = dataset_page(contents_of(grid_spec(100), lambda at: at["phi1"] > 15, message="<script>"))
     assert "<script>" not in page
     assert page.count("&lt;script&gt;") == LISTED
     assert ">0 more are" not in page
-    page = dataset_page(manifest(grid_spec(101), lambda at: at["phi1"] > 15))
+    page = dataset_page(contents_of(grid_spec(101), lambda at: at["phi1"] > 15))
     assert "2 more are in the manifest" in page
 
 

@@ -50,7 +50,7 @@ def test_a_part_has_all_labels_and_the_shards_of_chosen_samples(origin: tuple[st
     views = {path for path in files(target) if path.startswith("views/c/")}
     assert views == {f"views/c/{shard}/0/0/0/0" for shard in (0, 1)}  # slots 1 and 2
     assert not [path for path in files(target) if path.startswith(("centerline/", "frame/"))]
-    assert {f"gamma/c/{shard}" for shard in range(4)} <= files(target)
+    assert "gamma/c/0" in files(target)
     part = json.loads((target / SELECTION_NAME).read_bytes())
     assert part["selection"] == {"arrays": ["views"], "split": None, "where": ["gamma<3", "gamma>=1"]}
     assert run("verify", target).exit_code == 0
@@ -62,9 +62,9 @@ def test_a_part_that_is_not_whole_is_found_and_mended(origin: tuple[str, str, st
     with Client(url) as client:
         pull(client, dataset, 1, tmp_path, selection=chosen)
         (tmp_path / "views/c/0/0/0/0/0").unlink()
-        (tmp_path / "gamma/c/3").write_bytes(b"damaged")
+        (tmp_path / "gamma/c/0").write_bytes(b"damaged")
         # Without labels nobody knows what else belongs to the part.
-        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [("gamma/c/3", "size")]
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [("gamma/c/0", "size")]
         pull(client, dataset, 1, tmp_path, selection=chosen)
         assert verify(tmp_path) == []
         (tmp_path / "views/c/0/0/0/0/0").unlink()
@@ -108,8 +108,7 @@ def test_versions_are_compared(origin: tuple[str, str, str], tmp_path: Path) -> 
     with Client(url) as client:
         pull(client, small, 1, tmp_path / "small", selection=Selection(arrays=()))
         found = {
-            each.what: (each.a, each.b)
-            for each in differences(client.manifest(large, 1)[0], client.manifest(small, 1)[0])
+            each.what: (each.a, each.b) for each in differences(client.contents(large, 1), client.contents(small, 1))
         }
     assert found["samples"] == ("8", "4")
     assert found["spec name"] == ("4-rods", "2-rods")

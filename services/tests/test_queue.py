@@ -7,7 +7,7 @@ from sqlalchemy import select
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.responses import Dataset
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask
+from stickslip_schemas.tasks import PackTask, PublishSection, PublishTask, RenderTask
 from stickslip_schemas.worker_api import LeaseRequest
 from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
@@ -46,7 +46,7 @@ def show_dataset(coordinator: Coordinator, dataset: str) -> Dataset:
 
 def show_task(coordinator: Coordinator, name: str) -> AnyTask:
     with coordinator.database.read() as connection:
-        return find_task(connection, name)
+        return find_task(connection, name, coordinator.store.publish)
 
 
 def check(coordinator: Coordinator) -> None:
@@ -95,12 +95,13 @@ def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, work
     worker.finish(first, second)
     (publish,) = worker.lease(publish=1)
     assert isinstance(publish.task, PublishTask)
-    assert [file.path for file in publish.task.files] == [
-        f"{name}/c/{shard}/0" for name in ("sample_key", "views") for shard in (0, 1)
-    ]
-    assert [entry.slot for entry in publish.task.rejections] == [0]
-    assert len(publish.task.sample_keys) == 4
-    assert publish.task.sample_keys[1] == good.sample_key
+    (digest,) = publish.task.sections
+    section = PublishSection.model_validate_json(coordinator.store.read(digest))
+    assert [file.path for file in section.files] == ["views/c/0/0", "views/c/1/0"]
+    assert len(section.labels) == 2
+    assert [entry.slot for entry in section.rejections] == [0]
+    assert (section.first, len(section.sample_keys)) == (0, 4)
+    assert section.sample_keys[1] == good.sample_key
     check(coordinator)
 
 

@@ -39,7 +39,9 @@ SPECS = (
     rods(gamma=(1.0, 2.0)),  # shares tasks with the first
     rods(gamma=(2.0,), views=None),  # and with the second
     rods(gamma=(2.0,), phi1=(1.0,)),  # all of it is rejected
+    rods(gamma=(1.0, 3.0, 4.0)),  # too many samples to be planned at once; shares tasks with the first two
 )
+PLAN_SAMPLES = 4
 
 HOW = ("well", "well", "well", "crashed", "crashed", "broken", "lost", "released")
 """How a task ends, the likely ways more often."""
@@ -68,6 +70,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.settings = Settings.chosen(
             data=Path(self.directory.name),
             durable=False,
+            plan_samples=PLAN_SAMPLES,
             database=None if self.server is None else self.server.clean(),
         )
         self.coordinator = Coordinator(self.settings, self.clock)
@@ -86,6 +89,19 @@ class QueueMachine(RuleBasedStateMachine):
     def submit(self, which: int) -> str:
         job = self.coordinator.submit(parsed(SPECS[which]), None)
         return job.id  # type: ignore[union-attr]
+
+    @rule()
+    def plan(self) -> None:
+        """Plan a piece of a job."""
+        waiting = {job.id: job for job in list_jobs(self.coordinator) if job.state is JobState.planning}
+        assert self.coordinator.planner.step() == bool(waiting)
+        grown = [
+            job.progress.planned - waiting[job.id].progress.planned
+            for job in list_jobs(self.coordinator)
+            if job.id in waiting
+        ]
+        assert sorted(grown)[:-1] == [0] * (len(grown) - 1), "one piece of one job"
+        assert not grown or 0 < max(grown) <= PLAN_SAMPLES
 
     @rule(name=st.sampled_from(("a", "b")))
     def register(self, name: str) -> None:
@@ -175,7 +191,7 @@ class QueueMachine(RuleBasedStateMachine):
         except ConflictError:
             assert job in self.ended or show_job(self.coordinator, job).state is JobState.cancelling
         else:
-            assert shown.state in (JobState.queued, JobState.running)
+            assert shown.state in (JobState.planning, JobState.queued, JobState.running)
 
     @rule(job=jobs, priority=st.integers(-2, 2))
     def prioritise(self, job: str, priority: int) -> None:
@@ -232,6 +248,7 @@ class QueueMachine(RuleBasedStateMachine):
         worker = PretendWorker(self.coordinator, self.coordinator.store, name="last", judge=_judge).register()
         for _ in range(10):
             self.clock.advance(60)
+            self.coordinator.plan_large_jobs()
             worker.work()
         for job in list_jobs(self.coordinator):
             assert job.state.is_terminal, f"{job.id} is {job.state}"

@@ -177,7 +177,7 @@ def test_a_result_that_is_not_in_the_store_is_refused(
         chunk = output.chunks["views"]
         output = output.model_copy(update={"chunks": {"views": chunk.model_copy(update={"length": 10**6})}})
     else:
-        directory(worker).path(output.files[1].sha256).unlink()  # type: ignore[union-attr]
+        directory(worker).path(output.labels).unlink()  # type: ignore[union-attr]
     lie = TaskResult(outcome="succeeded", output=output)
     assert worker.report((lease, lie)) == ["accepted"]  # as a failure
     with coordinator.database.read() as connection:

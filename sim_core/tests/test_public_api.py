@@ -28,6 +28,7 @@ def test_exported_names() -> None:
         "build_info",
         "cylinder",
         "drop_and_drag",
+        "drop_on_cloth",
         "fabric",
         "fabric_names",
         "fit_natural_curvature",

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stickslip_sim_core import DropAndDrag, drop_and_drag, fabric, fabric_names
+from stickslip_sim_core import DropAndDrag, drop_and_drag, drop_on_cloth, fabric, fabric_names
+from stickslip_sim_core import stage as scenes
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.scenes import cloth_drag as scenes
 from stickslip_sim_core.scenes.cloth_sphere import RADIUS, SETTLING, SPEED, rotating_sphere, turned
 
 
@@ -161,12 +161,35 @@ class TestDropAndDrag:
             ({"preset": "best"}, "preset: must be one of"),
             ({"fabric": "silk"}, "fabric: must be one of"),
             ({"mu": -0.1}, r"mu: must be in \[0, 10\], got -0.1"),
+            ({"self_friction": -1.0}, r"mu: must be in \[0, 10\], got -1.0"),
             ({"mu": float("nan")}, r"mu: must be in \[0, 10\], got nan"),
         ],
     )
     def test_refusals(self, settings: dict[str, object], message: str) -> None:
         with pytest.raises(ValueError, match=message):
             drop_and_drag(**{"fabric": "gray-interlock", "mu": 0.5, **settings})  # type: ignore[arg-type]
+
+
+class TestClothOnCloth:
+    def test_a_stretched_cloth_is_a_floor_of_the_same_friction(self) -> None:
+        floor = drop_and_drag("gray-interlock", 0.4, vertices=9, frames=80)
+        cloth = drop_on_cloth("gray-interlock", "11oz-black-denim", 0.4, vertices=9, frames=80)
+        assert cloth.valid, cloth.reason
+        assert 4.9e-4 < cloth.least_distance <= 5e-4
+        assert not cloth.self_intersections.any()
+        steady, weight = slice(60, 75), floor.holder_force[0, 2]
+        assert np.abs(cloth.contact_force - floor.contact_force)[steady].max() < 1e-5 * weight
+        assert np.abs(cloth.holder_force - floor.holder_force).max() < 0.03 * weight
+        assert np.median(np.abs(cloth.positions - floor.positions)) < 1e-6
+        assert np.abs(cloth.others - cloth.others[0]).max() < 1e-4
+
+    def test_refusals(self) -> None:
+        with pytest.raises(ValueError, match="vertices: must be at least 5, got 3"):
+            drop_on_cloth("gray-interlock", "gray-interlock", 0.4, vertices=3)
+        with pytest.raises(ValueError, match="fabric: must be one of"):
+            drop_on_cloth("gray-interlock", "silk", 0.4)
+        with pytest.raises(ValueError, match=r"mu: must be in \[0, 10\]"):
+            drop_on_cloth("gray-interlock", "gray-interlock", 11.0)
 
 
 class TestRotatingSphere:

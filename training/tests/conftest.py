@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from stickslip_schemas.arrays import ArrayLayout, describe
+from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
-from stickslip_schemas.layout import layout
+from stickslip_schemas.layout import layout, samples_per_file
 from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
 from stickslip_schemas.samples import SPLITS, dataset_id, samples
 from stickslip_schemas.states import Reason
@@ -88,12 +88,12 @@ def write_dataset(
     }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # consolidated metadata are no part of the Zarr v3 specification yet
-        group = zarr.create_group(str(root), zarr_format=3, attributes={"format": "stickslip-dataset/1"})
+        group = zarr.create_group(str(root), zarr_format=3, attributes={"format": FORMAT})
         for array in layout(spec):
             values = arrays[array.name].copy()
             if array.name not in ("valid", "split", "sample_key"):
                 values[~valid] = array.fill
-            _write_array(group, array, values, spec.samples_per_shard)
+            _write_array(group, array, values, samples_per_file(array, spec, FORMAT))
             arrays[array.name] = values
         zarr.consolidate_metadata(group.store)
     files = sorted(path for path in root.rglob("*") if path.is_file() and path != root / "zarr.json")
@@ -130,8 +130,8 @@ def write_dataset(
     return MadeDataset(root, arrays, spec)
 
 
-def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samples_per_shard: int) -> None:
-    shard = (samples_per_shard, *array.shape)
+def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samples_per_file: int) -> None:
+    shard = (samples_per_file, *array.shape)
     compressor = BloscCodec(typesize=4, cname="zstd", clevel=5, shuffle="shuffle") if array.is_trajectory else None
     out = group.create_array(
         array.name,

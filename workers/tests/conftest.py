@@ -21,6 +21,7 @@ from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import (
     ChunkRef,
     FileEntry,
+    PackOutput,
     PackSlot,
     PackTask,
     PublishTask,
@@ -34,7 +35,9 @@ from stickslip_workers.stages.records import encode_records
 
 os.environ["RAY_AUTH_MODE"] = "token"  # Ray looks once, when it is first imported, and test_failures imports it
 HERE = str(Path(__file__).parent)
-sys.path.append(HERE)  # coordinator_double, fake_renderer
+sys.path.append(HERE)  # coordinator_double, fake_renderer, publishing
+
+from publishing import publish_task  # noqa: E402
 
 BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" * 64)
 
@@ -49,22 +52,19 @@ class Made:
     arrays: dict[str, np.ndarray[Any, Any]]
     rejections: tuple[Rejection, ...]
     sample_keys: tuple[str, ...]
-    files: list[FileEntry] = field(default_factory=list)
+    packed: list[PackOutput] = field(default_factory=list)
 
     @property
     def publish_task(self) -> PublishTask:
         """The task that ends it; packs first where that has not been done."""
-        if not self.files:
-            self.files = [file for task in self.pack_tasks for file in pack(task, self.store).files]
-        return PublishTask(
-            spec=self.spec,
-            dataset=dataset_id(self.spec),
-            version=1,
-            builds=BUILDS,
-            files=tuple(self.files),
-            sample_keys=self.sample_keys,
-            rejections=self.rejections,
-        )
+        if not self.packed:
+            self.packed = [pack(task, self.store) for task in self.pack_tasks]
+        return publish_task(self.spec, BUILDS, self.sample_keys, self.rejections, self.packed, self.store)
+
+    @property
+    def files(self) -> list[FileEntry]:
+        """What was packed."""
+        return [file for output in self.packed for file in output.files]
 
     def publish(self) -> Path:
         """Pack and publish, and return the directory."""

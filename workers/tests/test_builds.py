@@ -21,6 +21,15 @@ SIMULATIONS = {
     | {"seed": 1},
     "cloth_sphere": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
     | {"seed": 1, "angular_speed": 1.0},
+    "cloth_on_cloth": {
+        "material": "gray-interlock",
+        "fabric": None,
+        "mu": 0.5,
+        "preset": "fast",
+        "mesh": 5,
+        "frames": 2,
+    }
+    | {"seed": 1, "substrate_material": "11oz-black-denim", "substrate_fabric": None, "self_friction": 0.5},
 }
 
 _RUN = """
@@ -123,9 +132,9 @@ def test_a_kinds_own_files_are_in_its_builds_and_in_no_others() -> None:
 @pytest.mark.parametrize(
     ("file", "stage", "kinds"),
     [
-        ("fabrics.toml", "simulate", {"cloth_drag", "cloth_sphere"}),
+        ("fabrics.toml", "simulate", {"cloth_drag", "cloth_sphere", "cloth_on_cloth"}),
         ("textures.py", "simulate", set()),
-        ("textures.py", "pack", {"cloth_drag", "cloth_sphere"}),
+        ("textures.py", "pack", {"cloth_drag", "cloth_sphere", "cloth_on_cloth"}),
         ("arrays.py", "pack", set(KINDS)),
         ("chunks.py", "pack", set(KINDS)),
     ],

@@ -11,10 +11,11 @@ import tensorstore
 import xarray
 import zarr
 from PIL import Image
+from publishing import changed
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
-from stickslip_schemas.manifest import Manifest, Pictures, check_seal
+from stickslip_schemas.manifest import Contents, Manifest, Pictures, check_seal
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.publish import publish
 
@@ -56,6 +57,49 @@ def test_three_readers_give_back_what_went_in(make_dataset: Make, shape: dict[st
             _assert_same(tensorstore.open(spec, read=True).result().read().result(), expected, name)
     assert dataset["frame"].dims == ("sample", "point", "xyz", "director")
     assert group["split"].attrs["categories"] == ["train", "validation", "test"]
+
+
+def test_a_version_of_many_samples_has_sections(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same version with and without sections: other lists, and the same files."""
+    made = make_dataset(count=7, per_shard=2, rejected=(2, 5))
+    whole = _tree(made.publish())
+    monkeypatch.setattr("stickslip_schemas.manifest.SECTION_SAMPLES", 5)
+    directory = made.publish()
+    tree = _tree(directory)
+    names = ["manifest/0.json", "manifest/1.json"]
+    assert tree.keys() - whole.keys() == set(names)
+    changed_names = {name for name in whole if tree[name] != whole[name]}
+    assert changed_names == {"manifest.json", "manifest.sha256", "zarr.json", "README.md"}
+    check_seal(*(tree[name] for name in ("manifest.json", "zarr.json", "manifest.sha256")))
+    manifest = Manifest.model_validate_json(tree["manifest.json"])
+    assert [file.path for file in manifest.sections] == names
+    assert (manifest.sample_keys, manifest.rejections) == ((), ())
+    assert manifest.rejection_counts == {"out_of_frame": 2}
+    contents = Contents(manifest, lambda file: tree[file.path])
+    assert [(section.first, section.end) for section in contents.sections()] == [(0, 4), (4, 7)]
+    assert tuple(contents.sample_keys()) == made.sample_keys
+    assert tuple(contents.rejections()) == made.rejections
+    listed = {file.path: (file.sha256, file.size) for file in contents.files()}
+    others = tree.keys() - {"manifest.json", "zarr.json", "manifest.sha256"}
+    assert listed == {path: (sha256(tree[path]), len(tree[path])) for path in others}
+    for path in others:
+        found = contents.file(path)
+        assert found is not None
+        assert found.sha256 == sha256(tree[path])
+    assert contents.file("views/c/4/0/0/0/0") is None
+    assert not {path for path in listed if path.startswith("views/c")} & {file.path for file in manifest.files}
+
+
+def test_labels_have_large_chunks(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stickslip_schemas.arrays.LABEL_SAMPLES", 3)
+    made = make_dataset(count=7, per_shard=2, rejected=(2,))
+    directory = made.publish()
+    assert sorted(path.name for path in (directory / "gamma/c").iterdir()) == ["0", "1", "2"]
+    group = zarr.open_group(directory, mode="r")
+    assert group["gamma"].chunks == (3,)
+    assert group["centerline"].chunks[0] == 2
+    for name, expected in made.arrays.items():
+        _assert_same(group[name][...], expected, name)
 
 
 def test_manifest_says_everything(make_dataset: Make) -> None:
@@ -123,15 +167,19 @@ def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
     made = make_dataset()
     task = made.publish_task
     with pytest.raises(ValueError, match=r"files must be those of 2 shards.*'"):
-        publish(task.model_copy(update={"files": task.files[1:]}), made.store)
+        publish(changed(task, made.store, files=tuple(made.files[1:])), made.store)
+    with pytest.raises(ValueError, match="files must be those of 2 shards"):
+        publish(changed(task, made.store, labels=(made.packed[0].labels,)), made.store)
     with pytest.raises(ValueError, match="rejections must be the slots that are not valid"):
-        publish(task.model_copy(update={"rejections": ()}), made.store)
+        publish(changed(task, made.store, rejections=()), made.store)
+    with pytest.raises(ValueError, match=r"sections must have the samples 0 to 6, and they end at \[0, 6\]"):
+        publish(changed(task, made.store, sample_keys=made.sample_keys[:6]), made.store)
     with pytest.raises(ValueError, match="dataset must be the id of its spec"):
         publish(task.model_copy(update={"dataset": "../elsewhere"}), made.store)
-    made.store.path(task.files[0].sha256).write_bytes(b"cut")
+    made.store.path(made.files[0].sha256).write_bytes(b"cut")
     with pytest.raises(OSError, match=r"must have .* bytes and the digest that names it"):
         publish(task, made.store)
-    made.store.path(task.files[0].sha256).unlink()
+    made.store.path(made.files[0].sha256).unlink()
     with pytest.raises(OSError, match="must have"):
         publish(task, made.store)
     assert not made.store.dataset_path(task.dataset, 1).exists()

@@ -1,8 +1,8 @@
 """What an array of a dataset is. The first dimension of every array is `sample`.
 
-Labels and curves are one chunk per shard group; pictures, clips and meshes are one chunk per sample, and the chunks of
-a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for those of clips and
-trajectories: see `stickslip_schemas.codecs`.
+Labels are a few large chunks; curves are one chunk per shard group; pictures, clips and meshes are one chunk per
+sample, and the chunks of a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for
+those of clips and trajectories: see `stickslip_schemas.codecs`.
 """
 
 from dataclasses import dataclass, field, fields
@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = "stickslip-dataset/1"
+FORMAT = "stickslip-dataset/2"
+FORMAT_1 = "stickslip-dataset/1"
+"""The format before: labels were one chunk per shard group, and a manifest had no sections."""
+
+LABEL_SAMPLES = 65_536
+"""Samples in a chunk of a label: a million samples have 16 files of each label."""
+LEAST_LABEL_SAMPLES = 4_096
+LABEL_CHUNK_BYTES = 2**21
+"""A chunk of a label that is a long vector has fewer samples, to be no larger than this [bytes]."""
 
 SAMPLE_KEY_BYTES = 32
 
@@ -47,13 +55,18 @@ class ArrayLayout:
         return prod(self.shape) * np.dtype(self.dtype).itemsize
 
     @property
+    def is_label(self) -> bool:
+        """True of one number of a sample, or a small vector."""
+        return not self.per_sample and len(self.shape) < 2
+
+    @property
     def identity(self) -> dict[str, Any]:
         """What decides on the bytes of the array, as JSON: everything but the description."""
         own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "description"}
         return own | {"fill": repr(self.fill)}  # NaN has no JSON form
 
     def shard_path(self, shard: int) -> str:
-        """Path, inside the dataset, of the file that holds shard group `shard` [Zarr v3 default chunk keys]."""
+        """Path, inside the dataset, of file `shard` of the array [Zarr v3 default chunk keys]."""
         return "/".join([self.name, "c", str(shard), *("0" for _ in self.shape)])
 
 

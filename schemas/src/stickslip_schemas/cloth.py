@@ -392,10 +392,10 @@ class ClothSpec(JobSpec):
                 attributes={"instants": list(self.shown_instants)},
             ),
             *self._ground_truth_arrays(),
-            _codes("texture", self.names("texture")),
-            _codes("viewpoint", self.names("viewpoint")),
-            _codes("lighting", self.names("lighting") if "lighting" in self.own else tuple(Lighting)),
-            _codes("substrate", self.names("substrate") if "substrate" in self.own else tuple(Substrate)),
+            codes("texture", self.names("texture")),
+            codes("viewpoint", self.names("viewpoint")),
+            codes("lighting", self.names("lighting") if "lighting" in self.own else tuple(Lighting)),
+            codes("substrate", self.names("substrate") if "substrate" in self.own else tuple(Substrate)),
             ArrayLayout("light_seed", "int32", (), (), "seed of the lamp, the floor and the noise", fill=-1),
             ArrayLayout(
                 "light",
@@ -470,7 +470,7 @@ class ClothSpec(JobSpec):
             "stretching": "factor of the fabric's stiffness in its plane",
         }
         return (
-            _codes("material", self.names("material")),
+            codes("material", self.names("material")),
             ArrayLayout("mu", "float64", (), (), "friction coefficient", fill=NAN),
             *(
                 ArrayLayout(name, "float64", (), (), text, fill=NAN)
@@ -499,7 +499,7 @@ class ClothSpec(JobSpec):
     def solver_arrays(self) -> tuple[ArrayLayout, ...]:
         """Return what the solver says of its work."""
         return (
-            _codes("kernel", KERNELS),
+            codes("kernel", KERNELS),
             ArrayLayout("steps", "int32", (), (), "time steps of the solver", fill=-1),
             ArrayLayout("unconverged_steps", "int32", (), (), "steps that stopped short of the tolerance", fill=-1),
             ArrayLayout(
@@ -569,5 +569,6 @@ class ClothSpec(JobSpec):
         )
 
 
-def _codes(name: str, names: tuple[str, ...]) -> ArrayLayout:
+def codes(name: str, names: tuple[str, ...]) -> ArrayLayout:
+    """Return the label of an axis of names: a code each, in the order of `names`."""
     return ArrayLayout(name, "int16", (), (), f"code of the {name}", fill=-1, categories=tuple(map(str, names)))

@@ -1,6 +1,7 @@
 """Which arrays the dataset of a spec has."""
 
-from stickslip_schemas.arrays import COMMON_ARRAYS, ArrayLayout
+from stickslip_schemas import arrays
+from stickslip_schemas.arrays import COMMON_ARRAYS, FORMAT_1, ArrayLayout
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import registered
 
@@ -8,6 +9,14 @@ from stickslip_schemas.kinds import registered
 def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
     """Return the arrays of the dataset of `spec`; raise UnknownKindError where nobody registered its class."""
     return (*registered(spec).arrays(), *COMMON_ARRAYS)
+
+
+def samples_per_file(array: ArrayLayout, spec: JobSpec, dataset_format: str) -> int:
+    """Return how many consecutive samples a file of an array holds, but the last one."""
+    if array.is_label and dataset_format != FORMAT_1:
+        most = max(arrays.LEAST_LABEL_SAMPLES, arrays.LABEL_CHUNK_BYTES // array.sample_bytes)
+        return min(most, arrays.LABEL_SAMPLES, spec.sample_count)
+    return spec.samples_per_shard
 
 
 def bytes_estimate(spec: JobSpec) -> int:

@@ -1,22 +1,29 @@
 """The manifest of a dataset version: what is in it, what it was made from, and how to check it.
 
-Three files vouch for all others and for one another. `manifest.json` has the SHA-256 of every file but these three. The
-attribute `manifest_sha256` of the root's `zarr.json` is that of the manifest. `manifest.sha256` has those of both, in
-the form that `sha256sum --check` reads. So a bit that flips in any of the three shows.
+Three files vouch for all others and for one another. `manifest.json` has the SHA-256 of every file but these three. In
+a version of many samples it has those of its **sections** instead, `manifest/0.json` and so on, each of which lists the
+keys, rejections and files of some thousand samples: a tree of digests, so that nobody reads all lists to open a
+version. `Contents` reads both forms. The attribute `manifest_sha256` of the root's `zarr.json` is the SHA-256 of the
+manifest. `manifest.sha256` has those of both, in the form that `sha256sum --check` reads. So a bit that flips in any of
+these files shows.
 """
 
 import json
-from typing import Literal
+import re
+from collections.abc import Callable, Iterator
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.base import Document
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import Camera
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.jobs import JobSpec, Quality
 from stickslip_schemas.keys import Sha256, sha256
 from stickslip_schemas.kinds import AnyJobSpec
-from stickslip_schemas.tasks import FileEntry, Rejection
+from stickslip_schemas.layout import samples_per_file
+from stickslip_schemas.tasks import FileEntry, ManifestSection, Rejection
 
 MANIFEST_NAME = "manifest.json"
 GROUP_NAME = "zarr.json"
@@ -25,6 +32,32 @@ SEALED_NAMES = (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
 """The files of a version that its manifest does not list."""
 
 MANIFEST_ATTRIBUTE = "manifest_sha256"
+
+
+SECTION_SAMPLES = 10_000
+"""A section has so many samples, or a little fewer: whole shards. A version of no more has no sections."""
+
+
+def section_samples(spec: JobSpec) -> int:
+    """Return how many samples a section of a manifest has."""
+    return max(1, SECTION_SAMPLES // spec.samples_per_shard) * spec.samples_per_shard
+
+
+def has_sections(spec: JobSpec) -> bool:
+    """Tell whether the manifest of a dataset of `spec` has sections."""
+    return spec.sample_count > SECTION_SAMPLES
+
+
+def section_path(number: int) -> str:
+    """Return the path of a section inside its version."""
+    return f"manifest/{number}.json"
+
+
+_SHARD = re.compile(r"[^/]+/c/(\d{1,18})(?:/|$)")
+
+
+class BrokenSectionError(ValueError):
+    """A section of a manifest is not what the manifest says."""
 
 
 class BrokenSealError(ValueError):
@@ -57,7 +90,7 @@ class Pictures(Document):
 class Manifest(Document):
     """Everything about a version that is not in its arrays. A version exists when its manifest is committed."""
 
-    format: Literal["stickslip-dataset/1"] = "stickslip-dataset/1"
+    format: Literal["stickslip-dataset/1", "stickslip-dataset/2"] = "stickslip-dataset/2"
     dataset: str
     version: int = Field(ge=1)
     spec: AnyJobSpec
@@ -73,22 +106,132 @@ class Manifest(Document):
     sample_count: int = Field(ge=1, description="slots, the rejected ones included")
     valid_count: int = Field(ge=0)
     split_counts: dict[str, int] = Field(description="valid samples by split")
-    rejections: tuple[Rejection, ...]
-    sample_keys: tuple[Sha256, ...] = Field(description="by slot")
-    files: tuple[FileEntry, ...] = Field(
-        description="every file of the version, by path, but the three that vouch for it: this one, the root's "
-        "zarr.json and manifest.sha256"
+    rejection_counts: dict[str, int] = Field(default_factory=dict, description="rejected samples by reason")
+    sections: tuple[FileEntry, ...] = Field(
+        default=(),
+        description="files that list samples and the files of their shards, by slot; none in a small version",
     )
+    rejections: tuple[Rejection, ...] = Field(description="empty where there are sections, which have them")
+    sample_keys: tuple[Sha256, ...] = Field(description="by slot; empty where there are sections, which have them")
+    files: tuple[FileEntry, ...] = Field(
+        description="every file of the version, by path, but the three that vouch for it (this one, the root's "
+        "zarr.json and manifest.sha256), the sections, and what the sections list"
+    )
+
+    @model_validator(mode="after")
+    def _has_its_sections(self) -> Self:
+        if not self.sections:
+            return self
+        expected = [section_path(number) for number in range(-(-self.sample_count // section_samples(self.spec)))]
+        found = [section.path for section in self.sections]
+        if found != expected:
+            raise ValueError(f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got {found[:5]}")
+        if self.sample_keys or self.rejections:
+            raise ValueError("sample_keys and rejections must be empty, for there are sections, which have them")
+        return self
+
+    def samples_per_file(self, array: ArrayLayout) -> int:
+        """Return how many consecutive samples a file of an array of this version holds, but the last one."""
+        return samples_per_file(array, self.spec, self.format)
 
     @property
     def acceptance_rate(self) -> float:
         """Share of the slots that hold a valid sample."""
         return self.valid_count / self.sample_count
 
-    @property
-    def size(self) -> int:
-        """Size of all files that it lists [bytes]."""
-        return sum(file.size for file in self.files)
+
+class Contents:
+    """What a manifest lists. Sections are read when they are asked for, and checked against their digests.
+
+    Methods raise BrokenSectionError for a section that is not what the manifest says, and what `read` raises.
+    """
+
+    KEPT = 2
+    """So many of the sections that were read last are kept."""
+
+    def __init__(self, manifest: Manifest, read: Callable[[FileEntry], bytes]) -> None:
+        self.manifest = manifest
+        self._read = read
+        self._samples = section_samples(manifest.spec) if manifest.sections else manifest.sample_count
+        # Each of these is replaced as a whole, so threads may share the object.
+        self._kept: dict[int, ManifestSection] = {}
+        self._root_files: dict[str, FileEntry] | None = None
+        self._section_files: tuple[int, dict[str, FileEntry]] = (-1, {})
+
+    def number_of(self, slot: int) -> int:
+        """Return the number of the section of a sample; 0 where all is in the manifest itself."""
+        return slot // self._samples
+
+    def section(self, number: int) -> ManifestSection:
+        """Return a section; a manifest without sections is like one with one section, but for the files."""
+        kept = self._kept
+        found = kept.get(number) or self._section(number)
+        others = [item for item in kept.items() if item[0] != number]
+        self._kept = dict([(number, found), *others][: self.KEPT])
+        return found
+
+    def sections(self) -> Iterator[ManifestSection]:
+        """Yield all sections, by slot."""
+        for number in range(max(1, len(self.manifest.sections))):
+            yield self.section(number)
+
+    def files(self) -> Iterator[FileEntry]:
+        """Yield every file of the version, but the three that vouch for it: also the sections themselves."""
+        yield from self.manifest.files
+        yield from self.manifest.sections
+        for section in self.sections() if self.manifest.sections else ():
+            yield from section.files
+
+    def file(self, path: str) -> FileEntry | None:
+        """Return the file at a path of the version; None where it lists none. At most one section is read."""
+        own = self._root_files
+        if own is None:
+            own = self._root_files = {file.path: file for file in [*self.manifest.files, *self.manifest.sections]}
+        found = own.get(path)
+        shard = _SHARD.match(path)
+        if found is not None or shard is None or not self.manifest.sections:
+            return found
+        slot = int(shard[1]) * self.manifest.spec.samples_per_shard
+        if slot >= self.manifest.sample_count:
+            return None
+        number, files = self._section_files
+        if number != self.number_of(slot):
+            number = self.number_of(slot)
+            files = {file.path: file for file in self.section(number).files}
+            self._section_files = number, files
+        return files.get(path)
+
+    def rejections(self) -> Iterator[Rejection]:
+        """Yield the rejected samples, by slot."""
+        for section in self.sections():
+            yield from section.rejections
+
+    def sample_keys(self) -> Iterator[Sha256]:
+        """Yield the keys of the samples, by slot."""
+        for section in self.sections():
+            yield from section.sample_keys
+
+    def _section(self, number: int) -> ManifestSection:
+        manifest = self.manifest
+        if not manifest.sections:
+            return ManifestSection.model_construct(
+                first=0, sample_keys=manifest.sample_keys, rejections=manifest.rejections, files=()
+            )
+        entry = manifest.sections[number]
+        data = self._read(entry)
+        if (found := sha256(data)) != entry.sha256:
+            raise BrokenSectionError(f"{entry.path} has SHA-256 {found}, and {MANIFEST_NAME} says {entry.sha256}")
+        try:
+            section = ManifestSection.model_validate_json(data)
+        except ValueError as error:
+            raise BrokenSectionError(f"{entry.path} is no section of a manifest: {error}") from error
+        slots = number * self._samples, min((number + 1) * self._samples, manifest.sample_count)
+        if (section.first, section.end) != slots:
+            raise BrokenSectionError(
+                f"{entry.path} must list the samples {slots[0]} to {slots[1] - 1}, and lists {section.first} to "
+                f"{section.end - 1}"
+            )
+        return section
 
 
 def seal_text(manifest: Sha256, group: Sha256) -> bytes:

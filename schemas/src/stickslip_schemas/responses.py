@@ -38,6 +38,9 @@ class Progress(Document):
 
     done: int = Field(description="tasks that are over, of all stages")
     total: int
+    planned: int = Field(
+        description="samples whose tasks are written down; `done` and `total` count the tasks of these only"
+    )
     stages: dict[Stage, StageProgress]
     eta: Eta | None = Field(description="null until there is a measurement to go by, and when nothing is left")
 

@@ -16,8 +16,9 @@ from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.base import Document
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import GROUP_NAME, Manifest
+from stickslip_schemas.manifest import GROUP_NAME, Contents
 from stickslip_schemas.samples import SPLITS
+from stickslip_schemas.tasks import FileEntry
 
 SELECTION_NAME = "selection.json"
 """The file that says which part of a version a directory holds; it is not in a directory that holds all of it."""
@@ -71,7 +72,7 @@ class Selection(Document):
         for name in self.arrays:
             if name not in names:
                 raise ValueError(f"arrays must be some of {', '.join(names)}, and {name!r} is none of them")
-        return tuple(array for array in arrays if is_label(array) or array.name in self.arrays)
+        return tuple(array for array in arrays if array.is_label or array.name in self.arrays)
 
     def choose_samples(self, arrays: Iterable[ArrayLayout], label: Labels) -> npt.NDArray[np.bool_]:
         """Return which slots are of the part, bool (slots,): they are valid, of the split, and hold to the conditions.
@@ -87,32 +88,39 @@ class Selection(Document):
         return chosen
 
 
-def is_label(array: ArrayLayout) -> bool:
-    """Tell whether an array is a label: one number of a sample, or a small vector."""
-    return not array.per_sample and len(array.shape) < 2
-
-
-def part_files(manifest: Manifest, selection: Selection, label: Labels | None) -> frozenset[str]:
-    """Return the paths of the listed files that a part of a version consists of.
+def part_files(contents: Contents, selection: Selection, label: Labels | None) -> list[FileEntry]:
+    """Return the listed files that a part of a version consists of.
 
     Without `label`, these are the files that one needs to know the labels, which tell what else belongs to the part.
     """
-    listed = frozenset(file.path for file in manifest.files)
     if selection.is_everything:
-        return listed
+        return list(contents.files())
+    manifest = contents.manifest
     arrays = layout(manifest.spec)
+    chosen_arrays = selection.choose_arrays(arrays)
     names = {array.name for array in arrays}
-    paths = {path for path in listed if path.split("/")[0] not in names}
-    size = manifest.spec.samples_per_shard
-    every = range(-(-manifest.sample_count // size))
-    some = (
-        every if label is None else np.unique(np.flatnonzero(selection.choose_samples(arrays, label)) // size).tolist()
-    )
-    for array in selection.choose_arrays(arrays):
-        if is_label(array) or label is not None:
+    slots = None if label is None else np.flatnonzero(selection.choose_samples(arrays, label))
+    paths: set[str] = set()
+    for array in chosen_arrays:
+        if array.is_label or slots is not None:
             paths.add(f"{array.name}/{GROUP_NAME}")
-            paths.update(array.shard_path(shard) for shard in (every if is_label(array) else some))
-    return frozenset(paths) & listed
+        if array.is_label:
+            count = -(-manifest.sample_count // manifest.samples_per_file(array))
+            paths.update(array.shard_path(number) for number in range(count))
+        elif slots is not None:
+            paths.update(map(array.shard_path, np.unique(slots // manifest.samples_per_file(array)).tolist()))
+    found = [file for file in manifest.files if file.path in paths or file.path.split("/")[0] not in names]
+    if manifest.sections and label is not None:
+        for number in sections_of(contents, selection, label):
+            found.append(manifest.sections[number])
+            found += [file for file in contents.section(number).files if file.path in paths]
+    return found
+
+
+def sections_of(contents: Contents, selection: Selection, label: Labels) -> list[int]:
+    """Return the numbers of the sections of a manifest that list the samples of a part; 0 is all of a small one."""
+    slots = np.flatnonzero(selection.choose_samples(layout(contents.manifest.spec), label))
+    return sorted({contents.number_of(slot) for slot in slots.tolist()})
 
 
 class PartDocument(Document):
@@ -130,8 +138,8 @@ def _holds(condition: str, arrays: dict[str, ArrayLayout], label: Labels) -> npt
         )
     name, sign, value = parts.groups()
     array = arrays.get(name)
-    if array is None or array.shape or not is_label(array):
-        single = [array.name for array in arrays.values() if is_label(array) and not array.shape]
+    if array is None or array.shape or not array.is_label:
+        single = [array.name for array in arrays.values() if array.is_label and not array.shape]
         raise ValueError(f"where must name one of the labels {', '.join(single)}; and is {condition!r}")
     if (array.categories or array.dtype == "bool") and sign not in ("=", "==", "!="):
         raise ValueError(f"where must compare {name} with == or !=, for it has no order; and is {condition!r}")

@@ -4,8 +4,12 @@ from enum import StrEnum
 
 
 class JobState(StrEnum):
-    """Where a job is; `pausing` and `cancelling` last until the leased tasks have been given back."""
+    """Where a job is; `pausing` and `cancelling` last until the leased tasks have been given back.
 
+    A job of many samples is `planning` until all its tasks are written down; the first of them run meanwhile.
+    """
+
+    planning = "planning"
     queued = "queued"
     running = "running"
     pausing = "pausing"

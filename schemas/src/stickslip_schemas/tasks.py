@@ -1,5 +1,7 @@
 """What the stages are told to do and what they answer. Bulk data is named by digest and never travels here."""
 
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, model_validator
@@ -125,10 +127,31 @@ class PackTask(Document):
 
 
 class PackOutput(Document):
-    """The shard's files, in the store."""
+    """The shard's files, in the store, and its labels, which go into files with those of other shards."""
 
     stage: Literal["pack"] = "pack"
+    files: tuple[FileEntry, ...] = Field(description="of the arrays that are no labels")
+    labels: Sha256 = Field(description="artifact: a shard whose chunks are the labels, in the order of the layout")
+
+
+class ManifestSection(Document):
+    """What a version has of consecutive shards: their samples and the files of their arrays that are no labels."""
+
+    first: Int = Field(ge=0, description="slot of the first sample")
+    sample_keys: tuple[Sha256, ...] = Field(min_length=1, description="by slot")
+    rejections: tuple[Rejection, ...]
     files: tuple[FileEntry, ...]
+
+    @property
+    def end(self) -> int:
+        """The slot after the last one."""
+        return self.first + len(self.sample_keys)
+
+
+class PublishSection(ManifestSection):
+    """The same for the task that publishes, with the labels of each shard; it is an artifact, and nobody keeps it."""
+
+    labels: tuple[Sha256, ...] = Field(description="see `PackOutput`; by shard")
 
 
 class PublishTask(Document):
@@ -139,9 +162,7 @@ class PublishTask(Document):
     dataset: str
     version: Int = Field(ge=1)
     builds: Builds
-    files: tuple[FileEntry, ...] = Field(description="the files of all shards")
-    sample_keys: tuple[Sha256, ...] = Field(description="by slot")
-    rejections: tuple[Rejection, ...]
+    sections: tuple[Sha256, ...] = Field(min_length=1, description="artifacts, each a `PublishSection`, by slot")
     certificate: Sha256 | None = Field(default=None, description="digest of the certificate that vouches for it")
 
 
@@ -191,13 +212,20 @@ task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = 
 """Validates and dumps a task of any stage."""
 
 
-def input_digests(task: SimulateTask | RenderTask | PackTask | PublishTask) -> tuple[Sha256, ...]:
-    """Return the artifacts that a task reads."""
+def input_digests(
+    task: SimulateTask | RenderTask | PackTask | PublishTask, read: Callable[[Sha256], bytes]
+) -> tuple[Sha256, ...]:
+    """Return the artifacts that a task needs; `read` reads those that list others, which may be damaged or lost."""
     if isinstance(task, RenderTask):
         pictures = map(referred, task.textures or (task.render.variant,))
         return tuple(dict.fromkeys([task.record.digest, *filter(None, pictures)]))
     if isinstance(task, PublishTask):
-        return tuple(dict.fromkeys(file.sha256 for file in task.files))
+        digests = list(task.sections)
+        for digest in task.sections:
+            with suppress(OSError, ValueError):
+                section = PublishSection.model_validate_json(read(digest))
+                digests += [*(file.sha256 for file in section.files), *section.labels]
+        return tuple(dict.fromkeys(digests))
     if isinstance(task, SimulateTask):
         return ()
     records = [slot.record.digest for slot in task.slots if slot.record is not None]

@@ -52,6 +52,9 @@ from stickslip_services.webhooks import Messenger
 
 logger = logging.getLogger(__name__)
 
+PLAN_SECONDS = 0.2
+"""Time between two looks for jobs that are to be planned [s]."""
+
 GRACE_SECONDS = 3
 """How long open requests (event streams) may go on after a signal to stop [s]."""
 
@@ -69,6 +72,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         keepers = [
             asyncio.create_task(_for_ever(coordinator.sweep, every)),
             asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
+            asyncio.create_task(_for_ever(coordinator.plan_large_jobs, PLAN_SECONDS)),
             asyncio.create_task(_for_ever(messenger.deliver, every)),
             asyncio.create_task(coordinator.database.listen(coordinator.bell.ring)),
         ]
@@ -169,12 +173,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
     parser.add_argument("--reindex", action="store_true", default=None, help="find the datasets in the store, and end")
+    parser.add_argument("--migrate", action="store_true", default=None, help="bring the database up to date, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
     if chosen.pop("openapi", False):
         sys.stdout.write(openapi_text())
         return 0
     descriptor, is_reindexing = chosen.pop("fd", None), chosen.pop("reindex", False)
+    is_migrating = chosen.pop("migrate", False)
     try:
         settings = Settings.chosen(**chosen)
     except SettingsError as error:
@@ -184,6 +190,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if is_reindexing:
             return reindex(settings)
+        if is_migrating:
+            check_database(settings, Role.visitor, with_store=True)
+            with opened(settings, Role.visitor):
+                return 0
         check_database(settings, Role.coordinator, with_store=True)
         # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
         with locked(settings.data) if descriptor is None else nullcontext():

@@ -54,6 +54,8 @@ class Settings(BaseSettings):
     """Wait before the second try [s]; it doubles with every further one."""
     sweep_seconds: float = Field(default=1.0, gt=0)
     """Time between two looks at expired leases and due retries [s]."""
+    plan_samples: int = Field(default=10_000, ge=1)
+    """Samples that are planned at once. A job of more is planned in the background, in pieces of so many."""
     lease_limit: int = Field(default=1000, ge=1)
     """The most tasks of one stage that one request is granted."""
     min_free_bytes: int = Field(default=256 * 2**20, ge=0)

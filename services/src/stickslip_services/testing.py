@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,22 +19,33 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
-from stickslip_schemas.arrays import SAMPLE_KEY_BYTES, ArrayLayout
+from stickslip_schemas.arrays import FORMAT, ArrayLayout
 from stickslip_schemas.builds import Builds
-from stickslip_schemas.chunks import encode_chunk, encode_shard
+from stickslip_schemas.chunks import decode_chunk, decode_shard_index, encode_chunk, encode_shard
 from stickslip_schemas.codecs import encode_sample
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, seal_text, with_manifest_digest
+from stickslip_schemas.layout import layout, samples_per_file
+from stickslip_schemas.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    Manifest,
+    has_sections,
+    seal_text,
+    section_path,
+    with_manifest_digest,
+)
 from stickslip_schemas.responses import Dataset, Job, JobDetail
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import DirectoryStore, Store
 from stickslip_schemas.tasks import (
     ChunkRef,
     FileEntry,
+    ManifestSection,
     PackOutput,
     PackTask,
     PublishOutput,
+    PublishSection,
     PublishTask,
     RecordRef,
     RenderOutput,
@@ -190,7 +202,8 @@ class PretendWorker:
         judged = self.judge(task)
         if judged is not None:
             return judged
-        damaged = tuple(digest for digest in input_digests(task) if not self.store.holds(digest))
+        needed = input_digests(task, self.store.read)
+        damaged = tuple(digest for digest in needed if not self.store.holds(digest))
         if damaged:
             return failure(Reason.storage_error, "inputs are damaged").model_copy(update={"damaged_inputs": damaged})
         output: Any
@@ -204,28 +217,41 @@ class PretendWorker:
             where = ChunkRef(digest=digest, offset=0, length=len(data))
             output = RenderOutput(chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
         elif task.stage == "pack" and self.whole:
-            arrays = ((array.shard_path(task.shard), _encoded(array, task)) for array in layout(task.spec))
+            arrays = [array for array in layout(task.spec) if not array.is_label]
+            shards = ((array.shard_path(task.shard), _encoded(array, task)) for array in arrays)
             output = PackOutput(
                 files=tuple(
-                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data)) for path, data in arrays
-                )
+                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data)) for path, data in shards
+                ),
+                labels=self.store.publish(
+                    encode_shard([_encoded(array, task) for array in layout(task.spec) if array.is_label])
+                ),
             )
         elif task.stage == "pack":
             data = b"".join(slot.sample_key.encode() for slot in task.slots) * 50
             entry = FileEntry(path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data))
             keys = bytes.fromhex("".join(slot.sample_key for slot in task.slots))
-            chunk = encode_chunk(keys.ljust(task.spec.samples_per_shard * SAMPLE_KEY_BYTES, b"\0"))
-            path = f"sample_key/c/{task.shard}/0"
-            named = FileEntry(path=path, sha256=self.store.publish(chunk), size=len(chunk))
-            output = PackOutput(files=(entry, named))
+            labels = self.store.publish(encode_shard([encode_chunk(keys)]))
+            output = PackOutput(files=(entry,), labels=labels)
         else:
             output = self._publish(task)
         return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0, call_seconds=1.0)
 
     def _publish(self, task: PublishTask) -> PublishOutput:
-        zarr = {file.path: file for file in self._zarr(len(task.sample_keys))}
+        given = [PublishSection.model_validate_json(self.store.read(digest)) for digest in task.sections]
+        count = task.spec.sample_count
+        zarr = {file.path: file for file in self._zarr(count)}
         group = self.store.read(zarr.pop(GROUP_NAME).sha256)
-        files = (*task.files, *zarr.values())
+        own = [*zarr.values(), *self._label_files(task, given)]
+        listed = [file for section in given for file in section.files]
+        rejections = tuple(rejection for section in given for rejection in section.rejections)
+        sections: list[FileEntry] = []
+        if has_sections(task.spec):
+            for number, section in enumerate(given):
+                kept = ManifestSection(**{name: getattr(section, name) for name in ManifestSection.model_fields})
+                data = kept.model_dump_json().encode()
+                path = section_path(number)
+                sections.append(FileEntry(path=path, sha256=self.store.publish(data), size=len(data)))
         manifest = Manifest(
             dataset=task.dataset,
             version=task.version,
@@ -234,21 +260,40 @@ class PretendWorker:
             builds=task.builds,
             certificate=task.certificate,
             cameras=(),
-            sample_count=len(task.sample_keys),
-            valid_count=len(task.sample_keys) - len(task.rejections),
+            sample_count=count,
+            valid_count=count - len(rejections),
             split_counts={},
-            rejections=task.rejections,
-            sample_keys=task.sample_keys,
-            files=tuple(sorted(files, key=lambda file: file.path)),
+            rejection_counts=Counter(str(rejection.reason) for rejection in rejections),
+            sections=tuple(sections),
+            rejections=() if sections else rejections,
+            sample_keys=() if sections else tuple(key for section in given for key in section.sample_keys),
+            files=tuple(sorted(own if sections else [*own, *listed], key=lambda file: file.path)),
         )
         content = manifest.model_dump_json().encode()
         digest = self.store.publish(content)
         group_digest = self.store.publish(with_manifest_digest(group, digest))
         seal = self.store.publish(seal_text(digest, group_digest))
-        own = {MANIFEST_NAME: digest, GROUP_NAME: group_digest, SEAL_NAME: seal}
-        for path, artifact in (own | {file.path: file.sha256 for file in manifest.files}).items():
+        named = {MANIFEST_NAME: digest, GROUP_NAME: group_digest, SEAL_NAME: seal}
+        every = [*own, *listed, *sections]
+        for path, artifact in (named | {file.path: file.sha256 for file in every}).items():
             self.store.show(artifact, task.dataset, task.version, path)
-        return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size)
+        return PublishOutput(manifest=digest, group=group_digest, bytes=sum(file.size for file in every))
+
+    def _label_files(self, task: PublishTask, given: Sequence[PublishSection]) -> Iterator[FileEntry]:
+        """Yield the files of the labels that packs gave: all of them, or `sample_key` alone."""
+        labels = [array for array in layout(task.spec) if array.is_label]
+        labels = labels if self.whole else [array for array in labels if array.name == "sample_key"]
+        columns: dict[str, list[bytes]] = {array.name: [] for array in labels}
+        for digest in (digest for section in given for digest in section.labels):
+            data = self.store.read(digest)
+            for array, (offset, length) in zip(labels, decode_shard_index(data, len(labels)).tolist(), strict=True):
+                columns[array.name].append(bytes(decode_chunk(data[offset : offset + length])))
+        for array in labels:
+            values = b"".join(columns[array.name])
+            size = samples_per_file(array, task.spec, FORMAT) * array.sample_bytes
+            for number in range(-(-len(values) // size)):
+                data = encode_chunk(values[number * size : (number + 1) * size].ljust(size, b"\0"))
+                yield FileEntry(path=array.shard_path(number), sha256=self.store.publish(data), size=len(data))
 
     def _zarr(self, count: int) -> list[FileEntry]:
         """Return the files of a small Zarr group."""
@@ -286,7 +331,8 @@ def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
     elif array.name != "sample_key" and len(values) < len(task.slots):
         rows = iter(values)
         values = [next(rows) if slot.valid else np.full(array.shape, array.fill, array.dtype) for slot in task.slots]
-    column = np.full((size, *array.shape), array.fill, dtype=array.dtype)
+    rows_held = len(task.slots) if array.is_label else size
+    column = np.full((rows_held, *array.shape), array.fill, dtype=array.dtype)
     column[: len(values)] = values
     return encode_chunk(column)
 

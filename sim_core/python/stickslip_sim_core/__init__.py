@@ -10,8 +10,10 @@ from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import reach, self_contact_distance
 from stickslip_sim_core.rods.multistability import OtherMinima, other_minima
 from stickslip_sim_core.rods.solve import RodSolution, solve_rods
-from stickslip_sim_core.scenes.cloth_drag import DropAndDrag, drop_and_drag
+from stickslip_sim_core.scenes.cloth_drag import drop_and_drag
+from stickslip_sim_core.scenes.cloth_on_cloth import drop_on_cloth
 from stickslip_sim_core.scenes.cloth_sphere import RotatingSphere, rotating_sphere
+from stickslip_sim_core.stage import DropAndDrag
 
 __all__ = [
     "PRESETS",
@@ -34,6 +36,7 @@ __all__ = [
     "build_info",
     "cylinder",
     "drop_and_drag",
+    "drop_on_cloth",
     "fabric",
     "fabric_names",
     "fit_natural_curvature",

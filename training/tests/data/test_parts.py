@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_schemas.keys import sha256
+from stickslip_schemas.manifest import Contents
 from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError, RejectedSampleError
 from stickslip_training.data.reader import DatasetReader
@@ -20,7 +21,8 @@ def part(clips: Any, tmp_path: Path) -> Any:
     """The clips of one fabric, without meshes."""
     copy = clips.copy(tmp_path / "part")
     with DatasetReader(copy.root) as whole:
-        paths = part_files(copy.manifest, SELECTION, whole.label)
+        contents = Contents(copy.manifest, whole.source.read)
+        paths = {file.path for file in part_files(contents, SELECTION, whole.label)}
     for file in copy.manifest.files:
         if file.path not in paths:
             (copy.root / file.path).unlink()

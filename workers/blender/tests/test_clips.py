@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender import clips
 from stickslip_blender.clips import ClothRenderer
+from stickslip_blender.holders import Holders
 from stickslip_blender.raster import projected, see, window_about
-from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
@@ -63,7 +63,7 @@ import numpy as np
 from stickslip_blender import clips
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.clips import ClothRenderer
-from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.holders import Holders
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender

@@ -7,7 +7,7 @@ import numpy as np
 from stickslip_blender import ground_truth as module
 from stickslip_blender.geometry import FLOOR, Geometry
 from stickslip_blender.ground_truth import CLOTH, GROUND, PROP, ground_truth
-from stickslip_blender.scenes.cloth_drag import Holders
+from stickslip_blender.holders import Holders
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.cloth import SEGMENTS, GroundTruth
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from stickslip_blender.clips import GATE, ClothRenderer, block_decibels
 from stickslip_blender.engine import ClothSampling
+from stickslip_blender.holders import Holders
 from stickslip_blender.multiplexed import encode
-from stickslip_blender.scenes.cloth_drag import Holders
 from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 

@@ -119,7 +119,7 @@ def test_a_task_says_which_pictures_it_reads(store: DirectoryStore, record: str)
     own = _task(record, texture="my-flag", image=f"sha256:{digest}")
     together = _task(record, textures=["dots", f"sha256:{digest}"])
     for task, expected in ((own, (record, digest)), (together, (record, digest)), (_task(record), (record,))):
-        assert input_digests(task_adapter.validate_python(task)) == expected
+        assert input_digests(task_adapter.validate_python(task), store.read) == expected
 
 
 def test_a_picture_that_is_gone_is_an_error(actor: RenderActor, record: str) -> None:

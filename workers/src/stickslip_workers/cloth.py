@@ -62,18 +62,15 @@ def kernel_level() -> str:
 
 def fabric_of(simulation: "ClothSimulation") -> "Fabric":
     """Return the fabric of a simulation: a measured one or the user's own, times its factors."""
-    from stickslip_sim_core.cloth import fabric
-
-    measured = simulation.fabric is None
-    named = fabric(simulation.material) if measured else _own_fabric(simulation.material, simulation.fabric)
+    named = named_fabric(simulation.material, simulation.fabric)
     return named.scaled(density=simulation.density, bending=simulation.bending, stretching=simulation.stretching)
 
 
-def _own_fabric(name: str, numbers: "FabricNumbers | None") -> "Fabric":
-    from stickslip_sim_core.cloth import own_fabric
+def named_fabric(name: str, numbers: "FabricNumbers | None") -> "Fabric":
+    """Return the measured fabric of a name, or the user's own if there are numbers."""
+    from stickslip_sim_core.cloth import fabric, own_fabric
 
-    assert numbers is not None
-    return own_fabric(name, **numbers.model_dump())
+    return fabric(name) if numbers is None else own_fabric(name, **numbers.model_dump())
 
 
 def result_of(

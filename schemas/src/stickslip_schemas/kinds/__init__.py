@@ -9,6 +9,7 @@ from pydantic import Field, TypeAdapter
 
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulation, ClothDragSpec
+from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothRender, ClothOnClothSimulation, ClothOnClothSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender, ClothSphereSimulation, ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation, RodHangSpec
 
@@ -16,12 +17,22 @@ KINDS: dict[str, type[JobSpec]] = {
     "rod_hang": RodHangSpec,
     "cloth_drag": ClothDragSpec,
     "cloth_sphere": ClothSphereSpec,
+    "cloth_on_cloth": ClothOnClothSpec,
 }
 """The class of the specs of each kind, by name."""
 
-AnyJobSpec = Annotated[RodHangSpec | ClothDragSpec | ClothSphereSpec, Field(discriminator="kind")]
-AnySimulation = Annotated[RodHangSimulation | ClothDragSimulation | ClothSphereSimulation, Field(discriminator="kind")]
-AnyRender = Annotated[RodHangRender | ClothDragRender | ClothSphereRender, Field(discriminator="kind")]
+AnyJobSpec = Annotated[
+    RodHangSpec | ClothDragSpec | ClothSphereSpec | ClothOnClothSpec,
+    Field(discriminator="kind"),
+]
+AnySimulation = Annotated[
+    RodHangSimulation | ClothDragSimulation | ClothSphereSimulation | ClothOnClothSimulation,
+    Field(discriminator="kind"),
+]
+AnyRender = Annotated[
+    RodHangRender | ClothDragRender | ClothSphereRender | ClothOnClothRender,
+    Field(discriminator="kind"),
+]
 
 job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
 """Validates and dumps the spec of any kind."""

@@ -1,13 +1,14 @@
 """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
 
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from stickslip_schemas.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, ListAxis, quantity
+from stickslip_schemas.base import Float
 from stickslip_schemas.cloth import (
     OWN_LOOKS,
     PHYSICAL_AXES,
@@ -78,6 +79,7 @@ class ClothDragSimulation(ClothSimulation):
     """The trajectory of a dragged cloth: all that it depends on besides the build."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
+    self_friction: float | None = None
 
 
 class ClothDragRender(ClothRender):
@@ -107,6 +109,13 @@ class ClothDragSpec(ClothSpec):
 
     kind: Literal["cloth_drag"]
     axes: ClothDragAxes
+    self_friction: Float | None = Field(
+        default=0.5,
+        ge=0,
+        le=10,
+        description="friction coefficient of the cloth with itself; null: it passes through itself",
+        json_schema_extra={"x-cost": "null saves up to two thirds of the CPU time of a cloth that folds over itself"},
+    )
     lamps: dict[OwnName, LampNumbers] = Field(
         default_factory=dict,
         max_length=64,
@@ -119,6 +128,10 @@ class ClothDragSpec(ClothSpec):
         description="floors of your own, by the names that the axis `substrate` uses",
         json_schema_extra={"additionalProperties": False},
     )
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        return super().simulation_settings() | {"self_friction": self.self_friction}
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of dragged cloth."""

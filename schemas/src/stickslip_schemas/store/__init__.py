@@ -14,6 +14,7 @@ from stickslip_schemas.store.base import (
 )
 from stickslip_schemas.store.directory import DirectoryStore, sync, write_durably
 from stickslip_schemas.store.opening import open_store, store_place
+from stickslip_schemas.store.parallel import in_parallel
 
 __all__ = [
     "CorruptArtifactError",
@@ -24,6 +25,7 @@ __all__ = [
     "Store",
     "Stored",
     "artifact_name",
+    "in_parallel",
     "is_unavailable",
     "open_store",
     "shown_name",

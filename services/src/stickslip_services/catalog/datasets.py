@@ -1,13 +1,19 @@
 """Datasets, their versions and their files, as the API shows them."""
 
-import json
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import Connection, Row, select
 from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, seal_text
+from stickslip_schemas.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    BrokenSectionError,
+    Contents,
+    Manifest,
+    seal_text,
+)
 from stickslip_schemas.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import FileEntry
@@ -51,7 +57,7 @@ def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
         digests[SEAL_NAME] = sha256(seal_text(version.manifest, version.group))
     if path in digests:
         return FileEntry(path=path, sha256=digests[path], size=_size(store, digests[path]))
-    file = _files(store, version.manifest).get(path)
+    file = _listed(store, version.manifest, path)
     if file is None:
         raise NotFoundError(f"version {version.version} has no file {path[:200]!r}")
     if _size(store, file.sha256) != file.size:
@@ -60,13 +66,23 @@ def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
 
 
 @lru_cache(maxsize=16)
-def _files(store: Store, manifest: Sha256) -> Mapping[str, FileEntry]:
-    """Return the files of a manifest by path; a manifest never changes, so it is read once."""
+def read_contents(store: Store, manifest: Sha256) -> Contents:
+    """Return what a manifest lists; raise MissingArtifactError where it is damaged or lost.
+
+    A manifest never changes, so it is read once. A section is read when a file of it is asked for.
+    """
     try:
-        document = json.loads(store.read(manifest))
+        document = Manifest.model_validate_json(store.read(manifest))
     except OSError as error:
         raise MissingArtifactError(f"the manifest {manifest} is damaged or not in the store") from error
-    return {file["path"]: FileEntry(**file) for file in document["files"]}
+    return Contents(document, lambda file: store.read(file.sha256))
+
+
+def _listed(store: Store, manifest: Sha256, path: str) -> FileEntry | None:
+    try:
+        return read_contents(store, manifest).file(path)
+    except (OSError, BrokenSectionError) as error:
+        raise MissingArtifactError(f"a section of the manifest {manifest} is damaged or not in the store") from error
 
 
 def _size(store: Store, digest: Sha256) -> int:

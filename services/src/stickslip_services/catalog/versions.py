@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal, seal_text
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal, seal_text
 from stickslip_schemas.responses import DatasetRef
 from stickslip_schemas.samples import dataset_id
-from stickslip_schemas.store import CorruptArtifactError, Store, is_unavailable
+from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 from stickslip_schemas.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 
 from stickslip_services.database.tables import dataset_versions, datasets
@@ -44,11 +44,14 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     """
     content, group = store.read(output.manifest), store.read(output.group)
     check_seal(content, group, store.read(sha256(seal_text(output.manifest, output.group))))
-    manifest = Manifest.model_validate_json(content)
+    contents = Contents(Manifest.model_validate_json(content), lambda file: store.read(file.sha256))
+    manifest = contents.manifest
     if dataset_id(manifest.spec) != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
         raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
-    for file in manifest.files:
-        if store.size(file.sha256) != file.size:
+    files = list(contents.files())
+    sizes = in_parallel(lambda file: store.size(file.sha256), files)
+    for file, size in zip(files, sizes, strict=True):
+        if size != file.size:
             raise CorruptArtifactError(f"{file.path} has another size than the manifest says")
     return ManifestSummary(
         dataset=manifest.dataset,
@@ -72,7 +75,7 @@ def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutpu
         named |= {chunk.digest: chunk.offset + chunk.length for chunk in output.chunks.values()}
         named |= {} if output.preview is None else {output.preview: 1}
     else:
-        named |= {file.sha256: file.size for file in output.files}
+        named |= {file.sha256: file.size for file in output.files} | {output.labels: 1}
     for digest, size in named.items():
         if not store.exists(digest, size=size):
             raise CorruptArtifactError(f"artifact {digest} must be in the store with at least {size} bytes")
@@ -129,7 +132,7 @@ def find_committed(connection: Connection, publish_task: int) -> CommittedVersio
 def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> frozenset[Sha256] | None:
     """Return the digests of the files of a version that are not whole, in the store or in the version's directory.
 
-    None where the three files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
+    None where the files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
     Raises OSError where the store is out of reach.
     """
     if group is None:
@@ -138,14 +141,17 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> froze
     try:
         document = Manifest.model_validate_json(store.read(manifest))
         check_seal(store.read(manifest), store.read(group), store.read(seal))
+        listed = list(Contents(document, lambda file: store.read(file.sha256)).files())
     except (OSError, ValueError) as error:
         if isinstance(error, OSError) and is_unavailable(error):
             raise
         return None
     own = {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: seal}
-    files = own | {file.path: file.sha256 for file in document.files}
-    return frozenset(
-        digest
-        for path, digest in files.items()
-        if not (store.shows(digest, document.dataset, document.version, path) and store.holds(digest))
-    )
+    files = own | {file.path: file.sha256 for file in listed}
+
+    def is_whole(shown: tuple[str, Sha256]) -> bool:
+        path, digest = shown
+        return store.shows(digest, document.dataset, document.version, path) and store.holds(digest)
+
+    whole = in_parallel(is_whole, files.items())
+    return frozenset(digest for digest, is_good in zip(files.values(), whole, strict=True) if not is_good)

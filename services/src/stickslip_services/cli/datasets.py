@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
-from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.manifest import MANIFEST_NAME, Contents, Manifest
 from stickslip_schemas.selection import Selection
 
 from stickslip_services.addresses import DEFAULT_URL, coordinator_url
@@ -109,7 +109,7 @@ def diff(
 ) -> None:
     """Say what differs between two versions: spec, builds, labels, samples, files. Exit with 1 if anything does."""
     with Client(url) as client:
-        found = differences(_manifest(client, a), _manifest(client, b))
+        found = differences(_contents(client, a), _contents(client, b))
     if not found:
         console().print("the two were made from the same spec by the same code, and hold the same files")
         return
@@ -120,13 +120,14 @@ def diff(
     raise typer.Exit(1)
 
 
-def _manifest(client: Client, dataset: str) -> Manifest:
-    """Return the manifest of a version that is on disk, or at the coordinator."""
+def _contents(client: Client, dataset: str) -> Contents:
+    """Return what the manifest lists of a version that is on disk, or at the coordinator."""
     if _ID.match(dataset):
-        return client.manifest(*_resolve(client, dataset))[0]
+        return client.contents(*_resolve(client, dataset))
     path = Path(dataset) / MANIFEST_NAME
     try:
-        return Manifest.model_validate_json(path.read_bytes())
+        manifest = Manifest.model_validate_json(path.read_bytes())
+        return Contents(manifest, lambda file: pulling.safe_path(Path(dataset), file.path).read_bytes())
     except ValidationError as error:
         raise ClientError(f"{path} is no manifest: {str(error).splitlines()[0]}") from error
 
@@ -139,6 +140,9 @@ def export(
     huggingface: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
+    mds: Annotated[Path | None, typer.Option(metavar="DIR", help="shards for MosaicML Streaming")] = None,
+    usd: Annotated[Path | None, typer.Option(metavar="DIR", help="moving meshes of cloth for USD")] = None,
+    obj: Annotated[Path | None, typer.Option(metavar="DIR", help="meshes of cloth, one file an instant")] = None,
     arrays: ArraysOption = None,
     split: SplitOption = None,
     where: WhereOption = None,
@@ -159,6 +163,9 @@ def export(
         "--hdf5": hdf5,
         "--webdataset": webdataset,
         "--huggingface": huggingface,
+        "--mds": mds,
+        "--usd": usd,
+        "--obj": obj,
         "--arrays": arrays,
         "--split": split,
         "--gzip": gzip,

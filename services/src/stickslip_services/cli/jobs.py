@@ -164,6 +164,8 @@ def _job_table(job: JobDetail) -> Table:
     if job.priority:
         shown.add_row("priority", str(job.priority))
     shown.add_row("tasks", escape(wording.stages(job.progress)))
+    if planned := wording.planned(job.progress, job.sample_count):
+        shown.add_row("", planned)
     if not job.state.is_terminal:
         shown.add_row("time left", wording.eta(job.progress.eta))
     cpu = sum(stage.cpu_seconds for stage in job.progress.stages.values())

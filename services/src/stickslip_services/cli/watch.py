@@ -29,16 +29,16 @@ class _Screen(Protocol):
 
 def watch(client: Client, job_id: str, console: Console) -> JobState:
     """Show a job until it ends; return how it did."""
-    state = client.job(job_id).state
+    job = client.job(job_id)
     try:
-        return _follow(client, job_id, console, state)
+        return _follow(client, job_id, console, job.state, job.sample_count)
     except KeyboardInterrupt:
         say(f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}")
         raise typer.Exit(130) from None
 
 
-def _follow(client: Client, job_id: str, console: Console, state: JobState) -> JobState:
-    with (_bars if console.is_terminal else _lines)(console) as screen:
+def _follow(client: Client, job_id: str, console: Console, state: JobState, sample_count: int) -> JobState:
+    with (_bars if console.is_terminal else _lines)(console, sample_count) as screen:
         for event in client.events(job_id):
             match event:
                 case JobProgressEvent():
@@ -64,15 +64,16 @@ def _because(message: str) -> str:
 class _Lines:
     """One line for each piece of news."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, sample_count: int) -> None:
         self._console = console
+        self._sample_count = sample_count
         self._last = ""
 
     def line(self, markup: str) -> None:
         self._console.print(markup, soft_wrap=True, highlight=False)
 
     def progress(self, progress: JobProgress) -> None:
-        text = wording.stages(progress)
+        text = ", ".join(filter(None, [wording.planned(progress, self._sample_count), wording.stages(progress)]))
         if progress.eta is not None:
             text += f"; {wording.eta(progress.eta)} left"
         if text != self._last:
@@ -83,15 +84,21 @@ class _Lines:
 class _Bars:
     """A bar for each stage."""
 
-    def __init__(self, console: Console, bars: Progress) -> None:
+    def __init__(self, console: Console, bars: Progress, sample_count: int) -> None:
         self._console = console
         self._bars = bars
+        self._sample_count = sample_count
+        self._plan: TaskID | None = None
         self._ids: dict[Stage, TaskID] = {}
 
     def line(self, markup: str) -> None:
         self._console.print(markup, soft_wrap=True, highlight=False)
 
     def progress(self, progress: JobProgress) -> None:
+        if self._plan is None and progress.planned < self._sample_count:
+            self._plan = self._bars.add_task("plan", total=self._sample_count, extra="samples")
+        if self._plan is not None:
+            self._bars.update(self._plan, completed=progress.planned)
         for stage, counted in progress.stages.items():
             total = sum(counted.counts.values())
             if not total:
@@ -113,12 +120,12 @@ class _Bars:
 
 
 @contextmanager
-def _lines(console: Console) -> Iterator[_Screen]:
-    yield _Lines(console)
+def _lines(console: Console, sample_count: int) -> Iterator[_Screen]:
+    yield _Lines(console, sample_count)
 
 
 @contextmanager
-def _bars(console: Console) -> Iterator[_Screen]:
+def _bars(console: Console, sample_count: int) -> Iterator[_Screen]:
     columns = (
         TextColumn("{task.description:>9}"),
         BarColumn(bar_width=32),
@@ -126,4 +133,4 @@ def _bars(console: Console) -> Iterator[_Screen]:
         TextColumn("[dim]{task.fields[extra]}"),
     )
     with Progress(*columns, console=console, transient=False) as bars:
-        yield _Bars(console, bars)
+        yield _Bars(console, bars, sample_count)

@@ -4,6 +4,7 @@ from stickslip_schemas.responses import DatasetRef, Eta, Job, Progress
 from stickslip_schemas.states import JobState, TaskState
 
 _COLORS = {
+    JobState.planning: "yellow",
     JobState.queued: "yellow",
     JobState.running: "cyan",
     JobState.cancelling: "yellow",
@@ -57,6 +58,11 @@ def dataset(value: DatasetRef | None) -> str:
 def done_of(progress: Progress) -> str:
     """Return how many tasks are over."""
     return f"{progress.done}/{progress.total}"
+
+
+def planned(progress: Progress, sample_count: int) -> str:
+    """Return how many samples are planned, where it is not all of them; else nothing."""
+    return "" if progress.planned == sample_count else f"{progress.planned:,} of {sample_count:,} samples are planned"
 
 
 def stages(progress: Progress) -> str:

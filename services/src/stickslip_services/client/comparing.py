@@ -7,7 +7,7 @@ from typing import Any
 
 from stickslip_schemas.arrays import ArrayLayout
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Contents, Manifest
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,16 +19,17 @@ class Difference:
     b: str
 
 
-def differences(a: Manifest, b: Manifest) -> list[Difference]:
+def differences(left: Contents, right: Contents) -> list[Difference]:
     """Return what differs: spec, builds, certificate, arrays and labels, samples, rejections and files."""
+    a, b = left.manifest, right.manifest
     return [
         *_of_mappings("spec", _flat(a.spec.model_dump(mode="json")), _flat(b.spec.model_dump(mode="json"))),
         *_of_mappings("build of", a.builds.model_dump(), b.builds.model_dump()),
         *_of_mappings("", {"certificate": a.certificate}, {"certificate": b.certificate}),
         *_of_mappings("array", _arrays(a), _arrays(b)),
-        *_of_mappings("", _counts(a), _counts(b)),
-        *_of_samples(a, b),
-        *_of_files(a, b),
+        *_of_mappings("", _counts(left), _counts(right)),
+        *_of_samples(left, right),
+        *_of_files(left, right),
     ]
 
 
@@ -60,23 +61,25 @@ def _described(array: ArrayLayout) -> str:
     return f"{array.dtype} {list(array.shape)}{codes}"
 
 
-def _counts(manifest: Manifest) -> dict[str, Any]:
-    reasons = Counter(f"rejected, {rejection.reason}" for rejection in manifest.rejections)
+def _counts(contents: Contents) -> dict[str, Any]:
+    manifest = contents.manifest
+    reasons = Counter(f"rejected, {rejection.reason}" for rejection in contents.rejections())
     splits = {f"samples in {split}": count for split, count in manifest.split_counts.items()}
     return {"samples": manifest.sample_count, "valid samples": manifest.valid_count, **splits, **reasons}
 
 
-def _of_samples(a: Manifest, b: Manifest) -> Iterator[Difference]:
+def _of_samples(a: Contents, b: Contents) -> Iterator[Difference]:
     """Samples with one key were made from the same things by the same code."""
-    left, right = set(a.sample_keys), set(b.sample_keys)
+    keys_a, keys_b = ([bytes.fromhex(key) for key in contents.sample_keys()] for contents in (a, b))
+    left, right = set(keys_a), set(keys_b)
     if left != right:
         yield Difference("samples that only it has", str(len(left - right)), str(len(right - left)))
-    elif a.sample_keys != b.sample_keys:
+    elif keys_a != keys_b:
         yield Difference("order of the samples", "another", "another")
 
 
-def _of_files(a: Manifest, b: Manifest) -> Iterator[Difference]:
-    left, right = ({file.sha256: file.size for file in manifest.files} for manifest in (a, b))
+def _of_files(a: Contents, b: Contents) -> Iterator[Difference]:
+    left, right = ({file.sha256: file.size for file in contents.files()} for contents in (a, b))
     if left.keys() != right.keys():
         only_a = sum(size for digest, size in left.items() if digest not in right)
         only_b = sum(size for digest, size in right.items() if digest not in left)

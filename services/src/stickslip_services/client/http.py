@@ -9,7 +9,7 @@ import httpx
 from httpx_sse import EventSource, ServerSentEvent
 from stickslip_schemas.certificate import Certificate, CertificateUpload
 from stickslip_schemas.events import JobStateEvent
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Contents, Manifest
 from stickslip_schemas.responses import (
     CertificateEntry,
     Dataset,
@@ -168,6 +168,12 @@ class Client:
     def version(self, dataset: str, version: int) -> DatasetVersion:
         """Return a version of a dataset."""
         return self._ask(calls.version(dataset, version))
+
+    def contents(self, dataset: str, version: int) -> Contents:
+        """Return what the manifest of a version lists; sections of a large one are asked for when they are needed."""
+        root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+        manifest, _ = self.manifest(dataset, version)
+        return Contents(manifest, lambda file: self.request("GET", root + file.path).content)
 
     def manifest(self, dataset: str, version: int) -> tuple[Manifest, bytes]:
         """Return the manifest of a version, and its bytes."""

@@ -8,10 +8,11 @@ file holds the first bytes of a file, and the server is asked for the rest.
 import hashlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -19,7 +20,6 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
-from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from stickslip_schemas.chunks import CorruptChunkError, decode_chunk
 from stickslip_schemas.keys import Sha256, sha256
 from stickslip_schemas.layout import layout
@@ -29,10 +29,12 @@ from stickslip_schemas.manifest import (
     SEAL_NAME,
     SEALED_NAMES,
     BrokenSealError,
+    BrokenSectionError,
+    Contents,
     Manifest,
     check_seal,
 )
-from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection, part_files
+from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection, part_files, sections_of
 from stickslip_schemas.store import sync, write_durably
 from stickslip_schemas.tasks import FileEntry
 
@@ -98,23 +100,23 @@ def pull(
 
     A part has all labels, and of the other arrays the shards in which a chosen sample lies. `selection.json` says so.
     """
-    manifest, sealed = _fetch_sealed(client, dataset, version)
-    files = [(file, safe_path(target, file.path)) for file in manifest.files]
-    refuse_foreign_files(target, {file.path for file in manifest.files}, f"{dataset}:v{version}")
-    refuse_other_part(target, selection)
+    contents, sealed = _fetch_sealed(client, dataset, version)
+    manifest = contents.manifest
     with _told():
         selection.choose_arrays(layout(manifest.spec))
+    files = _placed(target, part_files(contents, selection, None))
+    refuse_foreign_files(target, contents, f"{dataset}:v{version}")
+    refuse_other_part(target, selection)
     target.mkdir(parents=True, exist_ok=True)
     root = f"/v1/datasets/{dataset}/versions/{version}/files/"
     labels_done = (0, 0)
     if not selection.is_everything:
-        first = part_files(manifest, selection, None)
-        labels = [(file, path) for file, path in files if file.path in first and not _is_whole(path, file)]
+        labels = [(file, path) for file, path in files if not _is_whole(path, file)]
         _download_all(client, root, labels, lambda _: None)
         labels_done = (len(labels), sum(file.size for file, _ in labels))
         with _told():
-            wanted = part_files(manifest, selection, lambda name: _label(target, manifest, name))
-        files = [(file, path) for file, path in files if file.path in wanted]
+            wanted = part_files(contents, selection, lambda name: _label(target, manifest, name))
+        files = _placed(target, wanted)
         document = PartDocument(manifest=sha256(sealed[MANIFEST_NAME]), selection=selection)
         write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
     missing = [(file, path) for file, path in files if not _is_whole(path, file)]
@@ -129,6 +131,10 @@ def pull(
     if selection.is_everything:
         (target / SELECTION_NAME).unlink(missing_ok=True)
     return Pulled(len(files) + len(sealed), count + labels_done[0], size + labels_done[1])
+
+
+def _placed(target: Path, files: list[FileEntry]) -> list[tuple[FileEntry, Path]]:
+    return [(file, safe_path(target, file.path)) for file in files]
 
 
 def _download_all(
@@ -177,18 +183,19 @@ def read_part(target: Path) -> PartDocument:
 def _label(target: Path, manifest: Manifest, name: str) -> npt.NDArray[Any]:
     """Return a label of all slots from the files of a directory, which have been checked."""
     array = next(array for array in layout(manifest.spec) if array.name == name)
-    shards = range(-(-manifest.sample_count // manifest.spec.samples_per_shard))
-    content = b"".join(bytes(decode_chunk((target / array.shard_path(shard)).read_bytes())) for shard in shards)
+    numbers = range(-(-manifest.sample_count // manifest.samples_per_file(array)))
+    content = b"".join(bytes(decode_chunk((target / array.shard_path(number)).read_bytes())) for number in numbers)
     return np.frombuffer(content, dtype=array.dtype).reshape(-1, *array.shape)[: manifest.sample_count]
 
 
-def refuse_foreign_files(target: Path, own: set[str], name: str) -> None:
-    """Raise ForeignFilesError where `target` holds files that are not among the paths `own` of the dataset `name`.
+def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
+    """Raise ForeignFilesError where `target` holds files that are not of the version `name`, which has `contents`.
 
     A directory that holds this very version may have files of yours beside it: pulling mends it.
     """
-    own = own | {*SEALED_NAMES, SELECTION_NAME}
-    foreign = [path for path in _files_below(target) if path.removesuffix(PART) not in own]
+    found = sorted(_files_below(target))  # by array and shard, so that each section is read once
+    own = {*SEALED_NAMES, SELECTION_NAME}
+    foreign = [path for path in found if (name_ := path.removesuffix(PART)) not in own and contents.file(name_) is None]
     there = ""
     with suppress(OSError, ValidationError):
         manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
@@ -203,8 +210,8 @@ def refuse_foreign_files(target: Path, own: set[str], name: str) -> None:
     )
 
 
-def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Manifest, dict[str, bytes]]:
-    """Return the manifest, and the bytes of the three files that vouch for a version, the manifest last."""
+def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents, dict[str, bytes]]:
+    """Return what the manifest lists, and the bytes of the three files that vouch for a version, the manifest last."""
     promised = client.version(dataset, version)
     if promised.group is None:
         raise DamagedError(
@@ -222,7 +229,8 @@ def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Manifest,
         check_seal(content, group, seal)
     except BrokenSealError as error:
         raise DamagedError(f"{dataset}, version {version}: {error}") from error
-    return manifest, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content}
+    contents = Contents(manifest, lambda file: client.request("GET", root + file.path).content)
+    return contents, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content}
 
 
 def _content(path: Path) -> bytes | None:
@@ -265,29 +273,39 @@ def verify(target: Path) -> list[Fault]:
         return [Fault(MANIFEST_NAME, "manifest", str(error).splitlines()[0])]
     except BrokenSealError as error:
         return [Fault(SEAL_NAME, "seal", str(error))]
-    named = frozenset(file.path for file in manifest.files)
-    wanted = named
+    contents = Contents(manifest, lambda file: safe_path(target, file.path).read_bytes())
     try:
-        part = read_part(target)
-        if part.manifest != sha256(sealed[MANIFEST_NAME]):
-            return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {part.manifest}")]
-        needed = part_files(manifest, part.selection, None)
-        faults = _faults(target, [file for file in manifest.files if file.path in needed])
-        if faults:  # the labels tell what else belongs to the part
+        selection = read_part(target)
+        if selection.manifest != sha256(sealed[MANIFEST_NAME]):
+            return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {selection.manifest}")]
+        needed = part_files(contents, selection.selection, None)
+        if faults := _faults(target, needed):  # the labels tell what else belongs to the part
             return sorted(faults, key=lambda fault: fault.path)
-        wanted = part_files(manifest, part.selection, lambda name: _label(target, manifest, name))
+        label = partial(_label, target, manifest)
+        numbers = sections_of(contents, selection.selection, label)
+        chosen = selection.selection
     except FileNotFoundError:
-        pass  # all of it
+        label, chosen, numbers = None, EVERYTHING, list(range(max(1, len(manifest.sections))))
     except (DamagedError, ValueError) as error:
         return [Fault(SELECTION_NAME, "selection", str(error))]
+    # A section that is damaged lists nothing.
+    sections = [manifest.sections[number] for number in numbers] if manifest.sections else []
+    if faults := _faults(target, sections):
+        return sorted(faults, key=lambda fault: fault.path)
     there = set(_files_below(target))
-    checked = [file for file in manifest.files if file.path in wanted or file.path in there]
-    faults = _faults(target, checked)
+    try:
+        wanted = {file.path: file for file in part_files(contents, chosen, label)}
+        for path in there:  # more than the part: what was pulled before
+            if path not in wanted and (file := contents.file(path)) is not None:
+                wanted[path] = file
+    except (OSError, BrokenSectionError) as error:
+        return [Fault(MANIFEST_NAME, "manifest", str(error))]
+    faults = _faults(target, list(wanted.values()))
     for path in there:
-        if path not in named and path not in (*SEALED_NAMES, SELECTION_NAME):
+        if path not in wanted and path not in (*SEALED_NAMES, SELECTION_NAME):
             faults.append(Fault(path, "extra", "not in the manifest"))
     if not faults:
-        faults = _sample_key_faults(target, manifest)
+        faults = _sample_key_faults(target, contents, numbers)
     return sorted(faults, key=lambda fault: fault.path)
 
 
@@ -296,21 +314,20 @@ def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
         return [fault for fault in pool.map(lambda file: _fault(target, file), files) if fault is not None]
 
 
-def _sample_key_faults(target: Path, manifest: Manifest) -> list[Fault]:
-    """Compare the array `sample_key` with the keys that the manifest lists by slot."""
+def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int]) -> list[Fault]:
+    """Compare the array `sample_key` with the keys that sections of the manifest list by slot."""
+    manifest = contents.manifest
     array = next(array for array in layout(manifest.spec) if array.name == "sample_key")
-    size = manifest.spec.samples_per_shard
+    try:
+        stored = _label(target, manifest, "sample_key")
+    except (OSError, CorruptChunkError) as error:
+        return [Fault(array.name, "sample_key", str(error))]
     faults = []
-    for shard in range(-(-manifest.sample_count // size)):
-        keys = manifest.sample_keys[shard * size : (shard + 1) * size]
-        path = array.shard_path(shard)
-        try:
-            stored = bytes(decode_chunk((target / path).read_bytes()))
-        except (OSError, CorruptChunkError) as error:
-            faults.append(Fault(path, "sample_key", str(error)))
-            continue
-        if stored[: len(keys) * SAMPLE_KEY_BYTES] != bytes.fromhex("".join(keys)):
-            slots = f"slots {shard * size} to {shard * size + len(keys) - 1}"
+    for number in numbers:
+        section = contents.section(number)
+        if stored[section.first : section.end].tobytes() != bytes.fromhex("".join(section.sample_keys)):
+            path = array.shard_path(section.first // manifest.samples_per_file(array))
+            slots = f"slots {section.first} to {section.end - 1}"
             faults.append(Fault(path, "sample_key", f"{slots} have other keys than the manifest says"))
     return faults
 

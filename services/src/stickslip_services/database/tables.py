@@ -56,7 +56,11 @@ jobs = Table(
     Column("kind", String, nullable=False),
     Column("spec", Text, nullable=False),  # JSON
     Column("sample_count", Integer, nullable=False),
-    Column("builds", Text),  # JSON; null until the job is planned
+    Column("builds", Text),  # JSON; null until its planning begins
+    Column("certificate", String),  # digest of the one that vouches for it, as of when its planning began
+    Column("planned", Integer, nullable=False, server_default="0"),  # samples whose tasks are written down
+    Column("planner", String),  # the coordinator that plans it
+    Column("planner_until", Float),  # when another coordinator may go on with that
     Column("publish_task", _Wide, index=True),  # null until the job is planned
     Column("state", String, nullable=False),
     Column("reason", String),
@@ -72,8 +76,8 @@ jobs = Table(
     Index(
         "ix_jobs_open",
         "seq",
-        sqlite_where=text("state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"),
-        postgresql_where=text("state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"),
+        sqlite_where=text("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
+        postgresql_where=text("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
     ),
     sqlite_autoincrement=True,
 )

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import combinations
+from itertools import combinations, islice
 from typing import Any
 
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Contents, Manifest
 from stickslip_schemas.samples import grid
 
 CELLS = 12
@@ -23,12 +23,15 @@ _SIDE = 240.0  # of a map [px]
 _MARGIN = 58.0
 
 
-def dataset_page(manifest: Manifest) -> str:
+def dataset_page(contents: Contents) -> str:
     """Return the page as HTML."""
-    points = list(grid(manifest.spec))
-    lost = [rejection.slot for rejection in manifest.rejections]
-    axes = [axis for axis in (Axis.of(name, points) for name in manifest.spec.named_axes) if axis.size > 1]
-    maps = "".join(_map(across, up, points, lost) for across, up in combinations(axes, 2))
+    manifest = contents.manifest
+    maps = ""
+    if not manifest.sections:
+        points = list(grid(manifest.spec))
+        lost = [rejection.slot for rejection in manifest.rejections]
+        axes = [axis for axis in (Axis.of(name, points) for name in manifest.spec.named_axes) if axis.size > 1]
+        maps = "".join(_map(across, up, points, lost) for across, up in combinations(axes, 2))
     title = f"{escape(manifest.dataset)}, version {manifest.version}"
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -36,25 +39,26 @@ def dataset_page(manifest: Manifest) -> str:
 <h1>{title}</h1>
 <p class="rate"><b>{manifest.acceptance_rate:.2%}</b> accepted: {manifest.valid_count:,} of
 {manifest.sample_count:,} samples</p>
-{_facts(manifest)}
+{_facts(contents)}
 <h2>What was lost</h2>
 {_losses(manifest)}
 <h2>Where it was lost</h2>
 <p>{_where(manifest, maps)}</p>
 <div class="maps">{maps}</div>
-{_listed(manifest)}
+{_listed(contents)}
 </body></html>
 """
 
 
-def _facts(manifest: Manifest) -> str:
-    spec = manifest.spec
+def _facts(contents: Contents) -> str:
+    manifest, spec = contents.manifest, contents.manifest.spec
+    files = list(contents.files())
     splits = ", ".join(f"{count:,} {name}" for name, count in manifest.split_counts.items())
     rows = [
         ("kind", spec.kind),
         ("grid", " × ".join(f"{name} ({axis.num})" for name, axis in spec.named_axes.items()) + f", {spec.combine}"),
         ("valid samples", splits or "none"),
-        ("files", f"{len(manifest.files):,}, {manifest.size / 1e6:,.1f} MB"),
+        ("files", f"{len(files):,}, {sum(file.size for file in files) / 1e6:,.1f} MB"),
         ("certificate", manifest.certificate or "none: no certificate vouches for the physics of this build"),
         ("spec", manifest.spec_digest),
     ]
@@ -62,9 +66,9 @@ def _facts(manifest: Manifest) -> str:
 
 
 def _losses(manifest: Manifest) -> str:
-    if not manifest.rejections:
+    if manifest.valid_count == manifest.sample_count:
         return "<p>No sample was rejected.</p>"
-    reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
+    reasons = Counter(manifest.rejection_counts or Counter(str(item.reason) for item in manifest.rejections))
     rows = "".join(
         f"<tr><td>{escape(reason)}</td><td>{count:,}</td><td>{count / manifest.sample_count:.2%}</td></tr>"
         for reason, count in reasons.most_common()
@@ -73,6 +77,8 @@ def _losses(manifest: Manifest) -> str:
 
 
 def _where(manifest: Manifest, maps: str) -> str:
+    if manifest.sections:
+        return "The grid has too many samples for maps. The label `valid` says of each whether it is there."
     if not maps:
         return "The grid has fewer than two axes with more than one value: there is no map to draw."
     if not manifest.rejections:
@@ -80,14 +86,15 @@ def _where(manifest: Manifest, maps: str) -> str:
     return "Each cell is a region of the grid, the redder the larger the share of its samples that was rejected."
 
 
-def _listed(manifest: Manifest) -> str:
-    if not manifest.rejections:
+def _listed(contents: Contents) -> str:
+    manifest = contents.manifest
+    if manifest.valid_count == manifest.sample_count:
         return ""
     rows = "".join(
         f"<tr><td>{rejection.slot}</td><td>{escape(str(rejection.reason))}</td><td>{escape(rejection.message)}</td></tr>"
-        for rejection in manifest.rejections[:LISTED]
+        for rejection in islice(contents.rejections(), LISTED)
     )
-    more = len(manifest.rejections) - LISTED
+    more = manifest.sample_count - manifest.valid_count - LISTED
     rest = f"<p>{more:,} more are in the manifest.</p>" if more > 0 else ""
     return f"<h2>The rejected samples</h2><table><tr><th>slot</th><th>reason</th><th></th></tr>{rows}</table>{rest}"
 

@@ -14,9 +14,9 @@ from stickslip_schemas.chunks import (
 from stickslip_schemas.codecs import decode_sample
 from stickslip_schemas.keys import Sha256
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Contents
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry
+from stickslip_schemas.tasks import FileEntry, Rejection
 
 Array = npt.NDArray[np.generic]
 
@@ -24,17 +24,17 @@ Array = npt.NDArray[np.generic]
 class SampleData:
     """The arrays of a version, by name; the files are found through its manifest."""
 
-    def __init__(self, store: Store, manifest: Manifest) -> None:
-        self.manifest = manifest
+    def __init__(self, store: Store, contents: Contents) -> None:
+        self.contents = contents
+        self.manifest = manifest = contents.manifest
         self.arrays = {array.name: array for array in layout(manifest.spec)}
         self._store = store
-        self._files = {file.path: file for file in manifest.files}
 
     def read(self, name: str, slot: int) -> Array:
         """Return the value of an array for a sample; raise KeyError, OSError or CorruptChunkError."""
         array = self.arrays[name]
-        size = self.manifest.spec.samples_per_shard
-        file = self._files[array.shard_path(slot // size)]
+        size = self.manifest.samples_per_file(array)
+        file = self._file(array, slot // size)
         return (
             _chunk(self._store, file, array, slot % size, size)
             if array.per_sample
@@ -44,12 +44,29 @@ class SampleData:
     def label(self, name: str) -> Array:
         """Return a label of all slots."""
         array = self.arrays[name]
-        size = self.manifest.spec.samples_per_shard
-        shards = -(-self.manifest.sample_count // size)
-        digests = [self._files[array.shard_path(shard)].sha256 for shard in range(shards)]
-        return np.concatenate([_column(self._store, digest, array, size) for digest in digests])[
-            : self.manifest.sample_count
-        ]
+        size = self.manifest.samples_per_file(array)
+        files = (self._file(array, number) for number in range(-(-self.manifest.sample_count // size)))
+        columns = [_column(self._store, file.sha256, array, size) for file in files]
+        return np.concatenate(columns)[: self.manifest.sample_count]
+
+    def rejections(self, until: int) -> dict[int, Rejection]:
+        """Return the rejected samples among the slots before `until`."""
+        found: dict[int, Rejection] = {}
+        for number in range(self.contents.number_of(min(until, self.manifest.sample_count) - 1) + 1):
+            found |= {rejection.slot: rejection for rejection in self.contents.section(number).rejections}
+        return found
+
+    def rejection(self, slot: int) -> Rejection | None:
+        """Return why a sample was rejected; None where it was not."""
+        rejections = self.contents.section(self.contents.number_of(slot)).rejections
+        return next((rejection for rejection in rejections if rejection.slot == slot), None)
+
+    def _file(self, array: ArrayLayout, number: int) -> FileEntry:
+        path = array.shard_path(number)
+        file = self.contents.file(path)
+        if file is None:
+            raise KeyError(path)
+        return file
 
     def named(self, array: ArrayLayout, value: Array) -> object:
         """Return a label as people read it: the name of a code, a number, several numbers."""
@@ -74,7 +91,7 @@ def _chunk(store: Store, file: FileEntry, array: ArrayLayout, position: int, slo
 
 @lru_cache(maxsize=256)
 def _column(store: Store, digest: Sha256, array: ArrayLayout, slots: int) -> Array:
-    """Return the values of a whole shard group; artifacts never change, so it is read once."""
+    """Return the values of all samples of a file; artifacts never change, so it is read once."""
     out = np.empty((slots, *array.shape), dtype=array.dtype)
     decode_chunk(store.read(digest), out)
     return out

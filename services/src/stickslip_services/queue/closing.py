@@ -18,6 +18,7 @@ from stickslip_services.queue.eta import Run
 from stickslip_services.queue.events import append_published, append_task_state, set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
+    ADD_TO_JOB_COUNTS,
     OVER,
     RUNNABLE,
     Ending,
@@ -29,21 +30,23 @@ from stickslip_services.queue.ledger import (
     runnable_tasks,
 )
 
-_OPEN = text("jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')")  # the partial index's words
+# In the words of the partial index.
+_OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")
 _OPEN_JOBS = Prepared(
     "SELECT seq, state, (SELECT SUM(count) FROM job_counts WHERE job = jobs.seq AND state = 'failed') FROM jobs "
-    "WHERE jobs.state IN ('queued', 'running', 'pausing', 'paused', 'cancelling')"
+    "WHERE jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"
 )
-_QUEUED_JOBS = Prepared(f"SELECT seq FROM jobs WHERE {_OPEN.text} AND jobs.state = 'queued'")
+_NOT_STARTED = Prepared(
+    f"SELECT seq, state FROM jobs WHERE {_OPEN.text} AND (jobs.state = 'queued' "
+    "OR (jobs.state = 'planning' AND jobs.started_at IS NULL))"
+)
 _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # likewise
 
 
+_PLANNED = frozenset(RUNNABLE) - {JobState.planning}
 _ADD_TO_TASK_COUNTS = Prepared(
     "INSERT INTO task_counts (stage, state, count) VALUES (:stage, :state, :change) "
     "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
-)
-_ADD_TO_JOB_COUNTS = Prepared(
-    text("UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state")
 )
 _ADD_TO_JOB_GROUPS = Prepared(
     'UPDATE job_groups SET "left" = "left" + :b_change '
@@ -68,7 +71,7 @@ def close(book: Ledger) -> None:
     given_up = _settle(book, frozenset())
     open_jobs = _OPEN_JOBS.tuples(book.connection)
     for job in _blocked_jobs(
-        book.connection, [seq for seq, state, failed in open_jobs if state in RUNNABLE and failed]
+        book.connection, [seq for seq, state, failed in open_jobs if state in _PLANNED and failed]
     ):
         book.end_job(job, _set_aside(book.connection, job))
     _settle(book, given_up)
@@ -98,7 +101,7 @@ def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
 
 
 def _blocked_jobs(connection: Connection, set_aside: list[int]) -> list[int]:
-    """Return those of the runnable jobs with tasks set aside for which nothing runs, and nothing can."""
+    """Return those of the planned jobs with tasks set aside for which nothing runs, and nothing can."""
     if not set_aside:
         return []
     counts = job_counts.c
@@ -165,7 +168,7 @@ def _count(connection: Connection, moves: list[Move], holders: dict[int, list[Ho
         if change
     ]
     if changes:
-        _ADD_TO_JOB_COUNTS.run_all(connection, changes)
+        ADD_TO_JOB_COUNTS.run_all(connection, changes)
 
 
 def _count_left(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
@@ -209,9 +212,13 @@ def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[
 def _start_jobs(book: Ledger, job_seqs: Collection[int]) -> None:
     if not job_seqs:
         return
-    queued = [seq for (seq,) in _QUEUED_JOBS.tuples(book.connection) if seq in job_seqs]
-    for job in queued:
-        set_job_state(book.connection, job, JobState.running, book.now)
+    for job, state in _NOT_STARTED.tuples(book.connection):
+        if job not in job_seqs:
+            continue
+        if state == JobState.queued:
+            set_job_state(book.connection, job, JobState.running, book.now)
+        else:  # it runs when it has been planned
+            book.connection.execute(update(jobs).where(jobs.c.seq == job).values(started_at=book.now))
 
 
 def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, TaskState]]) -> None:

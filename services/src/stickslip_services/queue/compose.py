@@ -7,9 +7,13 @@ from typing import Any
 
 from sqlalchemy import Connection, func, insert, select
 from stickslip_schemas.builds import Builds
+from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.manifest import section_samples
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.states import Stage, TaskState
+from stickslip_schemas.store import in_parallel
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
 
 from stickslip_services.database.database import batches
@@ -18,6 +22,9 @@ from stickslip_services.errors import ConflictError, NotFoundError
 from stickslip_services.queue.ids import task_id, task_key
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
+
+Publish = Callable[[bytes], Sha256]
+"""Writes an artifact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +37,17 @@ class StoredTask:
     preview: bool
 
 
-def compose_tasks(connection: Connection, stored: Sequence[StoredTask]) -> dict[int, AnyTask]:
-    """Return the tasks by `seq`; all that they depend on has to be settled."""
+def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish: Publish) -> dict[int, AnyTask]:
+    """Return the tasks by `seq`; all that they depend on has to be settled.
+
+    What is too long for a task that publishes is written to the store with `publish`, which takes a while: do not call
+    this in a transaction that keeps others from writing.
+    """
     composers: Mapping[Stage, Callable[[Connection, list[StoredTask]], dict[int, AnyTask]]] = {
         Stage.simulate: _simulate_tasks,
         Stage.render: _render_tasks,
         Stage.pack: lambda connection, group: {task.seq: _pack_task(connection, task) for task in group},
-        Stage.publish: lambda connection, group: {task.seq: _publish_task(connection, task) for task in group},
+        Stage.publish: lambda connection, group: {task.seq: _publish_task(connection, task, publish) for task in group},
     }
     composed: dict[int, AnyTask] = {}
     for stage, compose in composers.items():
@@ -45,8 +56,11 @@ def compose_tasks(connection: Connection, stored: Sequence[StoredTask]) -> dict[
     return composed
 
 
-def find_task(connection: Connection, name: str) -> AnyTask:
-    """Return a task by its name; raise NotFoundError, or ConflictError where what it builds on is not there yet."""
+def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
+    """Return a task by its name, composed as by `compose_tasks`.
+
+    Raise NotFoundError, or ConflictError where what it builds on is not there yet.
+    """
     key = task_key(name)
     columns = (tasks.c.seq, tasks.c.stage, tasks.c.payload, tasks.c.preview, tasks.c.waiting_on)
     row = None if key is None else connection.execute(select(*columns).where(tasks.c.key == key)).one_or_none()
@@ -56,7 +70,8 @@ def find_task(connection: Connection, name: str) -> AnyTask:
         raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
     if row.stage == Stage.render and _record_of(connection, row.seq) is None:
         raise ConflictError(f"task {name} has nothing to render: its simulation was rejected")
-    return compose_tasks(connection, [StoredTask(row.seq, Stage(row.stage), row.payload, row.preview)])[row.seq]
+    stored = StoredTask(row.seq, Stage(row.stage), row.payload, row.preview)
+    return compose_tasks(connection, [stored], publish)[row.seq]
 
 
 def _record_of(connection: Connection, render: int) -> str | None:
@@ -140,40 +155,58 @@ def _slots(connection: Connection, job: int, *, first: int, count: int) -> list[
     return slots
 
 
-def _publish_task(connection: Connection, task: StoredTask) -> PublishTask:
+def _publish_task(connection: Connection, task: StoredTask, publish: Publish) -> PublishTask:
     payload = json.loads(task.payload)
     job = payload["job"]
     spec, builds = _job_spec(connection, job)
     dataset = dataset_id(spec)
-    outputs = connection.scalars(
-        select(tasks.c.output)
-        .join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
-        .where(task_dependencies.c.task == task.seq)
+    packed = {
+        json.loads(shard)["shard"]: output
+        for shard, output in connection.execute(
+            select(tasks.c.payload, tasks.c.output)
+            .join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
+            .where(task_dependencies.c.task == task.seq, tasks.c.stage == Stage.pack)
+        )
+    }
+    size = section_samples(spec)
+    sections = (
+        _section(connection, job, spec, packed, first, min(first + size, spec.sample_count))
+        for first in range(0, spec.sample_count, size)
     )
-    files = [file for output in outputs if output for file in json.loads(output)["files"]]
-    files.sort(key=lambda file: str(file["path"]))
-    keys = connection.scalars(select(samples.c.key).where(samples.c.job == job).order_by(samples.c.slot))
-    return PublishTask.model_validate(
-        {
-            "spec": spec,
-            "dataset": dataset,
-            "version": find_version(connection, dataset, task.seq),
-            "builds": builds,
-            "files": files,
-            "sample_keys": [key.hex() for key in keys],
-            "rejections": rejections(connection, job),
-            "certificate": payload.get("certificate"),
-        }
+    return PublishTask(
+        spec=spec,
+        dataset=dataset,
+        version=find_version(connection, dataset, task.seq),
+        builds=builds,
+        sections=tuple(in_parallel(publish, sections)),
+        certificate=payload.get("certificate"),
     )
 
 
-def rejections(connection: Connection, job: int) -> list[dict[str, Any]]:
-    """Return the rejected samples of a job, by slot."""
+def _section(connection: Connection, job: int, spec: JobSpec, packed: Mapping[int, str], first: int, end: int) -> bytes:
+    """Return the slots from `first` to `end`, which are whole shards, as a `PublishSection`."""
+    own = (samples.c.job == job, samples.c.slot >= first, samples.c.slot < end)
+    keys = connection.scalars(select(samples.c.key).where(*own).order_by(samples.c.slot))
+    shards = range(first // spec.samples_per_shard, -(-end // spec.samples_per_shard))
+    outputs = [json.loads(packed[shard]) for shard in shards]
+    document = {
+        "first": first,
+        "sample_keys": [key.hex() for key in keys],
+        "rejections": rejections(connection, job, first=first, end=end),
+        "files": [file for output in outputs for file in output["files"]],
+        "labels": [output["labels"] for output in outputs],
+    }
+    return json.dumps(document).encode()
+
+
+def rejections(connection: Connection, job: int, *, first: int, end: int) -> list[dict[str, Any]]:
+    """Return the rejected samples of a job among the slots from `first` to `end`, by slot."""
     last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
     rows = connection.execute(
         select(samples.c.slot, samples.c.key, samples.c.labels, tasks.c.reason, tasks.c.message)
         .join(tasks, tasks.c.seq == last)
-        .where(samples.c.job == job, tasks.c.state == TaskState.rejected)
+        .where(samples.c.job == job, samples.c.slot >= first, samples.c.slot < end)
+        .where(tasks.c.state == TaskState.rejected)
         .order_by(samples.c.slot)
     )
     return [

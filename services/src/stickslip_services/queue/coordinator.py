@@ -61,17 +61,25 @@ from stickslip_services.queue.jobs import (
     show_job,
     unplanned_jobs,
 )
-from stickslip_services.queue.leasing import grant_leases, has_ready_task, renew_all_leases, renew_leases
+from stickslip_services.queue.leasing import (
+    compose_leases,
+    grant_leases,
+    has_ready_task,
+    renew_all_leases,
+    renew_leases,
+)
 from stickslip_services.queue.ledger import RUNNABLE, Ledger
+from stickslip_services.queue.planner import Planner, release_claims
 from stickslip_services.queue.planning import Plan, collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.queue.stranded import find_stranded, note_stranded
-from stickslip_services.queue.submitting import insert_job, plan_job
+from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
 from stickslip_services.queue.terms import Terms, terms_for
 from stickslip_services.queue.workers import (
+    NO_WORKER,
     RegisteredWorker,
     find_worker,
     insert_worker,
@@ -103,6 +111,8 @@ class Coordinator:
     store: Store = field(init=False)
     store_watch: StoreWatch = field(init=False)
     eta_watch: EtaWatch = field(init=False, default_factory=EtaWatch)
+    planner: Planner = field(init=False)
+    _is_closing: bool = field(init=False, default=False)
     _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
     """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
 
@@ -116,6 +126,7 @@ class Coordinator:
             min_free_bytes=self.settings.min_free_bytes,
             clock=lambda: self.clock(),
         )
+        self.planner = Planner(self.database, lambda: self.clock(), self.settings, self.bell.ring)
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
@@ -124,10 +135,12 @@ class Coordinator:
             admit_local_worker(connection, self.settings.worker_key_path, self.clock())
             if self.database.is_alone(connection):  # nobody could take a heartbeat
                 renew_all_leases(connection, self.clock(), self.settings)
+                release_claims(connection)
         self.plan_waiting_jobs()
 
     def close(self) -> None:
         """Let go of the database."""
+        self._is_closing = True
         self.database.close()
 
     @contextmanager
@@ -147,13 +160,15 @@ class Coordinator:
     def _submit(self, spec: JobSpec, idempotency_key: str | None, priority: int) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
+        planned_for: Terms | None = None
         while True:
             with self.database.read() as connection:
                 if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
                     return replay
                 terms = terms_for(connection, spec)
-            if terms is not None and (plan is None or Terms(plan.builds, plan.certificate) != terms):
-                plan = self._expand(spec, terms)
+            at_once = terms is not None and spec.sample_count <= self.settings.plan_samples
+            if terms is not None and at_once and planned_for != terms:
+                plan, planned_for = self._expand(spec, terms), terms
             with self.database.write() as connection:
                 if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
                     return replay
@@ -161,7 +176,8 @@ class Coordinator:
                     continue  # a worker with other builds has registered in between, or a certificate
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, plan, priority=priority)
+                    job = insert_job(book, spec, priority=priority)
+                    self._enqueue(book, job, terms, plan if at_once else None)
                 shown = self.show(connection, job)
                 note(
                     connection,
@@ -177,6 +193,17 @@ class Coordinator:
             self.bell.ring()
             self.check_made_datasets(at_most=CHECKED_AT_ONCE)
             return shown
+
+    def _enqueue(self, book: Ledger, job: int, terms: Terms | None, plan: Plan | None) -> None:
+        """Let a new job be queued with its whole plan, or be planned piece by piece, or wait for the first worker."""
+        if terms is None:
+            reason = Reason.waiting_for_worker
+            set_job_state(book.connection, job, JobState.queued, book.now, reason=reason, message=NO_WORKER)
+            return
+        begin_planning(book, job, terms)
+        set_job_state(book.connection, job, JobState.planning if plan is None else JobState.queued, book.now)
+        if plan is not None:
+            plan_piece(book, job, plan)
 
     def cancel(self, job_id: str, *, if_match: Collection[str] | None = None) -> JobDetail:
         """Cancel a job. With `if_match`, only if its entity tag is one of these."""
@@ -273,7 +300,10 @@ class Coordinator:
             return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
         with self._book() as book:
             worker = _unsuperseded(book.connection, worker.id)
-            leases = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
+            grants = grant_leases(book, worker, wanted, self.settings, at_most=request.at_most_seconds)
+        # What a task builds on has ended: nobody needs to be kept from writing while the tasks are composed.
+        with self.database.read() as connection:
+            leases = compose_leases(connection, grants, self.store.publish)
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
@@ -415,11 +445,12 @@ class Coordinator:
                 else:
                     if terms is None:
                         return
-            plan = None if terms is None else self._expand(spec, terms)
+            at_once = spec.sample_count <= self.settings.plan_samples
+            plan = self._expand(spec, terms) if terms is not None and at_once else None
             with self.database.write() as connection:
                 if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
                     continue  # cancelled, or planned by somebody else
-                if plan is None:
+                if terms is None:
                     set_job_state(
                         connection,
                         row.seq,
@@ -430,8 +461,17 @@ class Coordinator:
                     )
                 else:
                     with ledger(connection, self.clock()) as book:
-                        plan_job(book, row.seq, plan)
+                        begin_planning(book, row.seq, terms)
+                        if plan is not None:
+                            plan_piece(book, row.seq, plan)
+                        else:
+                            set_job_state(connection, row.seq, JobState.planning, book.now)
             self.bell.ring()
+
+    def plan_large_jobs(self) -> None:
+        """Plan the jobs that are `planning`, until there are none left."""
+        while not self._is_closing and self.planner.step():
+            pass
 
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""
@@ -448,7 +488,7 @@ class Coordinator:
         return self.clock() - self.settings.lease_seconds
 
     def _expand(self, spec: JobSpec, terms: Terms) -> Plan:
-        return expand(spec, terms.builds, certificate=terms.certificate, previews=self.settings.previews_per_job)
+        return expand(spec, terms, previews=self.settings.previews_per_job)
 
     def _note_stranded(self) -> None:
         with self.database.read() as connection:

@@ -78,9 +78,9 @@ def runnable_jobs(connection: Connection) -> list[str]:
     return list(connection.scalars(select(jobs.c.id).where(jobs.c.state.in_(RUNNABLE)).order_by(jobs.c.seq)))
 
 
-def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any, Any]]:
-    """Return (seq, kind, spec) of the jobs that wait for the first worker."""
-    query = select(jobs.c.seq, jobs.c.kind, jobs.c.spec).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
+def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any]]:
+    """Return (seq, spec) of the jobs that wait for the first worker."""
+    query = select(jobs.c.seq, jobs.c.spec).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
     return connection.execute(query.order_by(jobs.c.seq)).all()
 
 
@@ -103,7 +103,9 @@ def pause_job(book: Ledger, job_id: str) -> int:
     if row.state in (JobState.pausing, JobState.paused) and row.reason is None:
         return int(row.seq)
     if row.state not in (*RUNNABLE, JobState.pausing, JobState.paused):
-        raise ConflictError(f"job {job_id} is {row.state}, and only a job that is queued or running can be paused")
+        raise ConflictError(
+            f"job {job_id} is {row.state}, and only one that is planning, queued or running can be paused"
+        )
     message = "nothing more is started; tasks that are running finish"
     set_job_state(book.connection, row.seq, JobState.pausing, book.now, message=message)
     charge_waiting_tasks(book.connection, row.seq)
@@ -118,6 +120,8 @@ def resume_job(book: Ledger, job_id: str) -> int:
     if row.state not in (JobState.pausing, JobState.paused):
         raise ConflictError(f"job {job_id} is {row.state}, and only a paused job can be resumed")
     state = JobState.queued if row.started_at is None else JobState.running
+    if row.builds is not None and row.planned < row.sample_count:
+        state = JobState.planning
     reason, message = (None, "") if row.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
     set_job_state(book.connection, row.seq, state, book.now, reason=reason, message=message)
     charge_waiting_tasks(book.connection, row.seq)

@@ -18,7 +18,7 @@ from stickslip_schemas.worker_api import Lease, LeaseState
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
-from stickslip_services.queue.compose import StoredTask, compose_tasks, reserve_version
+from stickslip_services.queue.compose import Publish, StoredTask, compose_tasks, reserve_version
 from stickslip_services.queue.costs import limit_seconds, long_groups, read_costs
 from stickslip_services.queue.eta import Cost, Group
 from stickslip_services.queue.ids import task_id, task_key
@@ -118,9 +118,20 @@ def has_ready_task(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """A task that has been leased and is still to be composed."""
+
+    task: StoredTask
+    task_id: str
+    token: int
+    attempt: int
+    limit_seconds: float | None
+
+
 def grant_leases(
     book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings, *, at_most: float | None
-) -> tuple[Lease, ...]:
+) -> list[Grant]:
     """Lease up to the wanted number of tasks of each stage to `worker`; none known to take over `at_most` seconds."""
     granted: list[_Ready] = []
     costs = read_costs(book.connection)
@@ -129,26 +140,41 @@ def grant_leases(
         if count > 0:
             granted.extend(_pick(book.connection, worker, stage, count, costs, at_most))
     if not granted:
-        return ()
+        return []
     for task in granted:
         book.moved(task.seq, task.stage, TaskState.pending, TaskState.leased)
     lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
     _LEASE.run_all(book.connection, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
-    stored = [StoredTask(task.seq, task.stage, task.payload, task.preview) for task in granted]
-    for publish in (task for task in stored if task.stage is Stage.publish):
-        reserve_version(book.connection, publish)
-    composed = compose_tasks(book.connection, stored)
-    return tuple(
-        Lease(
+    grants = [
+        Grant(
+            task=StoredTask(task.seq, task.stage, task.payload, task.preview),
             task_id=task_id(task.stage, task.key),
             token=task.token + 1,
             attempt=task.attempts + 1,
             limit_seconds=limit_seconds(
                 costs.get((task.stage, task.kind, task.cost_group)), task.tries, floor=settings.limit_floor_seconds
             ),
-            task=composed[task.seq],
         )
         for task in granted
+    ]
+    for grant in grants:
+        if grant.task.stage is Stage.publish:
+            reserve_version(book.connection, grant.task)
+    return grants
+
+
+def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
+    """Return what the worker is told of the tasks that it has been granted; see `compose_tasks`."""
+    composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+    return tuple(
+        Lease(
+            task_id=grant.task_id,
+            token=grant.token,
+            attempt=grant.attempt,
+            limit_seconds=grant.limit_seconds,
+            task=composed[grant.task.seq],
+        )
+        for grant in grants
     )
 
 

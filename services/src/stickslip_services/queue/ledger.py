@@ -18,8 +18,8 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.eta import Run
 
-RUNNABLE = (JobState.queued, JobState.running)
-"""States of a job whose tasks may be leased."""
+RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
+"""States of a job whose tasks may be leased: of one that is being planned, those that are written down."""
 
 LIVE = (*RUNNABLE, JobState.pausing, JobState.paused)
 """States of a job that needs its tasks."""
@@ -89,6 +89,9 @@ _HOLDERS = Prepared(
     .join(tasks, tasks.c.seq == job_tasks.c.task)
     .where(job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)), jobs.c.state.in_(OPEN))
 )
+ADD_TO_JOB_COUNTS = Prepared(
+    "UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state"
+)
 
 
 class Ledger:
@@ -146,7 +149,12 @@ def charge_waiting_tasks(connection: Connection, job: int) -> None:
     Called whenever a job starts or stops being runnable, or changes its priority, for a task is leased only on behalf
     of the job it is charged to.
     """
-    for batch in batches(seq for seq, _, _ in _waiting_tasks(connection, job)):
+    charge_tasks(connection, (seq for seq, _, _ in _waiting_tasks(connection, job)))
+
+
+def charge_tasks(connection: Connection, waiting: Iterable[int]) -> None:
+    """Charge waiting tasks to the jobs that they are to run for."""
+    for batch in batches(waiting):
         _charge(connection, live_jobs(connection, batch))
 
 

@@ -1,22 +1,22 @@
 """From a spec to tasks: simulate -> render -> pack -> publish, each keyed by exactly what its result depends on.
 
-`expand` is pure and slow and runs outside any transaction.
+Planning is pure and slow and runs outside any transaction. A job of many samples is planned piece by piece (`planner`).
 """
 
 import gc
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, NamedTuple
 
-from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.samples import keyed_points, pack_key, publish_key
+from stickslip_schemas.samples import KeyedPoint, keyed_points, pack_key, publish_key
 from stickslip_schemas.states import Stage
 
 from stickslip_services.database.database import batches
+from stickslip_services.queue.terms import Terms
 
 _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
 
@@ -45,17 +45,27 @@ class PlannedSample(NamedTuple):
 
 @dataclass(slots=True)
 class Plan:
-    """The tasks of a job by content key, in the order in which they should run, and its samples."""
+    """Tasks of a job by content key, in the order in which they should run, and samples: all, or those of a piece."""
 
     spec: JobSpec
-    builds: Builds
-    certificate: Sha256 | None = None
+    first: int
+    """The first slot."""
     tasks: dict[bytes, PlannedTask] = field(default_factory=dict)
     samples: list[PlannedSample] = field(default_factory=list)
 
     @property
+    def end(self) -> int:
+        """The slot after the last one."""
+        return self.first + len(self.samples)
+
+    @property
+    def is_last(self) -> bool:
+        """True where it ends with the task that publishes."""
+        return self.end == self.spec.sample_count
+
+    @property
     def publish_key(self) -> bytes:
-        """Key of the last task."""
+        """Key of the last task, of the last piece."""
         return next(reversed(self.tasks))
 
     @property
@@ -85,15 +95,41 @@ def preview_slots(sample_count: int, previews: int) -> set[int]:
     return {position * sample_count // count for position in range(count)}
 
 
-def expand(spec: JobSpec, builds: Builds, *, certificate: Sha256 | None = None, previews: int = 0) -> Plan:
+def expand(spec: JobSpec, terms: Terms, *, previews: int = 0) -> Plan:
     """Return all tasks and samples that `spec` means; the manifest will carry the certificate's digest."""
-    plan = Plan(spec, builds, certificate)
-    tasks_by_key = plan.tasks
+    return next(pieces(spec, terms, size=spec.sample_count, previews=previews))
+
+
+def pieces(
+    spec: JobSpec, terms: Terms, *, size: int, previews: int = 0, first: int = 0, packed: Sequence[str] = ()
+) -> Iterator[Plan]:
+    """Yield the plan of `spec` in pieces of whole shards, of about `size` samples each.
+
+    Together they are the plan that `expand` returns, however they are cut. Who goes on from slot `first` gives the keys
+    of the pack tasks before it, in order.
+    """
+    builds, per_shard = terms.builds, spec.samples_per_shard
     previewed = preview_slots(spec.sample_count, previews)
-    pack_keys: list[str] = []
+    pack_keys = list(packed)
+    shards = enumerate(batches(keyed_points(spec, builds, first=first), per_shard), start=first // per_shard)
+    while some := list(islice(shards, -(-size // per_shard))):
+        yield _piece(spec, terms, some, previewed, pack_keys)
+
+
+def _piece(
+    spec: JobSpec,
+    terms: Terms,
+    shards: Sequence[tuple[int, list[KeyedPoint]]],
+    previewed: set[int],
+    pack_keys: list[str],
+) -> Plan:
+    """Return the plan of some shards; add the keys of their pack tasks to `pack_keys`."""
+    builds = terms.builds
+    plan = Plan(spec, shards[0][1][0].slot)
+    tasks_by_key = plan.tasks
     packs: dict[bytes, PlannedTask] = {}
     renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by trace: those that can be made together
-    for shard, members in enumerate(batches(keyed_points(spec, builds), spec.samples_per_shard)):
+    for shard, members in shards:
         last: dict[bytes, None] = {}  # an ordered set: a grid may have one sample in two slots
         for point in members:
             key = simulate = bytes.fromhex(point.simulation_key)
@@ -118,7 +154,9 @@ def expand(spec: JobSpec, builds: Builds, *, certificate: Sha256 | None = None, 
     for group in renders.values():
         tasks_by_key.update(group)
     tasks_by_key.update(packs)
-    publish = bytes.fromhex(publish_key(spec, pack_keys, builds, certificate))
-    payload = json.dumps({} if certificate is None else {"certificate": certificate})
-    tasks_by_key[publish] = PlannedTask(_PUBLISH, builds.digest, payload, tuple(packs))
+    if plan.is_last:
+        publish = bytes.fromhex(publish_key(spec, pack_keys, builds, terms.certificate))
+        payload = json.dumps({} if terms.certificate is None else {"certificate": terms.certificate})
+        depends_on = tuple(map(bytes.fromhex, pack_keys))
+        tasks_by_key[publish] = PlannedTask(_PUBLISH, builds.digest, payload, depends_on)
     return plan

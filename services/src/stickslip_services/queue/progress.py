@@ -103,11 +103,12 @@ def _progress(row: Row[tuple[object, ...]], known: _Known, slots: int) -> Progre
             told_of = known.frames.get((row.seq, stage, group))
             work[stage].append(StageWork(left - (0.0 if told_of is None else told_of.share), timings))
     eta = None
-    if row.state in (JobState.queued, JobState.running) and row.builds is not None:
+    if row.state in (JobState.queued, JobState.running) and row.builds is not None:  # else the work is not known
         eta = estimate(work, slots=slots)
     return Progress(
         done=sum(count for stage in shown.values() for state, count in stage.counts.items() if state.is_over),
         total=sum(count for stage in shown.values() for count in stage.counts.values()),
+        planned=row.planned,
         stages=shown,
         eta=eta,
     )

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import select, update
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Manifest, check_seal
+from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.states import TaskState
-from stickslip_schemas.store import ShownVersion, Store
+from stickslip_schemas.store import ShownVersion, Store, in_parallel
 from stickslip_schemas.tasks import PublishOutput
 
 from stickslip_services.catalog.versions import (
@@ -24,11 +24,15 @@ from stickslip_services.catalog.versions import (
     version_exists,
 )
 from stickslip_services.database.database import Database
-from stickslip_services.database.tables import tasks
+from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.planning import expand
-from stickslip_services.queue.submitting import insert_job
+from stickslip_services.queue.planning import pieces
+from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
+from stickslip_services.queue.terms import Terms
+
+PIECE = 10_000
+"""Samples that are planned at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +69,15 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     if (dataset_id(manifest.spec), manifest.version) != place:
         raise ValueError(f"the manifest is that of {dataset_id(manifest.spec)}, v{manifest.version}")
     own = {MANIFEST_NAME: sha256(content), GROUP_NAME: sha256(group), SEAL_NAME: sha256(seal)}
-    for path, digest in (own | {file.path: file.sha256 for file in manifest.files}).items():
+    listed = list(Contents(manifest, lambda file: store.read_shown(*place, file.path)).files())
+
+    def put_back(shown: tuple[str, Sha256]) -> None:
+        path, digest = shown
         if not store.exists(digest, size=1):
             store.publish(store.read_shown(*place, path))
-    size = manifest.size + len(content) + len(group) + len(seal)
+
+    in_parallel(put_back, (own | {file.path: file.sha256 for file in listed}).items())
+    size = sum(file.size for file in listed) + len(content) + len(group) + len(seal)
     output = PublishOutput(manifest=own[MANIFEST_NAME], group=own[GROUP_NAME], bytes=size)
     read_version(store, output)  # every file is there
     return manifest, output
@@ -76,13 +85,16 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
 
 def _take_in(database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float) -> bool:
     """Write a version down as the work of a job that has ended; return False where it is known."""
-    plan = expand(manifest.spec, manifest.builds, certificate=manifest.certificate)
+    terms = Terms(manifest.builds, manifest.certificate)
     with database.write() as connection:
         if version_exists(connection, manifest.dataset, manifest.version):
             return False
         with ledger(connection, made_at) as book:
-            insert_job(book, manifest.spec, plan)
-            task = connection.scalar(select(tasks.c.seq).where(tasks.c.key == plan.publish_key))
+            job = insert_job(book, manifest.spec)
+            begin_planning(book, job, terms)
+            for piece in pieces(manifest.spec, terms, size=PIECE):
+                plan_piece(book, job, piece)
+            task = connection.scalar(select(jobs.c.publish_task).where(jobs.c.seq == job))
             assert task is not None
             connection.execute(
                 update(tasks)

@@ -6,17 +6,17 @@ wait for it, where it failed or was cancelled the new job starts it again.
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.states import JobState, Stage, TaskState
 
 from stickslip_services.database.database import batches, insert_rows
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import (
     job_counts,
-    job_groups,
     job_stages,
     job_tasks,
     jobs,
@@ -26,16 +26,20 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import OVER, Ledger, charge_waiting_tasks
+from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks
 from stickslip_services.queue.planning import Plan
-from stickslip_services.queue.workers import NO_WORKER
+from stickslip_services.queue.terms import Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
 
+_ADD_GROUPS = Prepared(
+    'INSERT INTO job_groups (job, stage, cost_group, "left") VALUES (:job, :stage, :cost_group, :n) '
+    'ON CONFLICT (job, stage, cost_group) DO UPDATE SET "left" = job_groups."left" + excluded."left"'
+)
 
-def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None, *, priority: int = 0) -> int:
-    """Write a job down, and its tasks if it can be planned already; return its `seq`."""
-    reason, message = (None, "") if plan else (Reason.waiting_for_worker, NO_WORKER)
+
+def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0) -> int:
+    """Write a job down, without its tasks; return its `seq`."""
     result = book.connection.execute(
         insert(jobs).values(
             id=new_id("job"),
@@ -44,34 +48,56 @@ def insert_job(book: Ledger, spec: JobSpec, plan: Plan | None, *, priority: int 
             spec=spec.model_dump_json(),
             sample_count=spec.sample_count,
             state=JobState.queued,
-            message=message,
+            message="",
             rejected_count=0,
             priority=priority,
             created_at=book.now,
         )
     )
-    job = int(result.inserted_primary_key[0])  # type: ignore[index]  # of one inserted row it is never None
-    set_job_state(book.connection, job, JobState.queued, book.now, reason=reason, message=message)
-    if plan is not None:
-        plan_job(book, job, plan)
-    return job
+    return int(result.inserted_primary_key[0])  # type: ignore[index]  # of one inserted row it is never None
 
 
-def plan_job(book: Ledger, job: int, plan: Plan) -> None:
-    """Write the tasks of a job. If its dataset was made before, it ends once that has been checked (`reopening`)."""
-    last = _insert_plan(book, job, plan)
-    publish_task = book.connection.scalar(select(tasks.c.seq).where(tasks.c.key == plan.publish_key))
+def begin_planning(book: Ledger, job: int, terms: Terms) -> None:
+    """Write down what a job is made with; its tasks come in pieces, from slot 0 on."""
     book.connection.execute(
         update(jobs)
         .where(jobs.c.seq == job)
-        .values(builds=plan.builds.model_dump_json(), publish_task=publish_task, reason=None, message="")
+        .values(builds=terms.builds.model_dump_json(), certificate=terms.certificate, reason=None, message="")
     )
+    rows = [(job, stage, state, 0) for stage in Stage for state in TaskState]
+    insert_rows(book.connection, job_counts, ("job", "stage", "state", "count"), rows)
+    insert_rows(book.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
+
+
+def plan_piece(book: Ledger, job: int, piece: Plan) -> None:
+    """Write the tasks of a piece of a job; the last one makes a job that was `planning` `queued` or `running`.
+
+    If its dataset was made before, the job ends once that has been checked (`reopening`).
+    """
+    last = _insert_plan(book, job, piece)
+    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(planned=piece.end))
+    if not piece.is_last:
+        return
+    publish_task = book.connection.scalar(select(tasks.c.seq).where(tasks.c.key == piece.publish_key))
+    done = {"publish_task": publish_task, "planner": None, "planner_until": None}
+    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(done))
     if last is TaskState.succeeded:
         set_job_state(book.connection, job, JobState.queued, book.now, message="all of it was made before: checking it")
-        return
-    charge_waiting_tasks(book.connection, job)  # tasks that it shares with paused jobs run for this one
-    if _has_started_tasks(book.connection, job):
+    elif _has_started_tasks(book.connection, job):
         set_job_state(book.connection, job, JobState.running, book.now)
+    elif piece.first > 0:
+        set_job_state(book.connection, job, JobState.queued, book.now)
+
+
+def pack_keys(connection: Connection, job: int) -> list[str]:
+    """Return the keys of the pack tasks that a job has so far, by shard."""
+    rows = connection.execute(
+        select(tasks.c.key, tasks.c.payload)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.stage == Stage.pack)
+    )
+    by_shard = {json.loads(payload)["shard"]: key.hex() for key, payload in rows}
+    return [by_shard[shard] for shard in sorted(by_shard)]
 
 
 def _has_started_tasks(connection: Connection, job: int) -> bool:
@@ -82,7 +108,7 @@ def _has_started_tasks(connection: Connection, job: int) -> bool:
 
 
 class _Known(NamedTuple):
-    """A task that was in the database before the job."""
+    """A task that was in the database before the piece."""
 
     seq: int
     stage: Stage
@@ -95,10 +121,14 @@ class _Known(NamedTuple):
 def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     """Write the tasks of `job` and return the state of the last of them."""
     connection = book.connection
-    known = _find(connection, plan.tasks)
+    needed = {key for task in plan.tasks.values() for key in task.depends_on} - plan.tasks.keys()
+    known = _find(connection, [*plan.tasks, *needed])
     seqs, rejected = _insert_tasks(connection, job, plan, known)
-    settled = rejected | {task.seq for task in known.values() if task.state.is_settled}
-    insert_rows(connection, job_tasks, ("job", "task", "cached"), ((job, seq, seq in settled) for seq in seqs.values()))
+    own = _held(connection, job, known.values())  # of earlier pieces
+    shared = [task for task in known.values() if task.seq not in own]
+    settled = rejected | {task.seq for task in shared if task.state.is_settled}
+    held = ((job, seq, seq in settled) for seq in seqs.values() if seq not in own)
+    insert_rows(connection, job_tasks, ("job", "task", "cached"), held)
     insert_rows(
         connection,
         samples,
@@ -114,17 +144,29 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
         counts[Stage.render, TaskState.rejected] += len(rejected)
         counts[Stage.render, TaskState.pending] -= len(rejected)
     book.inserted.update(counts)
-    counts.update((task.stage, task.state) for task in known.values())
-    _insert_counts(connection, job, counts)
-    left = Counter((task.stage, task.cost_group) for task in known.values() if task.state not in OVER)
+    counts.update((task.stage, task.state) for task in shared)
+    _add_counts(connection, job, counts)
+    left = Counter((task.stage, task.cost_group) for task in shared if task.state not in OVER)
     for key, task in plan.tasks.items():
         if key not in known:
             left[Stage(task.stage), task.cost_group] += seqs[key] not in rejected
-    groups = {*left, *((task.stage, task.cost_group) for task in known.values())}
-    rows = ((job, stage, group, left[stage, group]) for stage, group in groups)
-    insert_rows(connection, job_groups, ("job", "stage", "cost_group", '"left"'), rows)
-    _retry(book, job, [task for task in known.values() if task.state in _LOST])  # its moves change the counts
-    return known[plan.publish_key].state if plan.publish_key in known else TaskState.pending
+    groups = {*left, *((task.stage, task.cost_group) for task in shared)}
+    if groups:
+        rows = [{"job": job, "stage": stage, "cost_group": group, "n": left[stage, group]} for stage, group in groups]
+        _ADD_GROUPS.run_all(connection, rows)
+    _retry(book, job, [task for task in shared if task.state in _LOST])  # its moves change the counts
+    charge_tasks(connection, (task.seq for task in shared if not task.state.is_settled))
+    return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
+
+
+def _held(connection: Connection, job: int, known: Collection[_Known]) -> set[int]:
+    """Return which of the tasks a job has."""
+    held: set[int] = set()
+    for batch in batches(task.seq for task in known):
+        held.update(
+            connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task.in_(batch)))
+        )
+    return held
 
 
 def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
@@ -207,9 +249,16 @@ def _insert_tasks(
     return seqs, rejected
 
 
-def _insert_counts(connection: Connection, job: int, counts: Mapping[tuple[Stage, TaskState], int]) -> None:
-    rows = [(job, stage, state, counts.get((stage, state), 0)) for stage in Stage for state in TaskState]
-    insert_rows(connection, job_counts, ("job", "stage", "state", "count"), rows)
+def _add_counts(connection: Connection, job: int, counts: Mapping[tuple[Stage, TaskState], int]) -> None:
+    changes = [
+        {"b_job": job, "b_stage": stage, "b_state": state, "b_change": count}
+        for (stage, state), count in counts.items()
+        if count
+    ]
+    if changes:
+        ADD_TO_JOB_COUNTS.run_all(connection, changes)
     settled = (TaskState.succeeded, TaskState.rejected)
-    cached = [(job, stage, sum(counts.get((stage, state), 0) for state in settled)) for stage in Stage]
-    insert_rows(connection, job_stages, ("job", "stage", "cached"), cached)
+    for stage in Stage:
+        if cached := sum(counts.get((stage, state), 0) for state in settled):
+            own = (job_stages.c.job == job, job_stages.c.stage == stage)
+            connection.execute(update(job_stages).where(*own).values(cached=job_stages.c.cached + cached))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import select
 from stickslip_schemas.keys import Sha256, is_sha256, sha256
-from stickslip_schemas.manifest import Manifest, seal_text
+from stickslip_schemas.manifest import Contents, Manifest, seal_text
 from stickslip_schemas.store import Store
 
 from stickslip_services.database.database import Database
@@ -61,7 +61,10 @@ def _needed(database: Database, store: Store) -> set[bytes]:
             select(columns.manifest, columns.group_digest).where(columns.manifest.is_not(None))
         )
         for manifest, group in versions.all():
-            add(manifest, group, *(file.sha256 for file in Manifest.model_validate_json(store.read(manifest)).files))
+            contents = Contents(
+                Manifest.model_validate_json(store.read(manifest)), lambda file: store.read(file.sha256)
+            )
+            add(manifest, group, *(file.sha256 for file in contents.files()))
             if group is not None:
                 add(sha256(seal_text(manifest, group)))
     return needed

@@ -56,7 +56,7 @@ def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
         if spec.sample_count > LOOKED_UP:
             return None
     with collector_at_rest():
-        plan = expand(spec, terms.builds, certificate=terms.certificate)
+        plan = expand(spec, terms)
         with database.read() as connection:
             found = (
                 connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(_SETTLED)))

@@ -28,13 +28,15 @@ def info(
         facts.add_row("certificate", manifest.certificate or "none: the physics of this build is not vouched for")
         counts = ", ".join(f"{manifest.split_counts.get(split, 0)} {split}" for split in SPLITS)
         facts.add_row("samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {counts}")
-        reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
+        reasons = Counter(str(rejection.reason) for rejection in reader.rejections())
         told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {told}" if told else ""))
-        facts.add_row("files", f"{len(manifest.files)}, {_megabytes(manifest.size)}" + (", verified" if verify else ""))
+        files = list(reader.files())
+        size = _megabytes(sum(file.size for file in files))
+        facts.add_row("files", f"{len(files)}, {size}" + (", verified" if verify else ""))
         console.print(facts)
         sizes: Counter[str] = Counter()
-        for file in manifest.files:
+        for file in files:
             sizes[file.path.split("/")[0]] += file.size
         arrays = Table(box=None, pad_edge=False, header_style="bold")
         for title in ("array", "type", "shape", "raw", "on disk", "what"):

@@ -13,7 +13,7 @@ from stickslip_schemas.selection import Selection
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import huggingface, webdataset
+from stickslip_training.export import huggingface, mds, meshes, webdataset
 from stickslip_training.export.content import Content, OnBytes
 from stickslip_training.export.writing import to_directory, to_file
 
@@ -27,6 +27,11 @@ def export(
     to_huggingface: Annotated[
         Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
+    to_mds: Annotated[Path | None, typer.Option("--mds", metavar="DIR", help="shards for MosaicML Streaming")] = None,
+    to_usd: Annotated[Path | None, typer.Option("--usd", metavar="DIR", help="moving meshes of cloth for USD")] = None,
+    to_obj: Annotated[
+        Path | None, typer.Option("--obj", metavar="DIR", help="meshes of cloth, an instant each")
+    ] = None,
     arrays: Annotated[str | None, typer.Option(help="arrays to take, with commas between; labels always come")] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
     where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
@@ -34,7 +39,14 @@ def export(
     gzip: Annotated[int, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = 0,
 ) -> None:
     """Write a dataset in a format that other libraries read. Nothing is overwritten."""
-    targets = {"--hdf5": to_hdf5, "--webdataset": to_webdataset, "--huggingface": to_huggingface}
+    targets = {
+        "--hdf5": to_hdf5,
+        "--webdataset": to_webdataset,
+        "--huggingface": to_huggingface,
+        "--mds": to_mds,
+        "--usd": to_usd,
+        "--obj": to_obj,
+    }
     with errors_told():
         given = {option: path for option, path in targets.items() if path is not None}
         if len(given) != 1:
@@ -42,7 +54,7 @@ def export(
         [(option, target)] = given.items()
         if gzip and option != "--hdf5":
             raise ValueError("--gzip is for --hdf5 only")
-        _require({"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"]}.get(option, []), option)
+        _require(option)
         selection = Selection.of_options(arrays, split, where)
         with DatasetReader(dataset) as reader:
             content = Content(reader, selection)
@@ -50,8 +62,7 @@ def export(
                 if option == "--hdf5":
                     to_file(content, target, on_bytes, gzip=gzip, licence=licence)
                 else:
-                    write = webdataset.write if option == "--webdataset" else huggingface.write
-                    to_directory(content, target, on_bytes, write, licence=licence)
+                    to_directory(content, target, on_bytes, _DIRECTORIES[option], licence=licence)
         skipped = len(reader) - len(content.slots)
         Console(soft_wrap=True, highlight=False).print(
             f"{content.name} is in {target}: {len(content.slots)} samples"
@@ -60,11 +71,23 @@ def export(
         )
 
 
-def _require(packages: list[str], option: str) -> None:
-    missing = [name for name in packages if find_spec(name) is None]
+_DIRECTORIES = {
+    "--webdataset": webdataset.write,
+    "--huggingface": huggingface.write,
+    "--mds": mds.write,
+    "--usd": meshes.write_usd,
+    "--obj": meshes.write_obj,
+}
+_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--mds": ["streaming"], "--usd": ["pxr"]}
+_EXTRAS = {"--mds": "mds", "--usd": "usd"}
+
+
+def _require(option: str) -> None:
+    missing = [name for name in _NEEDED.get(option, []) if find_spec(name) is None]
     if missing:
+        extra = _EXTRAS.get(option, "export")
         raise ImportError(
-            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[export]'"
+            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[{extra}]'"
         )
 
 

@@ -38,11 +38,11 @@ def consolidated(group: Mapping[str, Any]) -> dict[str, Any] | None:
     return dict(inline["metadata"])
 
 
-def check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples_per_shard: int) -> None:
+def check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples_per_file: int) -> None:
     """Raise InvalidDatasetError where the metadata of one array contradict its layout."""
     if not isinstance(metadata, dict):
         raise InvalidDatasetError(f"array {array.name}: there must be metadata, and there are none")
-    shard = [samples_per_shard, *array.shape]
+    shard = [samples_per_file, *array.shape]
     expected: dict[str, Any] = {
         "zarr_format": 3,
         "node_type": "array",

@@ -6,7 +6,7 @@ be used before and after a fork, and it can be pickled. Zeros are never made up:
 """
 
 import os
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -26,10 +26,10 @@ from stickslip_schemas.codecs import decode_sample
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import BrokenSectionError, Contents, Manifest
 from stickslip_schemas.samples import SPLITS
 from stickslip_schemas.selection import part_files
-from stickslip_schemas.tasks import FileEntry
+from stickslip_schemas.tasks import FileEntry, Rejection
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import (
@@ -81,7 +81,9 @@ class DatasetReader:
         arrays = self.selection.choose_arrays(layout(self.spec))
         self.arrays: dict[str, ArrayLayout] = {array.name: array for array in arrays}
         self._chosen: Array | None = None
-        self._files = {file.path: file for file in self.manifest.files}
+        self._contents = self._read_contents()
+        self._checked: set[int] = set()
+        """Sections of the manifest that tell the same as the labels."""
         self._shard_size = self.spec.samples_per_shard
         self._indexes: dict[tuple[str, int], Array] = {}
         self._labels: dict[str, Array] = {}
@@ -92,7 +94,6 @@ class DatasetReader:
             self.verify()
         self._check_metadata()
         self._check_slots()
-        self._check_manifested()
 
     @property
     def spec(self) -> JobSpec:
@@ -128,10 +129,11 @@ class DatasetReader:
 
     def __getstate__(self) -> dict[str, Any]:
         # The types of a spec's axes are made at run time, and pickle cannot find them by name.
-        return self.__dict__ | {"manifest": self.manifest.model_dump_json()}
+        return self.__dict__ | {"manifest": self.manifest.model_dump_json(), "_contents": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, manifest=Manifest.model_validate_json(state["manifest"]))
+        self._contents = self._read_contents()
 
     def close(self) -> None:
         """Let go of connections."""
@@ -159,10 +161,8 @@ class DatasetReader:
             array = self._array(name)
             if array.per_sample or len(array.shape) > 1:
                 raise ValueError(f"{name} is no label; the labels are {', '.join(self.label_names)}")
-            shards = range(-(-len(self) // self._shard_size))
-            values = np.concatenate([self._read_group_chunk(array, shard) for shard in shards])[: len(self)]
-            if name == "sample_key":
-                self._check_sample_keys(values)
+            numbers = range(-(-len(self) // self.manifest.samples_per_file(array)))
+            values = np.concatenate([self._read_group_chunk(array, number) for number in numbers])[: len(self)]
             values.flags.writeable = False
             self._labels[name] = values
         return self._labels[name]
@@ -175,6 +175,16 @@ class DatasetReader:
     def categories(self, name: str) -> tuple[str, ...]:
         """Return the names of the codes 0, 1, ... of a categorical label; none where it is no such label."""
         return tuple(map(str, self._array(name).categories))
+
+    def rejections(self) -> Iterator[Rejection]:
+        """Yield the rejected samples with their reasons, by slot."""
+        with self._telling_sections():
+            yield from self._contents.rejections()
+
+    def files(self) -> Iterator[FileEntry]:
+        """Yield the files that the manifest lists."""
+        with self._telling_sections():
+            yield from self._contents.files()
 
     # --- samples ----------------------------------------------------------------------------------------------
 
@@ -195,21 +205,23 @@ class DatasetReader:
             )
         for place, slot in enumerate(map(int, slots)):
             self._check_slot(slot)
-            shard, position = divmod(slot, self._shard_size)
+            self._check_section(self._contents.number_of(slot))
+            number, position = divmod(slot, self.manifest.samples_per_file(array))
             if array.per_sample:
-                self._read_sample(array, shard, position, slot, out[place])
+                self._read_sample(array, number, position, slot, out[place])
             else:
-                out[place] = self._group_chunk(array, shard)[position]
+                out[place] = self._group_chunk(array, number)[position]
 
     def verify(self) -> None:
         """Check the size and the SHA-256 of every file of the manifest; the others were checked when it was opened."""
-        part = part_files(self.manifest, self.selection, self.label)
-        for file in self.manifest.files:
-            if file.path not in part:
-                continue
+        with self._telling_sections():
+            part = part_files(self._contents, self.selection, self.label)
+        for file in part:
             if ".." in file.path.split("/"):
                 raise InvalidDatasetError(f"the manifest names {file.path}, which is not inside the dataset")
             self._check_digest(file, self.source.read(file))
+        for number in {self._contents.number_of(slot) for slot in np.flatnonzero(self.chosen).tolist()}:
+            self._check_section(number)
 
     # --- chunks -----------------------------------------------------------------------------------------------
 
@@ -253,11 +265,12 @@ class DatasetReader:
             self._chunks.move_to_end(key)
         return chunk
 
-    def _read_group_chunk(self, array: ArrayLayout, shard: int) -> Array:
-        """Return the chunk that is all of a shard group, (samples per shard, *sample shape)."""
-        first, end = shard * self._shard_size, min((shard + 1) * self._shard_size, len(self))
-        file = self._file(array.shard_path(shard), f"array {array.name}, samples {first} to {end - 1}")
-        out = np.empty((self._shard_size, *array.shape), dtype=array.dtype)
+    def _read_group_chunk(self, array: ArrayLayout, number: int) -> Array:
+        """Return the chunk that is all of a file, (samples per file, *sample shape)."""
+        size = self.manifest.samples_per_file(array)
+        first, end = number * size, min((number + 1) * size, len(self))
+        file = self._file(array.shard_path(number), f"array {array.name}, samples {first} to {end - 1}")
+        out = np.empty((size, *array.shape), dtype=array.dtype)
         data = self.source.read(file)
         self._check_digest(file, data)
         with _naming(f"array {array.name}, samples {first} to {end - 1}, {self._at(file)}"):
@@ -268,10 +281,21 @@ class DatasetReader:
         return f"{self.source}/{file.path}"
 
     def _file(self, path: str, what: str) -> FileEntry:
+        with self._telling_sections():
+            file = self._contents.file(path)
+        if file is None:
+            raise MissingFileError(f"{what}: {path} is not in the manifest of {self.source}")
+        return file
+
+    def _read_contents(self) -> Contents:
+        return Contents(self.manifest, self.source.read)
+
+    @contextmanager
+    def _telling_sections(self) -> Iterator[None]:
         try:
-            return self._files[path]
-        except KeyError:
-            raise MissingFileError(f"{what}: {path} is not in the manifest of {self.source}") from None
+            yield
+        except BrokenSectionError as error:
+            raise CorruptDataError(f"{self.source}/{error}") from error
 
     def _array(self, name: str) -> ArrayLayout:
         try:
@@ -283,7 +307,9 @@ class DatasetReader:
         if not 0 <= slot < len(self):
             raise IndexError(f"slot must be from 0 to {len(self) - 1}, and is {slot}")
         if not self.valid[slot]:
-            reasons = [item for item in self.manifest.rejections if item.slot == slot]
+            with self._telling_sections():
+                section = self._contents.section(self._contents.number_of(slot))
+            reasons = [item for item in section.rejections if item.slot == slot]
             raise RejectedSampleError(f"sample {slot} was rejected: {reasons[0].reason}, {reasons[0].message}")
         if not self.chosen[slot]:
             raise MissingFileError(
@@ -298,7 +324,7 @@ class DatasetReader:
         inline = consolidated(self._group)
         for name, array in self.arrays.items():
             found = self._read_metadata(f"{name}/{GROUP_METADATA}") if inline is None else inline.get(name)
-            check_array(found, array, sample_count=len(self), samples_per_shard=self._shard_size)
+            check_array(found, array, sample_count=len(self), samples_per_file=self.manifest.samples_per_file(array))
 
     def _read_metadata(self, path: str) -> dict[str, Any]:
         file = self._file(path, "metadata")
@@ -318,30 +344,52 @@ class DatasetReader:
             raise CorruptDataError(f"{self._at(file)} has SHA-256 {digest}, and the manifest says {file.sha256}")
 
     def _check_slots(self) -> None:
-        """Check that the manifest and the arrays `valid`, `split` and `sample_key` tell one story."""
-        self.label("sample_key")
-        rejected = sorted(item.slot for item in self.manifest.rejections)
-        if np.flatnonzero(~self.valid).tolist() != rejected:
-            raise InvalidDatasetError(f"array valid must be false at the manifest's rejections, which are {rejected}")
+        """Check that the manifest and the arrays `valid`, `split` and `sample_key` tell one story.
+
+        What sections say of their samples is checked when the first of these is read.
+        """
+        for array in self.arrays.values():
+            for number in range(-(-len(self) // self.manifest.samples_per_file(array)) if array.is_label else 0):
+                self._file(array.shard_path(number), f"array {array.name}, file {number}")
+        if not self.manifest.sections:
+            self._check_section(0)
+        if (valid_count := int(np.count_nonzero(self.valid))) != self.manifest.valid_count:
+            raise InvalidDatasetError(
+                f"valid_count of the manifest is {self.manifest.valid_count}, and array valid has {valid_count}"
+            )
         split = self.label("split")
         if split.max() >= len(SPLITS):
             raise InvalidDatasetError(f"array split must be less than {len(SPLITS)}, and there is a {split.max()}")
-        counts = Counter(SPLITS[code] for code in split[self.valid].tolist())
-        stated = {name: count for name, count in self.manifest.split_counts.items() if count}
-        if stated != dict(counts):
-            raise InvalidDatasetError(f"split_counts of the manifest are {stated}, and those of the arrays {counts}")
+        counts = np.bincount(split[self.valid], minlength=len(SPLITS)).tolist()
+        stated = [self.manifest.split_counts.get(name, 0) for name in SPLITS]
+        if stated != counts:
+            raise InvalidDatasetError(
+                f"split_counts of the manifest are {self.manifest.split_counts}, and those of the arrays "
+                f"{dict(zip(SPLITS, counts, strict=True))}"
+            )
 
-    def _check_sample_keys(self, keys: Array) -> None:
-        listed = np.frombuffer(bytes.fromhex("".join(self.manifest.sample_keys)), dtype=np.uint8).reshape(keys.shape)
-        wrong = np.flatnonzero(self.valid & (keys != listed).any(axis=1))
+    def _check_section(self, number: int) -> None:
+        """Check that a section of the manifest and the labels say the same, and that it lists what it has to."""
+        if number in self._checked:
+            return
+        with self._telling_sections():
+            section = self._contents.section(number)
+        slots = slice(section.first, section.end)
+        valid = self.valid[slots]
+        rejected = sorted(item.slot for item in section.rejections)
+        if (section.first + np.flatnonzero(~valid)).tolist() != rejected:
+            raise InvalidDatasetError(f"array valid must be false at the manifest's rejections, which are {rejected}")
+        keys = self.label("sample_key")[slots]
+        listed = np.frombuffer(bytes.fromhex("".join(section.sample_keys)), dtype=np.uint8).reshape(keys.shape)
+        wrong = section.first + np.flatnonzero(valid & (keys != listed).any(axis=1))
         if wrong.size:
             raise InvalidDatasetError(f"array sample_key is not what the manifest says of samples {wrong.tolist()}")
-
-    def _check_manifested(self) -> None:
-        """Check that the manifest lists every shard that holds a valid sample, before an epoch is half over."""
-        for shard in np.unique(np.flatnonzero(self.valid) // self._shard_size).tolist():
+        # Every shard that holds a valid sample must be listed: better now than when an epoch is half over.
+        for shard in np.unique((section.first + np.flatnonzero(valid)) // self._shard_size).tolist():
             for array in self.arrays.values():
-                self._file(array.shard_path(shard), f"array {array.name}, shard {shard}")
+                if not array.is_label:
+                    self._file(array.shard_path(shard), f"array {array.name}, shard {shard}")
+        self._checked.add(number)
 
 
 def _parse_manifest(data: bytes) -> Manifest:
@@ -349,12 +397,13 @@ def _parse_manifest(data: bytes) -> Manifest:
         manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
         raise InvalidDatasetError(f"the manifest does not hold to the contract: {error}") from None
-    if len(manifest.sample_keys) != manifest.sample_count or manifest.spec.sample_count != manifest.sample_count:
+    listed = manifest.sample_count if manifest.sections else len(manifest.sample_keys)
+    if listed != manifest.sample_count or manifest.spec.sample_count != manifest.sample_count:
         raise InvalidDatasetError(
             f"sample_count of the manifest is {manifest.sample_count}, its spec asks for {manifest.spec.sample_count} "
             f"and it lists {len(manifest.sample_keys)} sample keys"
         )
-    if manifest.valid_count != manifest.sample_count - len(manifest.rejections):
+    if not manifest.sections and manifest.valid_count != manifest.sample_count - len(manifest.rejections):
         raise InvalidDatasetError(
             f"valid_count of the manifest is {manifest.valid_count}, and {manifest.sample_count} samples less "
             f"{len(manifest.rejections)} rejections is another number"

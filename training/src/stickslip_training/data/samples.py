@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from stickslip_schemas.arrays import SAMPLE_KEY_BYTES
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from stickslip_training.arrays import Array
@@ -134,8 +133,7 @@ class SampleDataset(Dataset[Item]):
         self.reader.close()
 
     def _sample_keys(self, slots: Array) -> torch.Tensor:
-        keys = b"".join(bytes.fromhex(self.reader.manifest.sample_keys[slot]) for slot in slots.tolist())
-        return torch.frombuffer(bytearray(keys), dtype=torch.uint8).reshape(len(slots), SAMPLE_KEY_BYTES)
+        return torch.from_numpy(self.reader.label("sample_key")[slots])
 
     def _buffers(self, count: int) -> dict[str, torch.Tensor]:
         """Return a tensor (count, *sample shape) for each array, new or of the ring."""

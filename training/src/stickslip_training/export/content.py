@@ -14,7 +14,7 @@ import numpy.typing as npt
 from stickslip_schemas.arrays import ArrayLayout, describe
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.samples import SPLITS
-from stickslip_schemas.selection import Selection, is_label
+from stickslip_schemas.selection import Selection
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import CorruptDataError
@@ -74,18 +74,18 @@ class Content:
     @property
     def labels(self) -> tuple[ArrayLayout, ...]:
         """The arrays that are labels."""
-        return tuple(array for array in self.arrays if is_label(array))
+        return tuple(array for array in self.arrays if array.is_label)
 
     @property
     def others(self) -> tuple[ArrayLayout, ...]:
         """The arrays that are no labels: pictures, clips, curves, meshes."""
-        return tuple(array for array in self.arrays if not is_label(array))
+        return tuple(array for array in self.arrays if not array.is_label)
 
     def read(self, name: str, slots: npt.NDArray[np.int64]) -> Array:
         """Return an array of samples, (len(slots), *sample shape)."""
         if name == SLOT.name:
             return slots
-        if is_label(self.reader.arrays[name]):
+        if self.reader.arrays[name].is_label:
             return self.reader.label(name)[slots]
         return self.reader.read(name, slots)
 

@@ -54,7 +54,8 @@ def card(manifest: Manifest) -> bytes:
         "every file against `manifest.json` and raises an error where one is missing or damaged:",
         '```python\nfrom stickslip_training.kinds import open_samples\n\ntrain = open_samples(".", "train")\n```',
         "## How to check it",
-        "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every other file. "
+        "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every other file"
+        f"{_in_sections(manifest)}. "
         "`stickslip verify .` checks all files.",
         "## How to cite it",
         f"Write `{name}` and the SHA-256 of `manifest.json`, which stands in `manifest.sha256`.",
@@ -86,9 +87,9 @@ def _array_row(array: Any) -> tuple[str, str, str, str]:
 
 
 def _rejected(manifest: Manifest) -> str:
-    if not manifest.rejections:
+    if not manifest.rejection_counts:
         return "None: every sample of the grid is valid."
-    reasons = Counter(str(rejection.reason) for rejection in manifest.rejections)
+    reasons = Counter(manifest.rejection_counts)
     return _table(("reason", "samples"), [(reason, str(count)) for reason, count in reasons.most_common()])
 
 
@@ -123,6 +124,10 @@ def _pictures(manifest: Manifest) -> list[str]:
 def _telling_array(spec: Any) -> str:
     arrays = layout(spec)
     return next((array.name for array in arrays if array.per_sample), arrays[0].name)
+
+
+def _in_sections(manifest: Manifest) -> str:
+    return ", the most of them in its sections, `manifest/0.json` and so on" if manifest.sections else ""
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:

@@ -7,7 +7,7 @@ from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.chunks import BLOSC_LEVEL
 from stickslip_schemas.codecs import axes_order, zstd_level
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.layout import layout
+from stickslip_schemas.layout import layout, samples_per_file
 
 
 def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: int) -> dict[str, bytes]:
@@ -28,7 +28,7 @@ def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: i
         },
     )
     for array in layout(spec):
-        create_array(group, array, sample_count=sample_count, samples_per_shard=spec.samples_per_shard)
+        create_array(group, array, sample_count=sample_count, samples_per_file=samples_per_file(array, spec, FORMAT))
     with warnings.catch_warnings():
         # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs #383].
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
@@ -36,11 +36,11 @@ def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: i
     return {path: buffer.to_bytes() for path, buffer in files.items()}  # type: ignore[attr-defined]
 
 
-def create_array(group: object, array: ArrayLayout, *, sample_count: int, samples_per_shard: int) -> object:
+def create_array(group: object, array: ArrayLayout, *, sample_count: int, samples_per_file: int) -> object:
     """Create `array` in a zarr group, empty, with the codecs that the packer writes."""
     from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
-    group_shape = (samples_per_shard, *array.shape)
+    group_shape = (samples_per_file, *array.shape)
     order = axes_order(array)
     compressor: object = ZstdCodec(level=zstd_level(array), checksum=False)
     if array.is_trajectory:

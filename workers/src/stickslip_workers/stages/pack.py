@@ -1,4 +1,7 @@
-"""Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write them."""
+"""Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write them.
+
+Labels are no files yet: those of many shard groups go into one, which the last task writes.
+"""
 
 from collections.abc import Sequence
 
@@ -19,17 +22,21 @@ def run(tasks: Sequence[PackTask], store: Store) -> list[TaskResult]:
 
 
 def pack(task: PackTask, store: Store) -> PackOutput:
-    """Make the file of shard `task.shard` of every array."""
+    """Make the file of shard `task.shard` of every array, and the artifact with its labels."""
     _check_slots(task)
     shard = _Shard(task, store)
     for row, slot in enumerate(task.slots):
         shard.fill(row, slot)
     files = []
-    for array in layout(task.spec):
+    arrays = layout(task.spec)
+    labels = store.publish(encode_shard([shard.encode(array) for array in arrays if array.is_label]))
+    for array in arrays:
+        if array.is_label:
+            continue
         data = shard.encode(array)
         digest = store.publish(data)
         files.append(FileEntry(path=array.shard_path(task.shard), sha256=digest, size=len(data)))
-    return PackOutput(files=tuple(files))
+    return PackOutput(files=tuple(files), labels=labels)
 
 
 def _check_slots(task: PackTask) -> None:
@@ -56,7 +63,7 @@ class _Shard:
             array.name: [None] * size for array in self._arrays if array.per_sample
         }
         self._columns: dict[str, Array] = {
-            array.name: np.full((size, *array.shape), array.fill, dtype=array.dtype)
+            array.name: np.full((len(task.slots) if array.is_label else size, *array.shape), array.fill, array.dtype)
             for array in self._arrays
             if not array.per_sample
         }

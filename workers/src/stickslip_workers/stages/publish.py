@@ -1,26 +1,39 @@
 """Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.chunks import decode_chunk, decode_shard_index, shard_index_size
+from stickslip_schemas.arrays import FORMAT, ArrayLayout
+from stickslip_schemas.chunks import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
 from stickslip_schemas.keys import canonical_json
-from stickslip_schemas.layout import layout
+from stickslip_schemas.layout import layout, samples_per_file
 from stickslip_schemas.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
     Manifest,
     Pictures,
+    has_sections,
     seal_text,
+    section_path,
+    section_samples,
     with_manifest_digest,
 )
 from stickslip_schemas.samples import SPLITS, dataset_id
-from stickslip_schemas.store import CorruptArtifactError, Store
-from stickslip_schemas.tasks import FileEntry, PublishOutput, PublishTask, TaskResult
+from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
+from stickslip_schemas.tasks import (
+    FileEntry,
+    ManifestSection,
+    PublishOutput,
+    PublishSection,
+    PublishTask,
+    Rejection,
+    TaskResult,
+)
 
 from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, card
@@ -35,12 +48,18 @@ def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:
     """Write what makes the shards a dataset. Doing it twice, or again after a crash, gives the same bytes."""
-    _check_complete(task, store)
-    files = list(task.files)
-    metadata = metadata_files(task.spec, dataset=task.dataset, version=task.version, sample_count=len(task.sample_keys))
+    given = [PublishSection.model_validate_json(store.read(digest)) for digest in task.sections]
+    _check_complete(task, given, store)
+    labels = _Labels(task, given, store)
+    metadata = metadata_files(task.spec, dataset=task.dataset, version=task.version, sample_count=labels.count)
     group = metadata.pop(GROUP_NAME)
+    files = labels.files()
     for path, data in metadata.items():
         files.append(FileEntry(path=path, sha256=store.publish(data), size=len(data)))
+    if (picture := _preview(task, given, labels, store)) is not None:
+        files.append(FileEntry(path=PREVIEW_NAME, sha256=store.publish(picture), size=len(picture)))
+    sections = _sections(task, given, store)
+    rejections = [rejection for section in given for rejection in section.rejections]
     manifest = Manifest(
         dataset=task.dataset,
         version=task.version,
@@ -49,23 +68,23 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         builds=task.builds,
         certificate=task.certificate,
         cameras=task.spec.cameras(),
-        sample_count=len(task.sample_keys),
-        valid_count=len(task.sample_keys) - len(task.rejections),
-        pictures=_pictures(task, store),
-        split_counts=_split_counts(task, store),
-        rejections=task.rejections,
-        sample_keys=task.sample_keys,
+        sample_count=labels.count,
+        valid_count=labels.count - len(rejections),
+        pictures=_pictures(task, labels),
+        split_counts=_split_counts(labels, rejections),
+        rejection_counts=dict(sorted(Counter(str(rejection.reason) for rejection in rejections).items())),
+        sections=sections,
+        rejections=() if sections else tuple(rejections),
+        sample_keys=() if sections else tuple(key for section in given for key in section.sample_keys),
         files=tuple(files),
     )
-    if (picture := _preview(task, store)) is not None:
-        files.append(FileEntry(path=PREVIEW_NAME, sha256=store.publish(picture), size=len(picture)))
-        manifest = manifest.model_copy(update={"files": tuple(files)})
     text = card(manifest)
     files.append(FileEntry(path=CARD_NAME, sha256=store.publish(text), size=len(text)))
-    manifest = manifest.model_copy(update={"files": tuple(sorted(files, key=lambda file: file.path))})
+    listed = [file for section in given for file in section.files]
+    own = files if sections else [*files, *listed]
+    manifest = manifest.model_copy(update={"files": tuple(sorted(own, key=lambda file: file.path))})
     version = task.dataset, task.version
-    for file in manifest.files:
-        store.show(file.sha256, *version, file.path)
+    in_parallel(lambda file: store.show(file.sha256, *version, file.path), [*listed, *files, *sections])
     data = canonical_json(manifest.model_dump(mode="json")).encode()
     digest = store.publish(data)
     group = with_manifest_digest(group, digest)
@@ -74,48 +93,112 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     store.show(group_digest, *version, GROUP_NAME)
     store.show(store.publish(seal), *version, SEAL_NAME)
     store.show(digest, *version, MANIFEST_NAME)
-    return PublishOutput(manifest=digest, group=group_digest, bytes=manifest.size + len(data) + len(group) + len(seal))
+    size = sum(file.size for file in [*listed, *files, *sections]) + len(data) + len(group) + len(seal)
+    return PublishOutput(manifest=digest, group=group_digest, bytes=size)
 
 
-def _check_complete(task: PublishTask, store: Store) -> None:
+def _check_complete(task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
     """Refuse a version that lacks a file: a Zarr reader would take it for fill values and say nothing."""
     if task.dataset != dataset_id(task.spec):
         raise ValueError(f"dataset must be the id of its spec, {dataset_id(task.spec)}; got {task.dataset!r}")
-    shards = -(-len(task.sample_keys) // task.spec.samples_per_shard)
-    expected = {array.shard_path(shard) for array in layout(task.spec) for shard in range(shards)}
-    given = {file.path for file in task.files}
-    if given != expected or len(task.files) != len(given):
-        odd = sorted(given ^ expected) or ["one path twice"]
-        raise ValueError(f"files must be those of {shards} shards; missing or unknown are {odd[:3]} and so on")
-    for file in task.files:
-        if not store.holds(file.sha256, size=file.size):
-            raise CorruptArtifactError(
-                f"artifact {file.sha256} of {file.path} must have {file.size} bytes and the digest that names it"
-            )
+    bounds = [0, *(section.end for section in given)]
+    if bounds[:-1] != [section.first for section in given] or bounds[-1] != task.spec.sample_count:
+        raise ValueError(f"sections must have the samples 0 to {task.spec.sample_count - 1}, and they end at {bounds}")
+    size = task.spec.samples_per_shard
+    arrays = [array for array in layout(task.spec) if not array.is_label]
+    for section in given:
+        shards = range(section.first // size, -(-section.end // size))
+        expected = {array.shard_path(shard) for array in arrays for shard in shards}
+        paths = {file.path for file in section.files}
+        if paths != expected or len(section.files) != len(paths) or len(section.labels) != len(shards):
+            odd = sorted(paths ^ expected) or ["one path twice, or labels"]
+            raise ValueError(f"files must be those of {len(shards)} shards; missing or unknown are {odd[:3]} and so on")
+        whole = in_parallel(lambda file: store.holds(file.sha256, size=file.size), section.files)
+        for file, is_whole in zip(section.files, whole, strict=True):
+            if not is_whole:
+                raise CorruptArtifactError(
+                    f"artifact {file.sha256} of {file.path} must have {file.size} bytes and the digest that names it"
+                )
 
 
-def _split_counts(task: PublishTask, store: Store) -> dict[str, int]:
+class _Labels:
+    """The labels of all samples, by name, from what the shards have."""
+
+    def __init__(self, task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
+        self.count = task.spec.sample_count
+        self._store = store
+        self._spec = task.spec
+        self.arrays = [array for array in layout(task.spec) if array.is_label]
+        self._columns = {array.name: np.empty((self.count, *array.shape), array.dtype) for array in self.arrays}
+        size = task.spec.samples_per_shard
+        for section in given:
+            for number, data in enumerate(in_parallel(store.read, section.labels)):
+                first = section.first + number * size
+                self._fill(data, slice(first, min(first + size, self.count)))
+
+    def _fill(self, data: bytes, slots: slice) -> None:
+        index = decode_shard_index(data, len(self.arrays)).tolist()
+        for array, (offset, length) in zip(self.arrays, index, strict=True):
+            decode_chunk(data[offset : offset + length], self._columns[array.name][slots])
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        return self._columns[name]
+
+    def files(self) -> list[FileEntry]:
+        """Write the files of the labels."""
+        numbers = [
+            (array, number)
+            for array in self.arrays
+            for number in range(-(-self.count // samples_per_file(array, self._spec, FORMAT)))
+        ]
+        return in_parallel(self._file, numbers)
+
+    def _file(self, which: tuple[ArrayLayout, int]) -> FileEntry:
+        array, number = which
+        size = samples_per_file(array, self._spec, FORMAT)
+        chunk = np.full((size, *array.shape), array.fill, array.dtype)  # a chunk is always whole
+        values = self._columns[array.name][number * size : (number + 1) * size]
+        chunk[: len(values)] = values
+        data = encode_chunk(chunk)
+        return FileEntry(path=array.shard_path(number), sha256=self._store.publish(data), size=len(data))
+
+
+def _sections(task: PublishTask, given: Sequence[PublishSection], store: Store) -> tuple[FileEntry, ...]:
+    """Write the sections of the manifest; none where all of it has room in one file."""
+    if not has_sections(task.spec):
+        return ()
+    size = section_samples(task.spec)
+
+    def write(section: PublishSection) -> FileEntry:
+        own = ManifestSection(**{name: getattr(section, name) for name in ManifestSection.model_fields})
+        data = canonical_json(own.model_dump(mode="json")).encode()
+        return FileEntry(path=section_path(section.first // size), sha256=store.publish(data), size=len(data))
+
+    return tuple(in_parallel(write, given))
+
+
+def _split_counts(labels: _Labels, rejections: Sequence[Rejection]) -> dict[str, int]:
     """Count the valid samples of each split from what the shards say, and check it against the rejections."""
-    valid = _column("valid", task, store)
-    rejected = sorted(rejection.slot for rejection in task.rejections)
+    valid = labels["valid"]
+    rejected = sorted(rejection.slot for rejection in rejections)
     if np.flatnonzero(~valid).tolist() != rejected:
         raise ValueError(f"rejections must be the slots that are not valid; got {rejected[:5]} and so on")
-    counts = np.bincount(_column("split", task, store)[valid], minlength=len(SPLITS))
+    counts = np.bincount(labels["split"][valid], minlength=len(SPLITS))
     return {name: int(number) for name, number in zip(SPLITS, counts, strict=True)}
 
 
-def _pictures(task: PublishTask, store: Store) -> Pictures | None:
+def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
     """Return how good the pictures are: what their quality is worth, and what the image gate said of each sample."""
     measured = task.spec.picture_decibels()
     if measured is None:
         return None
     gate, share, direct = None, None, np.empty(0, dtype=int)
-    if any(array.name == "gate_db" for array in layout(task.spec)):
-        valid = _column("valid", task, store)
+    if any(array.name == "gate_db" for array in labels.arrays):
+        valid = labels["valid"]
         if valid.any():
-            gate = round(float(_column("gate_db", task, store)[valid].min()), 2)
-            share = round(float(_column("frame_share", task, store)[valid].mean()), 4)
-        direct = np.flatnonzero(valid & ~_column("composed", task, store))
+            gate = round(float(labels["gate_db"][valid].min()), 2)
+            share = round(float(labels["frame_share"][valid].mean()), 4)
+        direct = np.flatnonzero(valid & ~labels["composed"])
     return Pictures(
         quality=task.spec.quality,
         psnr_db=measured,
@@ -126,30 +209,20 @@ def _pictures(task: PublishTask, store: Store) -> Pictures | None:
     )
 
 
-def _preview(task: PublishTask, store: Store) -> bytes | None:
+def _preview(task: PublishTask, given: Sequence[PublishSection], labels: _Labels, store: Store) -> bytes | None:
     """Return the picture of the version; None where nothing is rendered, or valid."""
     array = pictured(task.spec)
     if array is None:
         return None
-    files = {file.path: file for file in task.files}
     size = task.spec.samples_per_shard
 
     def chunk(slot: int) -> bytes:
-        file = files[array.shard_path(slot // size)]
+        path = array.shard_path(slot // size)
+        (section,) = (section for section in given if section.first <= slot < section.end)
+        (file,) = (file for file in section.files if file.path == path)
         tail = shard_index_size(size)
         index = decode_shard_index(store.read(file.sha256, offset=file.size - tail, length=tail), size)
         offset, length = index[slot % size].tolist()
         return store.read(file.sha256, offset=offset, length=length)
 
-    valid = np.flatnonzero(_column("valid", task, store)).tolist()
-    return preview(task.spec, array, valid, chunk)
-
-
-def _column(name: str, task: PublishTask, store: Store) -> npt.NDArray[Any]:
-    """Return the values of a label, by slot, from the shards."""
-    (array,) = (array for array in layout(task.spec) if array.name == name)
-    digests = {file.path: file.sha256 for file in task.files}
-    count = len(task.sample_keys)
-    shards = range(-(-count // task.spec.samples_per_shard))
-    chunks = [bytes(decode_chunk(store.read(digests[array.shard_path(shard)]))) for shard in shards]
-    return np.frombuffer(b"".join(chunks), dtype=array.dtype)[:count]
+    return preview(task.spec, array, np.flatnonzero(labels["valid"]).tolist(), chunk)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from stickslip_schemas.states import Reason
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, in_parallel
 from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
 
 from stickslip_workers.failures import failure
@@ -32,7 +32,8 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
 
 def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
     """Return the artifacts that `task` reads and that are damaged or not in the store. Reads all of them."""
-    return tuple(digest for digest in input_digests(task) if not store.holds(digest))
+    digests = input_digests(task, store.read)
+    return tuple(digest for digest, whole in zip(digests, in_parallel(store.holds, digests), strict=True) if not whole)
 
 
 def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:

@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Request, Response
 from stickslip_schemas.keys import is_sha256
-from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
+from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.tasks import FileEntry
 
 from stickslip_services.api.files import OPENAPI_HEADERS, picture_format, serve
 from stickslip_services.api.routes.common import PageDep, coordinator_of, problem_responses
-from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets
+from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets, read_contents
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.dataset_page import dataset_page
 from stickslip_services.queue.coordinator import Coordinator
@@ -80,8 +80,7 @@ def get_manifest(dataset: str, version: Version, request: Request, coordinator: 
 def get_page(dataset: str, version: Version, coordinator: CoordinatorDep) -> Response:
     """Return the version's page for people: its acceptance rate, and where in the grid samples were lost."""
     file = _find(coordinator, dataset, version, MANIFEST_NAME)
-    manifest = Manifest.model_validate_json(coordinator.store.read(file.sha256))
-    return Response(dataset_page(manifest), media_type="text/html", headers=_INERT)
+    return Response(dataset_page(read_contents(coordinator.store, file.sha256)), media_type="text/html", headers=_INERT)
 
 
 @router.get(

@@ -16,7 +16,6 @@ from sqlalchemy import Connection
 from stickslip_schemas.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.responses import Dataset, DatasetVersion, JobDetail
 from stickslip_schemas.samples import SPLITS, grid
 from stickslip_schemas.states import JobState, TaskState
@@ -25,7 +24,7 @@ from stickslip_schemas.store import Store
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import coordinator_of
 from stickslip_services.catalog.certificates import find_certificate, list_certificates
-from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets
+from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
@@ -226,16 +225,17 @@ def get_version(request: Request, dataset: str, version: Version, coordinator: C
         sliders=_sliders(data.manifest.spec),
         histograms=_histograms(data),
         splits=SPLITS,
-        card=_listed(data.manifest, "README.md"),
-        picture=_listed(data.manifest, "preview.webp"),
+        file_count=None if data.manifest.sections else len(data.manifest.files) + 3,
+        card=_listed(data, "README.md"),
+        picture=_listed(data, "preview.webp"),
         url=coordinator.settings.url,
         **context,
     )
 
 
-def _listed(manifest: Manifest, path: str) -> str | None:
+def _listed(data: SampleData, path: str) -> str | None:
     """Return the path of a file of a version, None where it has none of that name."""
-    return next((file.path for file in manifest.files if file.path == path), None)
+    return None if data.contents.file(path) is None else path
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")
@@ -259,7 +259,7 @@ def _open(coordinator: Coordinator, dataset: str, version: int) -> tuple[Dataset
 
 @lru_cache(maxsize=8)
 def _sample_data(store: Store, manifest: str) -> SampleData:
-    return SampleData(store, Manifest.model_validate_json(store.read(manifest)))
+    return SampleData(store, read_contents(store, manifest))
 
 
 def _sliders(spec: JobSpec) -> list[dict[str, Any]]:
@@ -279,7 +279,7 @@ def _thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str,
         places = [query.get(f"{axis['name']}.{end}", "") for end in ("from", "to")]
         first, last = (int(place) if place.isdecimal() and len(place) < 9 else None for place in places)
         wanted[axis["name"]] = set(values[first or 0 : len(values) if last is None else last + 1])
-    lost = {rejection.slot: rejection for rejection in data.manifest.rejections}
+    lost = data.rejections(MOST_SAMPLES)
     chosen = [
         (slot, point)
         for slot, point in enumerate(islice(grid(data.manifest.spec), MOST_SAMPLES))
@@ -340,7 +340,7 @@ def get_sample(dataset: str, version: Version, slot: int, coordinator: Coordinat
     manifest = data.manifest
     if not 0 <= slot < manifest.sample_count:
         raise NotFoundError(f"version {version} of {dataset} has slots 0 to {manifest.sample_count - 1}, not {slot}")
-    rejection = next((item for item in manifest.rejections if item.slot == slot), None)
+    rejection = data.rejection(slot)
     return _page(
         "sample.html",
         here="datasets",

@@ -27,5 +27,5 @@ CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 def get_task(task_id: str, coordinator: CoordinatorDep) -> Response:
     """Return a task as a worker gets it. 409: what it builds on is not there yet."""
     with coordinator.database.read() as connection:
-        task = find_task(connection, task_id)
+        task = find_task(connection, task_id, coordinator.store.publish)
     return Response(task.model_dump_json(), media_type="application/json")

@@ -4,58 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
 from stickslip_blender.clips import render_clips
-from stickslip_blender.geometry import Prop, box
+from stickslip_blender.holders import Holders
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth_drag import ClothDragRender
     from stickslip_schemas.tasks import RenderTask, TaskResult
 
-HOLDER = (0.004, 0.01, 0.01)
-"""Of the clip at a corner [m]: across the cloth, and in its plane as in the simulation."""
-ROD = (0.003, 0.003, 0.5)
-"""Of the rod that the clip hangs on [m]."""
-_AIM = 0.05  # [m], the height that the lamp points to, under the holders
-
-Array = npt.NDArray[np.float64]
-
 
 def render(look: ClothDragRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a dragged cloth."""
     return render_clips(look, task, workshop, Holders)
-
-
-class Holders:
-    """Two holders at the upper corners of the cloth; the lamp follows them."""
-
-    def __init__(self, rest: npt.ArrayLike) -> None:
-        """Find the corners of a cloth whose held edge is the last one of its rest shape (V, 2) [m]."""
-        flat = np.asarray(rest, dtype=np.float64)
-        low, high = flat.min(axis=0), flat.max(axis=0)
-        corners = np.array([(low[0], high[1]), (high[0], high[1])])
-        self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
-        inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
-        self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
-        vertices, faces = _holder()
-        self.props = tuple(Prop(f"holder-{n}", vertices, faces, (0.05, 0.05, 0.052), 0.45) for n in (1, 2))
-
-    def poses(self, _instant: int, vertices: Array) -> Array:
-        """Let the holders follow the corners that they hold."""
-        poses = np.tile(np.eye(4), (2, 1, 1))
-        poses[:, :3, 3] = vertices[self._held] + self._grips
-        return poses
-
-    def aim(self, _instant: int, vertices: Array) -> Array:
-        """Return a point below the middle of the holders."""
-        return np.array([vertices[self._held, 0].mean(), 0.0, _AIM])
-
-
-def _holder() -> tuple[Array, list[tuple[int, ...]]]:
-    """Return a clip of one centimetre, about its middle, and the rod it hangs on."""
-    boxes = [box(HOLDER, (0.0, 0.0, 0.0)), box(ROD, (0.0, 0.0, ROD[2] / 2))]
-    faces = [tuple(8 * number + index for index in face) for number, (_, sides) in enumerate(boxes) for face in sides]
-    return np.concatenate([corners for corners, _ in boxes]), faces

@@ -1,0 +1,135 @@
+"""A square of cloth dropped on a stretched cloth and dragged to and fro [thesis, 4.2.2]."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from stickslip_schemas.appearance import LampNumbers
+from stickslip_schemas.arrays import NAN, ArrayLayout
+from stickslip_schemas.axes import SHORTHAND, ListAxis
+from stickslip_schemas.base import Float
+from stickslip_schemas.cloth import (
+    OWN_LOOKS,
+    PHYSICAL_AXES,
+    ClothAxes,
+    ClothRender,
+    ClothSimulation,
+    ClothSpec,
+    Lighting,
+    LightingAxis,
+    MaterialAxis,
+    Own,
+    OwnName,
+    Substrate,
+    TextureAxis,
+    codes,
+)
+from stickslip_schemas.fabrics import FabricNumbers, Material
+from stickslip_schemas.jobs import SeedRule
+from stickslip_schemas.kinds.cloth_drag import Viewpoint, ViewpointName
+
+
+class ClothOnClothAxes(ClothAxes):
+    """What a clip of cloth that is dragged over cloth depends on; `mu` is the friction between the two."""
+
+    substrate_material: MaterialAxis = Field(
+        description="fabric of the stretched cloth, a measured one, or one of your own under `materials`"
+    )
+    texture: TextureAxis = Field(
+        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+    )
+    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
+        description="camera of the rig, or one of your own under `viewpoints`"
+    )
+    lighting: LightingAxis | None = Field(
+        default=None, description="which lamps to draw from, or one of your own under `lamps`; by default `drawn`"
+    )
+
+
+_PHYSICAL_AXES = (*PHYSICAL_AXES, "substrate_material")
+
+
+class ClothOnClothSimulation(ClothSimulation):
+    """The trajectory of a cloth that is dragged over cloth: all that it depends on besides the build."""
+
+    kind: Literal["cloth_on_cloth"] = "cloth_on_cloth"
+    substrate_material: str
+    substrate_fabric: FabricNumbers | None = Field(
+        description="the numbers of a stretched cloth of the user's own; null: a measured one"
+    )
+    self_friction: float
+
+
+class ClothOnClothRender(ClothRender):
+    """How a cloth that is dragged over cloth is seen."""
+
+    kind: Literal["cloth_on_cloth"] = "cloth_on_cloth"
+
+
+class ClothOnClothSpec(ClothSpec):
+    """A square of cloth dropped on a stretched cloth and dragged to and fro [thesis, 4.2.2]."""
+
+    simulation_type = ClothOnClothSimulation
+    render_type = ClothOnClothRender
+    simulation_seeds = (SeedRule("seed", "bias", _PHYSICAL_AXES),)
+    render_seeds = (
+        SeedRule("light_seed", "light", (*_PHYSICAL_AXES, "viewpoint", "lighting")),
+        SeedRule("crease_seed", "creases", _PHYSICAL_AXES),
+    )
+    instants = 300
+    instants_per_second = 2.4
+    rig = "drag"
+    own = OWN_LOOKS | {
+        "substrate_material": Own("materials", "substrate_fabric", tuple(Material)),
+        "viewpoint": Own("viewpoints", "camera", tuple(Viewpoint)),
+        "lighting": Own("lamps", "lamp", tuple(Lighting)),
+    }
+
+    kind: Literal["cloth_on_cloth"]
+    axes: ClothOnClothAxes
+    self_friction: Float = Field(
+        default=0.5, ge=0, le=10, description="friction coefficient of each of the two with itself"
+    )
+    lamps: dict[OwnName, LampNumbers] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="lamps of your own, by the names that the axis `lighting` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        return super().simulation_settings() | {"self_friction": self.self_friction}
+
+    def render_settings(self) -> dict[str, Any] | None:
+        """Return the fields of the render document that are the same for all samples: a woven floor, for one."""
+        return (super().render_settings() or {}) | {"substrate": Substrate.cloth.value}
+
+    def arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the arrays of a dataset of cloth that is dragged over cloth."""
+        forces = (
+            ("contact_force", "force of the stretched cloth on the cloth [N]"),
+            ("holder_force", "force of the holders on the cloth [N]"),
+        )
+        bias = "what broke the symmetry: horizontal over vertical gravity during the drop"
+        return (
+            *self.clip_arrays(),
+            *self.physical_arrays(),
+            codes("substrate_material", self.names("substrate_material")),
+            ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
+            ArrayLayout(
+                "landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"
+            ),
+            ArrayLayout("bias", "float64", (), (), bias, fill=NAN),
+            ArrayLayout(
+                "least_distance",
+                "float64",
+                (),
+                (),
+                "of two pieces of cloth that do not hang together, at the ends of all steps of the solver [m]",
+                fill=NAN,
+            ),
+            *self.solver_arrays(),
+            *(self.over_time(name, "float32", (3,), ("xyz",), text, fill=NAN) for name, text in forces),
+            *self.mesh_arrays(),
+        )

@@ -1,0 +1,373 @@
+"""Jobs of many samples: planned piece by piece, by whoever is there, while others work."""
+
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import select
+from stickslip_schemas.responses import Progress
+from stickslip_schemas.states import JobState, Reason, Stage
+from stickslip_schemas.store import DirectoryStore
+from stickslip_services.cli import wording
+from stickslip_services.cli.main import app
+from stickslip_services.coordinator import make_app
+from stickslip_services.database.tables import job_tasks, jobs, samples, task_dependencies, tasks
+from stickslip_services.queue import planner
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.planning import expand
+from stickslip_services.queue.terms import Terms
+from stickslip_services.settings import Settings
+from stickslip_services.testing import (
+    BUILDS,
+    HttpApi,
+    ManualClock,
+    PretendWorker,
+    failure,
+    parsed,
+    rejection,
+    rods,
+    serving,
+    show_job,
+    start_server,
+    wait_until,
+)
+from typer.testing import CliRunner
+
+pytestmark = pytest.mark.databases
+
+PIECE = 4
+GRID = rods(gamma=(1.0, 2.0, 3.0, 4.0, 5.0), phi1=(1.0, 2.0, 3.0))
+"""15 samples in shards of 2: pieces of 4, 4, 4 and 3."""
+
+
+@pytest.fixture
+def settings(settings: Settings) -> Settings:
+    return settings.model_copy(update={"plan_samples": PIECE})
+
+
+def submit(coordinator: Coordinator, document: dict[str, Any] = GRID, **options: Any) -> str:
+    job = coordinator.submit(parsed(document), None, **options)
+    return job.id  # type: ignore[union-attr]
+
+
+def check(coordinator: Coordinator) -> None:
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+
+
+def written(coordinator: Coordinator, job_id: str) -> tuple[Any, ...]:
+    """Return the plan of a job as it is in the database, by keys: tasks, what they build on, and samples."""
+    needed = tasks.alias()
+    with coordinator.database.read() as connection:
+        job = connection.scalar(select(jobs.c.seq).where(jobs.c.id == job_id))
+        names = dict(connection.execute(select(tasks.c.seq, tasks.c.key)).all())
+        of_job = job_tasks.c.task == tasks.c.seq, job_tasks.c.job == job
+        columns = [tasks.c[name] for name in ("key", "stage", "build", "preview", "cost_group", "waiting_on")]
+        own = connection.execute(select(*columns).join(job_tasks, of_job[0]).where(of_job[1])).all()
+        edges = connection.execute(
+            select(tasks.c.key, needed.c.key)
+            .join(task_dependencies, task_dependencies.c.task == tasks.c.seq)
+            .join(needed, needed.c.seq == task_dependencies.c.depends_on)
+            .join(job_tasks, of_job[0])
+            .where(of_job[1])
+        ).all()
+        slots = connection.execute(select(samples).where(samples.c.job == job).order_by(samples.c.slot)).all()
+    return (
+        sorted(map(tuple, own)),
+        sorted(map(tuple, edges)),
+        [(row.slot, row.key, names[row.simulate_task], names.get(row.render_task), row.split) for row in slots],
+    )
+
+
+def planned(document: dict[str, Any]) -> tuple[Any, ...]:
+    """Return what `written` gives of a job of which nothing was done before."""
+    plan = expand(parsed(document), Terms(BUILDS, None), previews=24)
+    own = [
+        (key, task.stage, task.build, task.preview, task.cost_group, len(task.depends_on))
+        for key, task in plan.tasks.items()
+    ]
+    edges = [(key, needed) for key, task in plan.tasks.items() for needed in task.depends_on]
+    return sorted(own), sorted(edges), [sample[:-1] for sample in plan.samples]
+
+
+RANGE = {"type": "linspace", "start": 1.0, "stop": 2.0, "num": 9}
+GRIDS = {
+    "product": GRID,
+    "zip": rods() | {"combine": "zip", "axes": dict.fromkeys(("gamma", "phi0", "phi1"), RANGE)},
+    "without pictures": GRID | {"views": None},
+    "cloth": {
+        "kind": "cloth_drag",
+        "axes": {
+            "material": "gray-interlock",
+            "mu": [0.1, 0.2, 0.3],
+            "texture": ["dots", "stripes"],
+            "viewpoint": ["left", "right"],
+        },
+        "samples_per_shard": 3,
+        "allow_uncertified": True,
+    },
+}
+
+
+@pytest.fixture
+def worker(coordinator: Coordinator) -> PretendWorker:
+    return PretendWorker(coordinator, coordinator.store, kinds=("rod_hang", "cloth_drag")).register()
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_plan_in_pieces_is_the_plan_made_at_once(coordinator: Coordinator, worker: PretendWorker, name: str) -> None:
+    job_id = submit(coordinator, GRIDS[name])
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.progress.planned, shown.progress.total) == (JobState.planning, 0, 0)
+    seen = []
+    while coordinator.planner.step():
+        check(coordinator)
+        seen.append(show_job(coordinator, job_id).progress.planned)
+    assert seen[-1] == shown.sample_count
+    assert len(seen) > 1
+    assert seen == sorted(set(seen))
+    assert show_job(coordinator, job_id).state is JobState.queued
+    assert written(coordinator, job_id) == planned(GRIDS[name])
+
+
+def test_a_small_job_is_planned_while_the_request_waits(coordinator: Coordinator, worker: PretendWorker) -> None:
+    shown = show_job(coordinator, submit(coordinator, rods()))
+    assert (shown.state, shown.progress.planned, shown.progress.total) == (JobState.queued, 4, 11)
+    assert not coordinator.planner.step()
+
+
+def test_what_is_planned_runs_meanwhile_and_so_do_other_jobs(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    other = submit(coordinator, rods(gamma=(9.0,)))
+    coordinator.planner.step()
+    assert worker.work() == (4 + 4 + 2) + (2 + 2 + 1 + 1)
+    assert show_job(coordinator, other).state is JobState.succeeded
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.progress.done, shown.progress.total, shown.progress.planned) == (
+        JobState.planning,
+        10,
+        10,
+        4,
+    )
+    assert shown.started_at is not None
+    assert shown.progress.eta is None
+    coordinator.plan_large_jobs()
+    check(coordinator)
+    worker.work()
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.progress.done, shown.progress.total) == (JobState.succeeded, 39, 39)
+    assert shown.progress.stages[Stage.simulate].cached == 0
+    check(coordinator)
+
+
+def test_a_large_job_that_was_made_before_runs_nothing(coordinator: Coordinator, worker: PretendWorker) -> None:
+    first = submit(coordinator)
+    coordinator.plan_large_jobs()
+    worker.work()
+    again = submit(coordinator)
+    coordinator.plan_large_jobs()
+    assert worker.lease() == ()
+    coordinator.check_made_datasets()
+    shown = show_job(coordinator, again)
+    assert shown.state is JobState.succeeded
+    assert shown.dataset == show_job(coordinator, first).dataset
+    assert {
+        stage: (counted.cached, sum(counted.counts.values())) for stage, counted in shown.progress.stages.items()
+    } == {Stage.simulate: (15, 15), Stage.render: (15, 15), Stage.pack: (8, 8), Stage.publish: (1, 1)}
+    check(coordinator)
+
+
+def test_rejections_of_earlier_pieces_reach_later_ones(coordinator: Coordinator, worker: PretendWorker) -> None:
+    """A simulation that has slots in two pieces is rejected before the second one is planned."""
+    worker.judge = lambda task: rejection() if task.stage == "simulate" else None
+    job_id = submit(coordinator, GRIDS["cloth"])
+    coordinator.planner.step()  # slots 0 to 5; slots 4 to 7 share a simulation
+    worker.work()
+    coordinator.plan_large_jobs()
+    check(coordinator)
+    worker.work()
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 12)
+
+
+def test_it_is_cancelled_half_planned_and_finished_by_another_job(
+    coordinator: Coordinator, worker: PretendWorker
+) -> None:
+    job_id = submit(coordinator)
+    coordinator.planner.step()
+    coordinator.cancel(job_id)
+    check(coordinator)
+    assert not coordinator.planner.step()
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.progress.planned) == (JobState.cancelled, 4)
+    assert worker.lease() == ()
+    again = submit(coordinator)
+    coordinator.plan_large_jobs()
+    check(coordinator)
+    worker.work()
+    assert show_job(coordinator, again).state is JobState.succeeded
+    check(coordinator)
+
+
+def test_a_pause_stops_the_planning_too(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    coordinator.planner.step()
+    coordinator.pause(job_id)
+    assert not coordinator.planner.step()
+    assert worker.lease() == ()
+    assert coordinator.resume(job_id).state is JobState.planning
+    coordinator.plan_large_jobs()
+    assert written(coordinator, job_id) == planned(GRID)
+    check(coordinator)
+
+
+def test_a_task_that_fails_ends_the_planning(coordinator: Coordinator, worker: PretendWorker) -> None:
+    job_id = submit(coordinator)
+    coordinator.planner.step()
+    for _ in range(coordinator.settings.max_tries):
+        worker.report((worker.lease(simulate=1)[0], failure(Reason.internal_error)))
+        coordinator.clock.advance(10)  # type: ignore[attr-defined]
+        coordinator.sweep()
+    assert show_job(coordinator, job_id).state is JobState.failed
+    assert not coordinator.planner.step()
+    check(coordinator)
+
+
+def test_tasks_that_were_set_aside_do_not_end_a_job_that_is_being_planned(
+    coordinator: Coordinator, worker: PretendWorker
+) -> None:
+    job_id = submit(coordinator)
+    coordinator.planner.step()
+    for _ in range(coordinator.settings.max_tries):
+        (bad, *others) = worker.lease(simulate=1)
+        assert not others
+        worker.report((bad, failure(Reason.renderer_crash)))
+        coordinator.clock.advance(10)  # type: ignore[attr-defined]
+        coordinator.sweep()
+    worker.work()
+    assert show_job(coordinator, job_id).state is JobState.planning
+    coordinator.plan_large_jobs()
+    worker.work()
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.reason) == (JobState.failed, Reason.quarantined)
+    check(coordinator)
+
+
+def test_a_plan_that_cannot_be_made_fails_the_job_and_says_why(
+    coordinator: Coordinator, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = submit(coordinator)
+    coordinator.planner.step()
+
+    def broken(*_: Any, **__: Any) -> Any:
+        raise ValueError("the axis bends")
+
+    monkeypatch.setattr(planner, "pieces", broken)
+    coordinator.planner = planner.Planner(
+        coordinator.database, coordinator.clock, coordinator.settings, coordinator.bell.ring
+    )
+    with coordinator.database.write() as connection:
+        planner.release_claims(connection)
+    assert coordinator.planner.step()
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.reason) == (JobState.failed, Reason.internal_error)
+    assert shown.message == "planning it failed after 4 of 15 samples: the axis bends"
+    assert worker.lease() == ()
+    check(coordinator)
+
+
+def test_another_coordinator_goes_on_when_the_first_one_has_died(
+    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job_id = submit(coordinator)
+    coordinator.planner.step()
+    other = planner.Planner(coordinator.database, clock, coordinator.settings, coordinator.bell.ring)
+    assert not other.step()  # the job is claimed
+    clock.advance(coordinator.settings.lease_seconds)
+    assert other.step()
+    coordinator.planner.step()  # back from the dead: it does not plan what is planned
+    while other.step():
+        check(coordinator)
+    assert written(coordinator, job_id) == planned(GRID)
+
+
+def test_jobs_wait_for_the_first_worker_and_are_planned_then(coordinator: Coordinator) -> None:
+    job_id = submit(coordinator)
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.reason) == (JobState.queued, Reason.waiting_for_worker)
+    assert not coordinator.planner.step()
+    PretendWorker(coordinator, coordinator.store).register()
+    shown = show_job(coordinator, job_id)
+    assert (shown.state, shown.reason, shown.message) == (JobState.planning, None, "")
+    coordinator.plan_large_jobs()
+    assert written(coordinator, job_id) == planned(GRID)
+    check(coordinator)
+
+
+def test_urgent_jobs_are_planned_first(coordinator: Coordinator, worker: PretendWorker) -> None:
+    first = submit(coordinator)
+    urgent = submit(coordinator, GRID | {"seed": 1}, priority=5)
+    coordinator.planner.step()
+    assert [show_job(coordinator, job).progress.planned for job in (first, urgent)] == [0, 4]
+
+
+def test_a_coordinator_that_is_killed_while_it_plans_goes_on_after_its_start(
+    tmp_path: Path, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STICKSLIP_PLAN_SAMPLES", "200")
+    axes = {
+        "gamma": {"type": "linspace", "start": 1.0, "stop": 9.0, "num": 20},
+        "phi0": {"type": "linspace", "start": 1.0, "stop": 9.0, "num": 20},
+        "phi1": {"type": "linspace", "start": 1.0, "stop": 9.0, "num": 20},
+    }
+    document = {"kind": "rod_hang", "axes": axes}
+    data = tmp_path / "data"
+    seen, job_id = [0], ""
+    for _ in range(4):
+        server = start_server(data)
+        with httpx.Client(base_url=server.url, trust_env=False) as client:
+            if not job_id:
+                server.worker()
+                job_id = client.post("/v1/jobs", json=document).raise_for_status().json()["id"]
+            wait_until(lambda: _planned(client, job_id) > seen[-1])  # noqa: B023  # it is over when the block is
+            seen.append(_planned(client, job_id))
+        server.process.kill()
+        server.stop()
+    assert seen[-1] < 8000, "it was planned before it could be killed"
+    coordinator = Coordinator(Settings.chosen(data=data))
+    coordinator.start()
+    coordinator.plan_large_jobs()
+    check(coordinator)
+    assert written(coordinator, job_id) == planned(document)
+    coordinator.close()
+
+
+def _planned(client: httpx.Client, job_id: str) -> int:
+    count: int = client.get(f"/v1/jobs/{job_id}").json()["progress"]["planned"]
+    return count
+
+
+def test_people_see_how_far_the_plan_is(tmp_path: Path, database: str, clock: ManualClock) -> None:
+    with serving(make_app(Settings(data=tmp_path / "data", durable=False, plan_samples=PIECE), clock=clock)) as url:
+        key = (tmp_path / "data" / "worker-key").read_text().strip()
+        worker = PretendWorker(HttpApi(url, key), DirectoryStore(tmp_path / "data" / "store")).register()
+        with httpx.Client(base_url=url, trust_env=False) as client:
+            answer = client.post("/v1/jobs", json=GRID)
+            job = answer.raise_for_status().json()
+            assert (answer.status_code, job["state"], job["progress"]["planned"]) == (202, "planning", 0)
+            page = client.get(f"/jobs/{job['id']}").text
+            wait_until(lambda: _planned(client, job["id"]) == 15)
+            assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
+        assert "0 of 15 samples are planned" in page
+        worker.work()
+        assert CliRunner().invoke(app, ["watch", job["id"], "--url", url]).exit_code == 0
+        states = CliRunner().invoke(app, ["watch", job["id"], "--url", url]).stdout
+        assert states.index("planning") < states.index("queued") < states.index("succeeded")
+
+
+def test_progress_in_words() -> None:
+    progress = Progress(done=2, total=9, planned=10_000, stages={}, eta=None)
+    assert wording.planned(progress, 1_000_000) == "10,000 of 1,000,000 samples are planned"
+    assert wording.planned(progress, 10_000) == ""

@@ -1,0 +1,51 @@
+"""Cloth that is dragged over cloth: from parameters to the artifact of one trajectory."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from stickslip_schemas.store import Store
+from stickslip_schemas.tasks import TaskResult
+
+from stickslip_workers.cloth import fabric_of, kernel_level, named_fabric, result_of
+from stickslip_workers.kinds import Kind
+from stickslip_workers.progress import tell
+
+if TYPE_CHECKING:
+    from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothSimulation
+
+
+def _simulate(simulations: Sequence["ClothOnClothSimulation"], store: Store) -> list[TaskResult]:
+    """Simulate one after the other: each takes minutes, and gets an artifact of its own."""
+    return [_simulate_one(simulation, store) for simulation in simulations]
+
+
+def _simulate_one(simulation: "ClothOnClothSimulation", store: Store) -> TaskResult:
+    from stickslip_sim_core.scenes.cloth_on_cloth import drop_on_cloth  # here, so that packing needs no compiled core
+
+    fabric = fabric_of(simulation)
+    run = drop_on_cloth(
+        fabric,
+        named_fabric(simulation.substrate_material, simulation.substrate_fabric),
+        simulation.mu,
+        self_friction=simulation.self_friction,
+        preset=simulation.preset.value,
+        vertices=simulation.mesh,
+        frames=simulation.frames,
+        seed=simulation.seed,
+        on_frame=tell,
+    )
+    forces = {
+        "contact_force": np.asarray(run.contact_force, dtype=np.float32),
+        "holder_force": np.asarray(run.holder_force, dtype=np.float32),
+    }
+    labels = {
+        "bias_side": int(run.bias_side),
+        "landed_side": int(run.landed_side),
+        "bias": float(run.bias),
+        "least_distance": float(run.least_distance),
+    }
+    return result_of(simulation, fabric, run, store, record=forces, labels=labels)
+
+
+KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth", kernel=kernel_level)
