@@ -8,7 +8,7 @@ from stickslip_schemas.cloth import KERNELS
 from stickslip_schemas.fabrics import Material
 from stickslip_schemas.keys import canonical_json, content_key, derived_seed
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.kinds.cloth_drag import ClothDragRender, Viewpoint
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.samples import (
@@ -23,6 +23,7 @@ from stickslip_schemas.samples import (
     split_of,
 )
 from stickslip_schemas.textures import Texture
+from stickslip_schemas.viewpoints import Viewpoint
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
