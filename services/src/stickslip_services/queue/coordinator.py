@@ -5,17 +5,18 @@ What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 
 import logging
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import InitVar, dataclass, field
 
 from sqlalchemy import Connection
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store, is_unavailable, open_store
-from stickslip_schemas.tasks import PublishOutput
+from stickslip_schemas.tasks import PublishOutput, PublishTask
 from stickslip_schemas.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -115,6 +116,8 @@ class Coordinator:
     _is_closing: bool = field(init=False, default=False)
     _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
     """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
+    _lists: dict[str, tuple[Sha256, ...]] = field(init=False, default_factory=dict)
+    """The lists that tasks were given to publish by. Those that a restart forgets, `gc` finds."""
 
     def __post_init__(self, given_clock: Clock | None) -> None:
         self.database = connect(self.settings)
@@ -304,6 +307,7 @@ class Coordinator:
         # What a task builds on has ended: nobody needs to be kept from writing while the tasks are composed.
         with self.database.read() as connection:
             leases = compose_leases(connection, grants, self.store.publish)
+        self._lists |= {lease.task_id: lease.task.sections for lease in leases if isinstance(lease.task, PublishTask)}
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
@@ -342,7 +346,15 @@ class Coordinator:
             fail_tries(book, charged, self.settings)
             for consumer, digests in taken.damaged:
                 make_again(book, consumer, digests)
+        for verdict in taken.verdicts:
+            if verdict.verdict == "accepted" and verdict.task_id in versions:
+                self._delete_lists(verdict.task_id)
         return ReportAnswer(verdicts=taken.verdicts)
+
+    def _delete_lists(self, task_id: str) -> None:
+        with suppress(OSError):
+            for digest in self._lists.pop(task_id, ()):
+                self.store.delete(digest)
 
     def _checked(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:
         """Return the report, or a failure where the store does not have what it says; read manifests on the way."""
