@@ -39,6 +39,7 @@ from stickslip_services.database.opening import connect
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.journal import note
 from stickslip_services.keys import admit_local_worker
+from stickslip_services.projects import check_quota, this_project
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.eta_watch import EtaWatch
@@ -155,7 +156,10 @@ class Coordinator:
     # --- users ----------------------------------------------------------------------------------------------------
 
     def submit(self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0) -> JobDetail | Replay:
-        """Make a job of a spec; with a key that has been here before, return the first answer."""
+        """Make a job of a spec; with a key that has been here before, return the first answer.
+
+        Raises QuotaExceededError where the project that asks has as much in flight as it may have.
+        """
         check_textures(self.store, spec)
         with collector_at_rest():
             return self._submit(spec, idempotency_key, priority)
@@ -168,6 +172,7 @@ class Coordinator:
             with self.database.read() as connection:
                 if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
                     return replay
+                check_quota(connection, this_project(), spec.sample_count)
                 terms = terms_for(connection, spec)
             at_once = terms is not None and spec.sample_count <= self.settings.plan_samples
             if terms is not None and at_once and planned_for != terms:
@@ -177,9 +182,10 @@ class Coordinator:
                     return replay
                 if terms_for(connection, spec) != terms:
                     continue  # a worker with other builds has registered in between, or a certificate
+                check_quota(connection, this_project(), spec.sample_count)
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, priority=priority)
+                    job = insert_job(book, spec, priority=priority, project=this_project())
                     self._enqueue(book, job, terms, plan if at_once else None)
                 shown = self.show(connection, job)
                 note(

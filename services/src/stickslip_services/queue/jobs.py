@@ -296,6 +296,7 @@ def _shown(
             state=row.state,
             reason=row.reason,
             message=row.message,
+            project=row.project,
             priority=row.priority,
             created_at=as_datetime(row.created_at),
             started_at=None if row.started_at is None else as_datetime(row.started_at),

@@ -1,8 +1,9 @@
 """Leases: who may run which task, and until when.
 
 A lease is (worker, token); the token of a task increments at each lease, so that a worker that lost its lease is told
-from the one that has it. Between jobs the next task goes to the job of the highest priority, and of those to the one
-that has the fewest tasks on lease: a small job does not wait behind a big one, and jobs of one size share evenly.
+from the one that has it. The next task goes to the project that has the fewest tasks on lease; of its jobs, to the one
+of the highest priority, and of those to the one that has the fewest tasks on lease: a small job does not wait behind a
+big one, jobs of one size share evenly, and no project can take all workers by its priorities or its number of jobs.
 Within a job and stage the order is that of the slots, so that shards fill up one after the other. How many tasks of
 each stage run is the dispatcher's choice.
 """
@@ -23,6 +24,7 @@ from stickslip_services.queue.costs import limit_seconds, long_groups, read_cost
 from stickslip_services.queue.eta import Cost, Group
 from stickslip_services.queue.ids import task_id, task_key
 from stickslip_services.queue.ledger import (
+    LIVE,
     RUNNABLE,
     HeldTask,
     Ledger,
@@ -75,6 +77,7 @@ _READY_TASKS = Prepared(
 _JOBS_WITH_PENDING = Prepared(
     select(
         job_counts.c.job,
+        jobs.c.project,
         jobs.c.priority,
         func.coalesce(
             func.sum(job_counts.c.count).filter(job_counts.c.state.in_((TaskState.leased, TaskState.running))), 0
@@ -82,8 +85,18 @@ _JOBS_WITH_PENDING = Prepared(
     )
     .join(jobs, jobs.c.seq == job_counts.c.job)
     .where(jobs.c.state.in_(RUNNABLE), job_counts.c.stage == bindparam("b_stage"))
-    .group_by(job_counts.c.job, jobs.c.priority)
+    .group_by(job_counts.c.job, jobs.c.project, jobs.c.priority)
     .having(func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.pending) > 0)
+)
+_ON_LEASE = Prepared(
+    select(jobs.c.project, func.sum(job_counts.c.count))
+    .join(jobs, jobs.c.seq == job_counts.c.job)
+    .where(
+        jobs.c.state.in_(LIVE),
+        job_counts.c.stage == bindparam("b_stage"),
+        job_counts.c.state.in_((TaskState.leased, TaskState.running)),
+    )
+    .group_by(jobs.c.project)
 )
 _LEASE = Prepared(
     update(tasks)
@@ -186,9 +199,9 @@ def _pick(
     costs: Mapping[Group, Cost],
     at_most: float | None,
 ) -> list[_Ready]:
-    """Choose ready tasks of a stage, one at a time: of the highest priority, from the job with the fewest on lease."""
-    queue: list[tuple[int, int, int, list[_Ready]]] = []  # -priority, tasks on lease, job, its tasks in reverse order
-    for job, priority, on_lease in _jobs_with_pending(connection, stage):
+    """Choose ready tasks of a stage, one at a time; see the module for which comes next."""
+    queues: dict[str, list[_Waiting]] = {}
+    for job, project, priority, on_lease in _jobs_with_pending(connection, stage):
         ready = [
             task
             for kind in worker.kinds
@@ -197,21 +210,40 @@ def _pick(
             )
         ]
         if ready:
-            queue.append((-priority, on_lease, job, ready[::-1]))
-    heapq.heapify(queue)
+            queues.setdefault(project, []).append((-priority, on_lease, job, ready[::-1]))
+    for queue in queues.values():
+        heapq.heapify(queue)
+    on_lease_of = dict(_ON_LEASE.tuples(connection, {"b_stage": stage})) if len(queues) > 1 else {}
+    projects = [(on_lease_of.get(name, 0), name) for name in queues]
+    heapq.heapify(projects)
     picked: list[_Ready] = []
-    while queue and len(picked) < count:
-        order, on_lease, job, ready = queue[0]
-        picked.append(ready.pop())
-        if ready:
-            heapq.heapreplace(queue, (order, on_lease + 1, job, ready))
+    while projects and len(picked) < count:
+        on_lease, name = projects[0]
+        picked.append(_pop(queues[name]))
+        if queues[name]:
+            heapq.heapreplace(projects, (on_lease + 1, name))
         else:
-            heapq.heappop(queue)
+            heapq.heappop(projects)
     return picked
 
 
-def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int, int]]:
-    """Return (job, priority, number of tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
+_Waiting = tuple[int, int, int, list[_Ready]]
+"""-priority, tasks on lease, job, its ready tasks in reverse order."""
+
+
+def _pop(queue: list[_Waiting]) -> _Ready:
+    """Take the next task from the jobs of a project."""
+    order, on_lease, job, ready = queue[0]
+    task = ready.pop()
+    if ready:
+        heapq.heapreplace(queue, (order, on_lease + 1, job, ready))
+    else:
+        heapq.heappop(queue)
+    return task
+
+
+def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, str, int, int]]:
+    """Return (job, project, priority, tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
     return _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage})
 
 
