@@ -4,11 +4,13 @@ What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 """
 
 import logging
+import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import InitVar, dataclass, field
 
 from sqlalchemy import Connection
+from stickslip_schemas import tracing
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import Sha256
@@ -61,6 +63,7 @@ from stickslip_services.queue.jobs import (
     resume_job,
     runnable_jobs,
     show_job,
+    trace_of,
     unplanned_jobs,
 )
 from stickslip_services.queue.leasing import (
@@ -155,16 +158,27 @@ class Coordinator:
 
     # --- users ----------------------------------------------------------------------------------------------------
 
-    def submit(self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0) -> JobDetail | Replay:
+    def submit(
+        self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0, traceparent: str | None = None
+    ) -> JobDetail | Replay:
         """Make a job of a spec; with a key that has been here before, return the first answer.
+
+        Where spans are exported, all of the job hangs below one, and this one below `traceparent` of who asks.
 
         Raises QuotaExceededError where the project that asks has as much in flight as it may have.
         """
         check_textures(self.store, spec)
-        with collector_at_rest():
-            return self._submit(spec, idempotency_key, priority)
+        with (
+            collector_at_rest(),
+            tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count) as span,
+        ):
+            answer = self._submit(spec, idempotency_key, priority, span.traceparent)
+            span.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
+            return answer
 
-    def _submit(self, spec: JobSpec, idempotency_key: str | None, priority: int) -> JobDetail | Replay:
+    def _submit(
+        self, spec: JobSpec, idempotency_key: str | None, priority: int, trace: str | None
+    ) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
         planned_for: Terms | None = None
@@ -185,7 +199,7 @@ class Coordinator:
                 check_quota(connection, this_project(), spec.sample_count)
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, priority=priority, project=this_project())
+                    job = insert_job(book, spec, priority=priority, project=this_project(), trace=trace)
                     self._enqueue(book, job, terms, plan if at_once else None)
                 shown = self.show(connection, job)
                 note(
@@ -333,6 +347,7 @@ class Coordinator:
     def report(self, batch: ReportBatch) -> ReportAnswer:
         """Take results in."""
         versions: dict[str, ManifestSummary] = {}
+        began = time.monotonic()
         reports = [self._checked(report, versions) for report in batch.reports]
         with self._book() as book:
             worker = find_worker(book.connection, batch.worker_id)
@@ -355,7 +370,14 @@ class Coordinator:
         for verdict in taken.verdicts:
             if verdict.verdict == "accepted" and verdict.task_id in versions:
                 self._delete_lists(verdict.task_id)
+                self._trace_commit(verdict.task_id, time.monotonic() - began)
         return ReportAnswer(verdicts=taken.verdicts)
+
+    def _trace_commit(self, task_id: str, seconds: float) -> None:
+        if tracing.is_on():
+            with self.database.read() as connection:
+                trace = trace_of(connection, task_id)
+            tracing.record("commit", parent=trace, seconds=seconds, task=task_id)
 
     def _delete_lists(self, task_id: str) -> None:
         with suppress(OSError):

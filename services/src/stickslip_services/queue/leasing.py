@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
+from stickslip_schemas import tracing
 from stickslip_schemas.states import Stage, TaskState
 from stickslip_schemas.worker_api import Lease, LeaseState
 
@@ -23,6 +24,7 @@ from stickslip_services.queue.compose import Publish, StoredTask, compose_tasks,
 from stickslip_services.queue.costs import limit_seconds, long_groups, read_costs
 from stickslip_services.queue.eta import Cost, Group
 from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.queue.jobs import traces_of
 from stickslip_services.queue.ledger import (
     LIVE,
     RUNNABLE,
@@ -43,6 +45,7 @@ _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # in the word
 @dataclass(frozen=True, slots=True)
 class _Ready:
     seq: int
+    job: int
     key: bytes
     stage: Stage
     kind: str
@@ -136,6 +139,7 @@ class Grant:
     """A task that has been leased and is still to be composed."""
 
     task: StoredTask
+    job: int
     task_id: str
     token: int
     attempt: int
@@ -161,6 +165,7 @@ def grant_leases(
     grants = [
         Grant(
             task=StoredTask(task.seq, task.stage, task.payload, task.preview),
+            job=task.job,
             task_id=task_id(task.stage, task.key),
             token=task.token + 1,
             attempt=task.attempts + 1,
@@ -179,12 +184,14 @@ def grant_leases(
 def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
     """Return what the worker is told of the tasks that it has been granted; see `compose_tasks`."""
     composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+    traces = traces_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
     return tuple(
         Lease(
             task_id=grant.task_id,
             token=grant.token,
             attempt=grant.attempt,
             limit_seconds=grant.limit_seconds,
+            trace=traces.get(grant.job),
             task=composed[grant.task.seq],
         )
         for grant in grants
@@ -270,6 +277,7 @@ def _ready_tasks(
     return [
         _Ready(
             seq=row.seq,
+            job=job,
             key=row.key,
             stage=stage,
             kind=kind,
