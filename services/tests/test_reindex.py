@@ -11,6 +11,7 @@ from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.states import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.cli import app
+from stickslip_services.coordinator import main
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.database.sqlite import SqliteDatabase
@@ -62,6 +63,16 @@ def test_a_lost_database_is_not_taken_for_a_new_one(settings: Settings, made: di
     assert "is gone: run `stickslip reindex --data" in sentence
     up = CliRunner().invoke(app, ["up", "--data", str(settings.data), "--port", "0"])
     assert (up.exit_code, "stickslip reindex" in up.stderr) == (1, True)
+
+
+def test_a_database_is_migrated_before_a_coordinator_starts(
+    settings: Settings, made: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--migrate", "--data", str(tmp_path / "new")]) == 0
+    assert check(Settings(data=tmp_path / "new"), Role.coordinator)
+    assert main(["--migrate", "--data", str(settings.data)]) == 2  # or the next coordinator would not miss anything
+    assert "is gone: run `stickslip reindex --data" in capsys.readouterr().err
+    assert not settings.database_path.exists()
 
 
 def test_datasets_are_found_again(settings: Settings, made: dict[str, object], tmp_path: Path) -> None:

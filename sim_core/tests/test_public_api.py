@@ -27,6 +27,7 @@ def test_exported_names() -> None:
         "box",
         "build_info",
         "drop_and_drag",
+        "drop_on_cloth",
         "fabric",
         "fabric_names",
         "fit_natural_curvature",

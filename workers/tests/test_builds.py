@@ -29,8 +29,7 @@ SIMULATIONS = {
         "mesh": 5,
         "frames": 2,
     }
-    | {"seed": 1, "substrate_material": "my-felt", "self_friction": 0.5}
-    | {"substrate_fabric": {"density": 0.3, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}},
+    | {"seed": 1, "substrate_material": "11oz-black-denim", "substrate_fabric": None, "self_friction": 0.5},
 }
 
 _RUN = """

@@ -19,13 +19,14 @@ from stickslip_schemas.chunks import encode_trajectory
 from stickslip_schemas.cloth import PICTURE_DECIBELS
 from stickslip_schemas.codecs import encode_clip
 from stickslip_schemas.jobs import Quality
-from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec, Viewpoint
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.manifest import Manifest, Pictures
 from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
+from stickslip_schemas.viewpoints import Viewpoint
 from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module
@@ -72,6 +73,7 @@ class Core:
         fabric: Fabric,
         mu: float,
         *,
+        self_friction: float | None,
         preset: str,
         vertices: int,
         frames: int,
@@ -79,7 +81,7 @@ class Core:
         on_frame: Callable[[int, int], None],
     ) -> Run:
         on_frame(frames, frames)
-        self.calls.append((fabric.name, mu, preset, vertices, frames, seed))
+        self.calls.append((fabric.name, mu, self_friction, preset, vertices, frames, seed))
         line = np.linspace(-0.1, 0.1, vertices)
         rest = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
         number = np.arange(vertices**2).reshape(vertices, vertices)
@@ -116,13 +118,14 @@ def _task(**changes: Any) -> SimulateTask:
         "mesh": SIDE,
         "frames": 300,
         "seed": 7,
+        "self_friction": 0.5,
     }
     return SimulateTask(simulation=ClothDragSimulation(**(cloth | changes)))
 
 
 def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectoryStore) -> None:
     (result,) = run_tasks([_task()], store)
-    assert core.calls == [("gray-interlock", 0.25, "fast", SIDE, 300, 7)]
+    assert core.calls == [("gray-interlock", 0.25, 0.5, "fast", SIDE, 300, 7)]
     assert result.outcome == "succeeded"
     assert result.output.labels == {
         "areal_density": fabric("gray-interlock").density,

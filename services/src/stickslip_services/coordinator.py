@@ -175,12 +175,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
     parser.add_argument("--reindex", action="store_true", default=None, help="find the datasets in the store, and end")
+    parser.add_argument("--migrate", action="store_true", default=None, help="bring the database up to date, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
     if chosen.pop("openapi", False):
         sys.stdout.write(openapi_text())
         return 0
     descriptor, is_reindexing = chosen.pop("fd", None), chosen.pop("reindex", False)
+    is_migrating = chosen.pop("migrate", False)
     try:
         settings = Settings.chosen(**chosen)
     except SettingsError as error:
@@ -190,6 +192,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if is_reindexing:
             return reindex(settings)
+        if is_migrating:
+            check_database(settings, Role.visitor, with_store=True)
+            with opened(settings, Role.visitor):
+                return 0
         check_database(settings, Role.coordinator, with_store=True)
         # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
         with locked(settings.data) if descriptor is None else nullcontext():

@@ -2,6 +2,7 @@
 
 import gc
 import hashlib
+import importlib
 import json
 import subprocess
 import sys
@@ -173,6 +174,48 @@ def test_mds_is_the_source(source: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert (target / "source-manifest.json").read_bytes() == (source.root / "manifest.json").read_bytes()
 
 
+def test_usd_is_the_source(clips: Any, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr", reason="usd-core is not installed: pip install 'stickslip-training[usd]'")
+    importlib.import_module("pxr.UsdGeom")
+    export(clips, "--usd", tmp_path / "out", "--split", "train")
+    slots = np.flatnonzero(clips.arrays["valid"] & (clips.arrays["split"] == 0))
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.usdc")) == [f"{slot:08d}.usdc" for slot in slots]
+    for slot in slots[:2]:
+        stage = usd.Usd.Stage.Open(str(tmp_path / "out" / f"{slot:08d}.usdc"))
+        mesh = usd.UsdGeom.Mesh(stage.GetPrimAtPath("/cloth"))
+        wanted = clips.arrays["positions"][slot]
+        assert stage.GetEndTimeCode() == len(wanted) - 1
+        found = np.stack([np.asarray(mesh.GetPointsAttr().Get(float(instant))) for instant in range(len(wanted))])
+        assert same(found, wanted)
+        corners = np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        assert np.array_equal(corners, clips.arrays["triangles"][slot])
+        labels = json.loads(stage.GetRootLayer().customLayerData["stickslip"])
+        assert labels["mu"] == clips.arrays["mu"][slot]
+
+
+def test_obj_is_the_source(clips: Any, tmp_path: Path) -> None:
+    export(clips, "--obj", tmp_path / "out", "--split", "test")
+    slots = np.flatnonzero(clips.arrays["valid"] & (clips.arrays["split"] == 2))
+    assert len(slots)
+    for slot in slots[:2]:
+        wanted = clips.arrays["positions"][slot]
+        files = sorted((tmp_path / "out" / f"{slot:08d}").glob("*.obj"))
+        assert len(files) == len(wanted)
+        for path, vertices in zip(files, wanted, strict=True):
+            lines = [line.split() for line in path.read_text().splitlines()]
+            found = np.array([line[1:] for line in lines if line[0] == "v"], dtype=np.float32)
+            assert same(found, vertices)
+            corners = [[int(corner.split("/")[0]) - 1 for corner in line[1:]] for line in lines if line[0] == "f"]
+            assert np.array_equal(corners, clips.arrays["triangles"][slot])
+
+
+def test_a_dataset_without_meshes_is_no_usd(rods: Any, tmp_path: Path) -> None:
+    done = run(app, ["export", str(rods.root), "--obj", str(tmp_path / "out")])
+    assert done.exit_code == 1
+    assert "a mesh needs the arrays positions, rest, triangles" in done.output
+    assert not list(tmp_path.iterdir())
+
+
 def test_parquet_has_the_types_of_the_source(clips: Any, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     pytest.importorskip("datasets", reason="datasets is not installed")
@@ -246,7 +289,7 @@ def test_the_same_export_has_the_same_bytes(clips: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "an export needs one of --hdf5, --webdataset, --huggingface, --mds, and has none"),
+        ([], "an export needs one of --hdf5, --webdataset, --huggingface, --mds, --usd, --obj, and has none"),
         (["--webdataset", "OUT", "--huggingface", "OUT"], "and has --webdataset, --huggingface"),
         (["--webdataset", "OUT", "--gzip", "3"], "--gzip is for --hdf5 only"),
         (["--webdataset", "OUT", "--arrays", "movie"], "'movie' is none of them"),

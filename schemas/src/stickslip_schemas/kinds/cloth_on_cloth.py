@@ -26,7 +26,7 @@ from stickslip_schemas.cloth import (
 )
 from stickslip_schemas.fabrics import FabricNumbers, Material
 from stickslip_schemas.jobs import SeedRule
-from stickslip_schemas.kinds.cloth_drag import Viewpoint, ViewpointName
+from stickslip_schemas.viewpoints import Viewpoint, ViewpointName
 
 
 class ClothOnClothAxes(ClothAxes):

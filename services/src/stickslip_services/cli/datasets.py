@@ -141,6 +141,8 @@ def export(
         Path | None, typer.Option(metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
     mds: Annotated[Path | None, typer.Option(metavar="DIR", help="shards for MosaicML Streaming")] = None,
+    usd: Annotated[Path | None, typer.Option(metavar="DIR", help="moving meshes of cloth for USD")] = None,
+    obj: Annotated[Path | None, typer.Option(metavar="DIR", help="meshes of cloth, one file an instant")] = None,
     arrays: ArraysOption = None,
     split: SplitOption = None,
     where: WhereOption = None,
@@ -162,6 +164,8 @@ def export(
         "--webdataset": webdataset,
         "--huggingface": huggingface,
         "--mds": mds,
+        "--usd": usd,
+        "--obj": obj,
         "--arrays": arrays,
         "--split": split,
         "--gzip": gzip,

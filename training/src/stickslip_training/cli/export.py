@@ -13,7 +13,7 @@ from stickslip_schemas.selection import Selection
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import huggingface, mds, webdataset
+from stickslip_training.export import huggingface, mds, meshes, webdataset
 from stickslip_training.export.content import Content, OnBytes
 from stickslip_training.export.writing import to_directory, to_file
 
@@ -28,6 +28,10 @@ def export(
         Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
     to_mds: Annotated[Path | None, typer.Option("--mds", metavar="DIR", help="shards for MosaicML Streaming")] = None,
+    to_usd: Annotated[Path | None, typer.Option("--usd", metavar="DIR", help="moving meshes of cloth for USD")] = None,
+    to_obj: Annotated[
+        Path | None, typer.Option("--obj", metavar="DIR", help="meshes of cloth, an instant each")
+    ] = None,
     arrays: Annotated[str | None, typer.Option(help="arrays to take, with commas between; labels always come")] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
     where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
@@ -35,7 +39,14 @@ def export(
     gzip: Annotated[int, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = 0,
 ) -> None:
     """Write a dataset in a format that other libraries read. Nothing is overwritten."""
-    targets = {"--hdf5": to_hdf5, "--webdataset": to_webdataset, "--huggingface": to_huggingface, "--mds": to_mds}
+    targets = {
+        "--hdf5": to_hdf5,
+        "--webdataset": to_webdataset,
+        "--huggingface": to_huggingface,
+        "--mds": to_mds,
+        "--usd": to_usd,
+        "--obj": to_obj,
+    }
     with errors_told():
         given = {option: path for option, path in targets.items() if path is not None}
         if len(given) != 1:
@@ -60,9 +71,15 @@ def export(
         )
 
 
-_DIRECTORIES = {"--webdataset": webdataset.write, "--huggingface": huggingface.write, "--mds": mds.write}
-_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--mds": ["streaming"]}
-_EXTRAS = {"--mds": "mds"}
+_DIRECTORIES = {
+    "--webdataset": webdataset.write,
+    "--huggingface": huggingface.write,
+    "--mds": mds.write,
+    "--usd": meshes.write_usd,
+    "--obj": meshes.write_obj,
+}
+_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--mds": ["streaming"], "--usd": ["pxr"]}
+_EXTRAS = {"--mds": "mds", "--usd": "usd"}
 
 
 def _require(option: str) -> None:

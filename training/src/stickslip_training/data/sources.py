@@ -1,4 +1,4 @@
-"""Where a dataset's bytes come from: a directory, or an HTTP server that answers range requests.
+"""Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range requests.
 
 A source keeps nothing open that two processes could fight over: a directory is read with one open and one pread per
 read, and an HTTP client belongs to the process that made it. So a source can be pickled and survives a fork.
@@ -8,8 +8,11 @@ import hashlib
 import os
 import re
 import time
+from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import unquote, urlsplit
 
 from stickslip_schemas.manifest import MANIFEST_NAME
 from stickslip_schemas.tasks import FileEntry
@@ -49,6 +52,8 @@ def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -
     text = os.fspath(source)
     if re.match(r"https?://", text):
         return HttpSource(text, api_key=api_key if api_key is not None else os.environ.get(API_KEY_VARIABLE))
+    if text.startswith("s3://"):
+        return BucketSource(text)
     return DirectorySource(Path(text))
 
 
@@ -109,6 +114,83 @@ class DirectorySource:
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
+
+
+class BucketSource:
+    """A dataset version in an S3 bucket: `s3://BUCKET/PREFIX/datasets/<id>/v<n>`.
+
+    Region, endpoint and credentials are those of the variables `AWS_...` of the environment. A read is one request. The
+    client has threads, which a fork does not have: a DataLoader with workers needs `multiprocessing_context="spawn"`.
+    """
+
+    PATIENCE = timedelta(seconds=60)
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        if not parts.netloc or parts.query or parts.fragment:
+            raise ValueError(f"a version in a bucket is s3://BUCKET/PREFIX/datasets/ID/vN, and the source is {url!r}")
+        self._url = url.rstrip("/")
+        self._bucket, self._prefix = parts.netloc, unquote(parts.path).strip("/")
+        self._objects: Any = None
+        self._pid = 0
+
+    def __str__(self) -> str:
+        return self._url
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_objects": None, "_pid": 0}
+
+    def read_manifest(self) -> bytes:
+        """Return the manifest's bytes."""
+        return self.read_unlisted(MANIFEST_NAME)
+
+    def read_unlisted(self, name: str) -> bytes:
+        """Return all bytes of a file that the manifest does not list."""
+        return self._asked(name, lambda obstore, objects: obstore.get(objects, name).bytes().to_bytes())
+
+    def digest(self, file: FileEntry) -> str | None:
+        """Return None: a shard is not fetched whole for the sake of one sample."""
+        return None
+
+    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
+        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
+        length = file.size - offset if length is None else length
+        if offset == 0 and length == file.size:
+            data = self.read_unlisted(file.path)
+        else:
+            data = self._asked(
+                file.path,
+                lambda obstore, objects: obstore.get_range(objects, file.path, start=offset, length=length).to_bytes(),
+            )
+        if len(data) != length:
+            raise CorruptDataError(f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected")
+        return data
+
+    def close(self) -> None:
+        """Let go of the client."""
+        self._objects = None
+
+    def _asked(self, name: str, request: Callable[[Any, Any], bytes]) -> bytes:
+        try:
+            import obstore
+        except ModuleNotFoundError as error:
+            raise SourceError(
+                f"{self} needs obstore, which is not installed: pip install 'stickslip-training[s3]'"
+            ) from error
+        if self._objects is not None and self._pid != os.getpid():
+            raise SourceError(
+                f'{self} cannot be read after a fork: give the DataLoader multiprocessing_context="spawn"'
+            )
+        try:
+            if self._objects is None:
+                retries: Any = {"retry_timeout": self.PATIENCE}
+                self._objects = obstore.store.S3Store(self._bucket, prefix=self._prefix or None, retry_config=retries)
+                self._pid = os.getpid()
+            return bytes(request(obstore, self._objects))
+        except FileNotFoundError:
+            raise MissingFileError(f"{self}/{name} is not there: this is no committed dataset version") from None
+        except obstore.exceptions.BaseError as error:
+            raise SourceError(f"{self}/{name} cannot be read: {str(error).splitlines()[0]}") from error
 
 
 class HttpSource:

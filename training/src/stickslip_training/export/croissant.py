@@ -21,6 +21,7 @@ _FORMATS = {
     ".h5": "application/x-hdf5",
     ".json": "application/json",
     ".md": "text/markdown",
+    ".obj": "model/obj",
     ".parquet": "application/x-parquet",
     ".tar": "application/x-tar",
 }

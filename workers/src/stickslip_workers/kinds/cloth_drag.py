@@ -27,6 +27,7 @@ def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult
     run = drop_and_drag(
         fabric,
         simulation.mu,
+        self_friction=simulation.self_friction,
         preset=simulation.preset.value,
         vertices=simulation.mesh,
         frames=simulation.frames,
