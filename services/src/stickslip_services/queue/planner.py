@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
+from stickslip_schemas import tracing
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.states import JobState, Reason
@@ -63,8 +64,9 @@ class Planner:
             with collector_at_rest():
                 if not self._goes_on(row):
                     self._pieces = self._begin(row, packed)
-                piece = next(self._pieces)
-                self._write(row.seq, piece)
+                with tracing.span("plan", parent=row.trace, job=row.id, first=row.planned):
+                    piece = next(self._pieces)
+                    self._write(row.seq, piece)
         except Exception as error:
             self._job = None
             if isinstance(error, OSError | SQLAlchemyError):
