@@ -73,16 +73,17 @@ from stickslip_services.queue.leasing import (
     renew_all_leases,
     renew_leases,
 )
-from stickslip_services.queue.ledger import RUNNABLE, Ledger
+from stickslip_services.queue.ledger import RUNNABLE, Ending, Ledger
+from stickslip_services.queue.plan import Plan, Terms
 from stickslip_services.queue.planner import Planner, release_claims
-from stickslip_services.queue.planning import Plan, collector_at_rest, expand
+from stickslip_services.queue.planning import collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.queue.stranded import find_stranded, note_stranded
 from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
-from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.terms import terms_for
 from stickslip_services.queue.workers import (
     NO_WORKER,
     RegisteredWorker,
@@ -133,7 +134,7 @@ class Coordinator:
             min_free_bytes=self.settings.min_free_bytes,
             clock=lambda: self.clock(),
         )
-        self.planner = Planner(self.database, lambda: self.clock(), self.settings, self.bell.ring)
+        self.planner = self.new_planner()
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
@@ -512,6 +513,25 @@ class Coordinator:
         """Plan the jobs that are `planning`, until there are none left."""
         while not self._is_closing and self.planner.step():
             pass
+
+    def new_planner(self) -> Planner:
+        """Return a planner that has claimed no job yet."""
+        return Planner(
+            self.database,
+            lambda: self.clock(),
+            self.settings,
+            self.bell.ring,
+            write=self._write_piece,
+            fail=self._fail_to_plan,
+        )
+
+    def _write_piece(self, connection: Connection, job: int, piece: Plan) -> None:
+        with ledger(connection, self.clock()) as book:
+            plan_piece(book, job, piece)
+
+    def _fail_to_plan(self, connection: Connection, job: int, message: str) -> None:
+        with ledger(connection, self.clock()) as book:
+            book.end_job(job, Ending(JobState.failed, Reason.internal_error, message))
 
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""
