@@ -21,6 +21,8 @@ MISSING = 2**64 - 1
 """Offset and length of a chunk that is not in the shard."""
 
 _CRC_BYTES = 4
+_RESIDUE = 0x48674BC7
+"""The crc32c of any bytes with their own little-endian crc32c behind them."""
 
 
 class CorruptChunkError(ValueError):
@@ -94,16 +96,16 @@ def _with_crc(data: bytes) -> bytes:
     return data + int(google_crc32c.value(data)).to_bytes(_CRC_BYTES, "little")
 
 
-def _without_crc(data: bytes, what: str) -> bytes:
-    payload, crc = data[:-_CRC_BYTES], data[-_CRC_BYTES:]
-    if len(data) < _CRC_BYTES or int(google_crc32c.value(payload)).to_bytes(_CRC_BYTES, "little") != crc:
+def _without_crc(data: bytes, what: str) -> memoryview:
+    """Return the bytes before the checksum, without a copy of them."""
+    if len(data) < _CRC_BYTES or google_crc32c.value(data) != _RESIDUE:
         raise CorruptChunkError(f"the crc32c of the {what} does not hold")
-    return payload
+    return memoryview(data)[:-_CRC_BYTES]
 
 
-def _content_size(frame: bytes) -> int | None:
+def _content_size(frame: memoryview) -> int | None:
     """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None where it states none."""
-    if len(frame) < 6 or frame[:4] != b"\x28\xb5\x2f\xfd":
+    if len(frame) < 6 or bytes(frame[:4]) != b"\x28\xb5\x2f\xfd":
         return None
     descriptor = frame[4]
     single_segment = descriptor >> 5 & 1

@@ -22,7 +22,7 @@ from stickslip_schemas.chunks import (
     decode_shard_index,
     shard_index_size,
 )
-from stickslip_schemas.codecs import decode_sample
+from stickslip_schemas.codecs import decode_sample, empty_in_order, in_order_of_chunks
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
 from stickslip_schemas.layout import layout
@@ -196,10 +196,14 @@ class DatasetReader:
         return out
 
     def read_into(self, name: str, slots: Slots, out: Array) -> None:
-        """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample shape)."""
+        """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample shape).
+
+        `out` of clips may also have the order in memory that their chunks have, which is quicker: see `empty`.
+        """
         array = self._array(name)
         shape = (len(slots), *array.shape)
-        if out.shape != shape or out.dtype != np.dtype(array.dtype) or not out.flags.c_contiguous:
+        ordered = out.flags.c_contiguous or (out.ndim == len(shape) and in_order_of_chunks(array, out))
+        if out.shape != shape or out.dtype != np.dtype(array.dtype) or not ordered:
             raise ValueError(
                 f"out must be C-ordered {array.dtype} of shape {shape} for {name}, and is {out.dtype} of {out.shape}"
             )
@@ -211,6 +215,10 @@ class DatasetReader:
                 self._read_sample(array, number, position, slot, out[place])
             else:
                 out[place] = self._group_chunk(array, number)[position]
+
+    def empty(self, name: str, count: int) -> Array:
+        """Return an array for `count` samples, with its axes in memory as chunks have them: C-ordered but for clips."""
+        return empty_in_order(self._array(name), count)
 
     def verify(self) -> None:
         """Check the size and the SHA-256 of every file of the manifest; the others were checked when it was opened."""

@@ -7,6 +7,9 @@ A buffer that is used again costs less than a new one, which the kernel has to m
 buffers cost about a third (benchmarks/reader.py). With `ring=n`, n buffers are used in turn, and **a batch is valid
 until n further batches have been drawn**: use it or copy it before. In the workers of a DataLoader every batch has a
 buffer of its own whatever `ring` says, for a worker reads ahead and hands its batches over by reference.
+
+The clips of a batch are tensors with strides: rows of all frames are together in memory, as they are on disk. Use
+`reshape`, not `view`, or `contiguous()`.
 """
 
 import os
@@ -150,8 +153,7 @@ class SampleDataset(Dataset[Item]):
     def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
         buffers = {}
         for name in self._arrays:
-            array = self.reader.arrays[name]
-            buffers[name] = torch.from_numpy(np.empty((count, *array.shape), dtype=array.dtype))
+            buffers[name] = torch.from_numpy(self.reader.empty(name, count))
         return buffers
 
 
