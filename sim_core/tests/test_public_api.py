@@ -26,6 +26,7 @@ def test_exported_names() -> None:
         "Surface",
         "box",
         "build_info",
+        "cylinder",
         "drop_and_drag",
         "drop_on_cloth",
         "fabric",

@@ -3,7 +3,7 @@
 from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, Surface, box, plane, sphere
+from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, Surface, box, cylinder, plane, sphere
 from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
 from stickslip_sim_core.rods.general import solve_general_rods
 from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
@@ -34,6 +34,7 @@ __all__ = [
     "Surface",
     "box",
     "build_info",
+    "cylinder",
     "drop_and_drag",
     "drop_on_cloth",
     "fabric",

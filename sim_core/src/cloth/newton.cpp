@@ -19,9 +19,11 @@ constexpr int rounds_max = 6;
 constexpr double pairs_tolerance = 1e-4;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
 constexpr double length_tolerance = 2e-9;
-// Where pairs that say nearly the same contradict each other, their forces grow apart until one lets go: by so much
-// more from one iteration to the next while the error falls by less than to this share.
-constexpr double hurry = 4.0, hurry_max = 1024.0, stalled = 0.5;
+// Nodes that are stopped one by one strain the cloth: so all go less far together, down to this share, before any one
+// is stopped by itself.
+constexpr double common_least = 0.1;
+// Iterations in a row that are stopped short, or take all rounds, after which an attempt is given up.
+constexpr int strained_max = 4;
 
 }  // namespace
 
@@ -98,12 +100,16 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   double window[4];
   std::fill(window, window + 4, norms.squared);
   trial_ = best_ = x;
-  double least = norms.squared, forces_share = 1.0;
+  double least = norms.squared;
+  int strained = 0;
+  strained_ = false;
   for (int iteration = 0; iteration < iterations; ++iteration) {
     contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && norms.largest <= settings_.tolerance && arrived(x)) break;
     if (!std::isfinite(norms.squared)) break;
+    strained = strained_ ? strained + 1 : 0;
+    if (strained > strained_max && iterations < settings_.newton_max) break;
     ++report.newton;
     correct(problem, x, krylov_tolerance, report);
     // Along the line, non-monotone [Grippo et al. 1986].
@@ -116,23 +122,22 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
       if (pairs) {
         const Stopwatch watch(phases.contact);
         std::copy(ends_.begin() + 4L * free_nodes, ends_.end(), trial_.begin() + 4L * free_nodes);
-        pairs->near.cap(x, trial_);
+        wanted_ = trial_;
+        if (!pairs->near.cap(x, trial_)) {
+          strained_ = true;
+          const double common = std::max(pairs->near.common_share(x, wanted_), common_least);
+          for (std::size_t i = 0; i < trial_.size(); ++i) trial_[i] = x[i] + common * (wanted_[i] - x[i]);
+          pairs->near.cap(x, trial_);
+        }
       }
       evaluate(trial_, true);
-      next = look(problem, trial_, share * forces_share);
-      if (forces_share > 1.0 && next.squared > limit) {
-        forces_share = 1.0;
-        continue;
-      }
+      next = look(problem, trial_, share);
       if (next.squared <= limit * (cut < 4 ? 1.0 : 1e4) || cut == 5 || (iteration == 0 && resumed)) break;
       share *= 0.5;
     }
     for (int i = 0; i < free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
     modes = contact.mode;
     std::swap(x, trial_);
-    const bool stalls =
-        pairs && pairs->active() && share == 1.0 && next.squared > stalled * norms.squared && pairs->settled();
-    forces_share = stalls ? std::min(hurry * forces_share, hurry_max) : 1.0;
     norms = next;
     if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);
     window[iteration % 4] = norms.squared;
@@ -166,7 +171,9 @@ void Newton::correct(const StepProblem& problem, const Buffer<double>& x, double
     correct_with_pairs(problem, x, report);
   }
   if (!pairs) return;
-  for (int round = 0; round < rounds_max && pairs->activate(change_); ++round) correct_with_pairs(problem, x, report);
+  int round = 0;
+  for (; round < rounds_max && pairs->activate(change_); ++round) correct_with_pairs(problem, x, report);
+  strained_ = round == rounds_max;
   pairs->solved(change_);
 }
 

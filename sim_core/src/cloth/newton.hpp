@@ -62,7 +62,8 @@ class Newton {
   ClothSettings settings_;
   PairFactor pair_factor_;
   PairData pair_rows_{};
-  Buffer<double> trial_, best_, ends_;
+  bool strained_ = false;  // whether the last correction was stopped short or took all rounds
+  Buffer<double> trial_, wanted_, best_, ends_;
   Buffer<float> change_, work_, image_, force_;
 };
 

@@ -16,7 +16,7 @@ bool PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Contac
                        double dt, const ClothSettings& settings) {
   std::vector<Name> names;
   for (const Pair& pair : pairs.list()) {
-    if (pair.bears()) names.push_back({pair.who.kind, pair.who.first, pair.feature, pair.row.mode});
+    if (pair.bears()) names.push_back({pair.who.kind, pair.who.first, pair.feature, pair.row.mode, pair.insistence});
   }
   const bool stale = !made_ || std::abs(dt - dt_) > 1e-9 * dt_ || excess_ > settings.refactor_after ||
                      last_ >= settings.krylov_max ||

@@ -29,7 +29,7 @@ class PairFactor {
 
  private:
   // A pair that bears: its nodes, and how.
-  using Name = std::tuple<PairKind, int, int, int>;
+  using Name = std::tuple<PairKind, int, int, int, double>;
 
   void order(const Assembly& assembly, const Buffer<double>& x, const Pairs& pairs);
   bool has_place_for(const Pairs& pairs, int free_nodes) const;

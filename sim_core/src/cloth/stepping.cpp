@@ -13,6 +13,8 @@ namespace {
 constexpr double loose = 0.1;
 // Iterations up to which steps may grow again, of those that a step may take.
 constexpr double easy = 0.6;
+// Times the patience where pairs are near: then halves of a step are hardly easier than the whole.
+constexpr double near_pairs = 2.5;
 
 }  // namespace
 
@@ -56,6 +58,11 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
   }
 }
 
+int Stepper::patience() const {
+  const bool near = newton.pairs && !newton.pairs->list().empty();
+  return static_cast<int>((near ? near_pairs : 1.0) * settings_.patience);
+}
+
 void Stepper::advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report) {
   const double part = (end - begin) * dt;
   std::vector<Body> at_start, at_end;
@@ -73,10 +80,10 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
   StepOutcome outcome{false, 0.0};
   if (depth >= depth_hint_) {
     assembly_.definite = depth > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
-    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : settings_.patience, report,
+    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
                            settings_.krylov_tolerance);
-    // Modes of contact that flip to and fro under exact solves settle under loose ones.
-    if (!outcome.converged) {
+    // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
+    if (!outcome.converged && (deepest || !newton.pairs || newton.pairs->list().empty())) {
       x = driven;
       outcome =
           newton.solve(problem, x, deepest, settings_.newton_max, report, std::max(loose, settings_.krylov_tolerance));
@@ -121,7 +128,7 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, predicted_, false);
-  tried_ = newton.solve(problem, x, false, settings_.patience, report, settings_.krylov_tolerance);
+  tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance);
   tried_dt_ = dt;
   return tried_.converged;
 }
@@ -175,7 +182,7 @@ StepReport Stepper::step(double dt, const Drive& drive) {
   hardest_ = 0;
   advance(0.0, 1.0, 0, dt, drive, report);
   bodies_before_ = drive.bodies;
-  if (hardest_ <= easy * settings_.patience && depth_hint_ > 0) --depth_hint_;
+  if (hardest_ <= easy * patience() && depth_hint_ > 0) --depth_hint_;
   ++report.steps;
   report.unconverged += !report.converged;
   count_contacts(report);

@@ -42,6 +42,7 @@ class Stepper {
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
 
  private:
+  int patience() const;
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);
   void count_contacts(StepReport& report) const;

@@ -14,6 +14,11 @@ Gap gap_of(const Body& body, const Vector3d& x) {
     const double r = local.norm();
     return {r - body.size[0], r > 0.0 ? Vector3d(body.rotation * (local / r)) : Vector3d(body.rotation.col(2))};
   }
+  if (body.shape == Body::cylinder) {
+    const Vector3d across(local.x(), local.y(), 0.0);
+    const double r = across.norm();
+    return {r - body.size[0], r > 0.0 ? Vector3d(body.rotation * (across / r)) : Vector3d(body.rotation.col(0))};
+  }
   const Vector3d beyond = local.cwiseAbs() - body.size, outside = beyond.cwiseMax(0.0);
   const double r = outside.norm();
   Vector3d normal = Vector3d::Zero();

@@ -6,9 +6,9 @@
 namespace sim_core {
 
 // At the end of a step. Its own axes: a plane fills z < 0, a sphere has radius size[0], a box reaches from -size to
-// size.
+// size, and a cylinder has radius size[0] and no ends along z.
 struct Body {
-  enum Shape : int { plane = 0, sphere = 1, box = 2 };
+  enum Shape : int { plane = 0, sphere = 1, box = 2, cylinder = 3 };
   int shape;
   double mu;
   Eigen::Vector3d size, origin;  // m

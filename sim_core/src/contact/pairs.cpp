@@ -24,6 +24,10 @@ constexpr double predicted_gap = 0.02;
 constexpr double crossing_least = 0.01, end_share = 1e-3;
 // Cosine up to which a force is handed on from one normal to another.
 constexpr double hand_on_cosine = 0.5;
+// Pairs that say nearly the same but contradict each other trade forces until one lets go. A pair whose gap or slip
+// stays above this share of what it was, between `insist_from` [m] and a share of the thickness, gets a larger proximal
+// stiffness: by so much, up to so much in all.
+constexpr double insist_above = 0.5, insist_from = 2e-9, insist_up_to = 0.02, insist_more = 4.0, insist_max = 4096.0;
 // Pairs whose middles are nearer than so much of the thickness are one; forces are handed on up to so far.
 constexpr double merge_share = 0.2, hand_on_share = 0.5;
 
@@ -40,12 +44,9 @@ Matrix3d axes(PairKind kind, const FourPoints& x) {
   return out;
 }
 
-// The force on the cone that is nearest along the normal and across it.
-Vector3d admissible(const PairSight& sight) {
-  const double pressing = std::max(sight.force.dot(sight.normal), 0.0), bound = sight.mu * pressing;
-  const Vector3d across = sight.force - sight.force.dot(sight.normal) * sight.normal;
-  const double size = across.norm();
-  return pressing * sight.normal + (size > bound ? Vector3d(bound / size * across) : across);
+// By how much a pair that bears misses what its row asks for, m.
+double missed(const PairSight& sight, int mode) {
+  return std::hypot(sight.gap, mode == contact_stick ? sight.slip.norm() : 0.0);
 }
 
 }  // namespace
@@ -88,6 +89,7 @@ void Pairs::keep() {
     if (pair.sight.force.isZero(0.0)) continue;
     kept_.push_back(pair);
     kept_.back().change.setZero();
+    kept_.back().insistence = 1.0;
   }
 }
 
@@ -96,7 +98,6 @@ void Pairs::look(const Buffer<double>& x, double share, Buffer<double>& residual
   hand_on(base_, share);
   merge();
   for (Pair& pair : pairs_) {
-    if (share > 1.0) pair.sight.force = admissible(pair.sight);
     pair.row = pair_row(pair.sight);
     if (pair.sight.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.sight.force;
@@ -212,6 +213,14 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
     for (; o < before.size() && key(before[o]) < key(pairs_[i]); ++o) orphans.push_back(&before[o]);
     if (o < before.size() && key(before[o]) == key(pairs_[i])) {
       pairs_[i].sight.force = before[o].sight.force + share * before[o].change;
+      pairs_[i].insistence = before[o].insistence;
+      const int mode = before[o].row.mode;
+      const double last = missed(before[o].sight, mode), now = missed(pairs_[i].sight, mode);
+      if (share == 1.0 && mode != contact_open && last > insist_from && last < insist_up_to * pairs_[i].thickness &&
+          now > insist_above * last) {
+        pairs_[i].insistence = std::min(insist_more * before[o].insistence, insist_max);
+      }
+      pairs_[i].sight.proximal *= pairs_[i].insistence;
       ++o;
     } else {
       fresh.push_back(i);
@@ -296,11 +305,6 @@ void Pairs::count_errors(double stiffness, Norms& norms) const {
     const double error = pair_error_squared(sight);
     if (error != 0.0) norms.count(error);
   }
-}
-
-bool Pairs::settled() const {
-  return std::equal(pairs_.begin(), pairs_.end(), base_.begin(), base_.end(),
-                    [](const Pair& a, const Pair& b) { return key(a) == key(b) && a.row.mode == b.row.mode; });
 }
 
 bool Pairs::active() const {

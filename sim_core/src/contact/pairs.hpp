@@ -29,6 +29,7 @@ struct Pair {
   Eigen::Vector3d given;   // m: of its motion, by nodes that are held and not yet at their ends
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force by the last linear problem, N
   PairRow row{};
+  double insistence = 1.0;               // by which its proximal stiffness has grown in this attempt
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
 
   bool bears() const { return row.mode != contact_open; }
@@ -53,13 +54,10 @@ class Pairs {
   // A step ended.
   void keep();
 
-  // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual. With a
-  // share above 1 forces stay on their cones.
+  // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual.
   void look(const Buffer<double>& x, double share, Buffer<double>& residual);
   // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
   void count_errors(double stiffness, Norms& norms) const;
-  // Whether all pairs are in the branches that they were in at the last linear problem.
-  bool settled() const;
   const std::vector<Pair>& list() const { return pairs_; }
   // Whether there is a force or a pair that bears.
   bool active() const;

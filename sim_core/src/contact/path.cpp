@@ -73,6 +73,14 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
   return false;
 }
 
+double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<double>& to) {
+  double least = 1.0;
+  for (const Candidate& pair : pairs(from)) {
+    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), keep));
+  }
+  return least;
+}
+
 bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
   std::fill(share_.begin(), share_.end(), 1.0);
   bool whole = true;

@@ -23,6 +23,10 @@ class Neighbourhood {
   // crosses on the straight ways between: each node by as much as its pairs demand. Returns whether nothing was moved.
   bool cap(const Buffer<double>& from, Buffer<double>& to);
 
+  // The share of the straight way from `from` to `to` that all nodes can go together, so that every pair that is near
+  // at `from` keeps a fifth of its distance.
+  double common_share(const Buffer<double>& from, const Buffer<double>& to);
+
   int rebuilds = 0;
 
  private:

@@ -33,7 +33,8 @@ BodyTuple = tuple[int, float, Floats, Floats, Floats]
 
 @dataclass(frozen=True)
 class Body:
-    """A body that cloth touches. In its own axes a plane fills z < 0; others are centred on their origin."""
+    """A body that cloth touches. In its own axes a plane fills z < 0; others are centred on their origin, and z is the
+    axis of a cylinder."""
 
     mu: float
     shape: int = 0
@@ -72,6 +73,16 @@ def sphere(mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rot
         raise ValueError(f"radius: must be finite and > 0, got {radius}")
     turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
     return Body(mu, 1, (radius, 0.0, 0.0), np.asarray(origin, float), turn)
+
+
+def cylinder(
+    mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
+) -> Body:
+    """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
+    if not (np.isfinite(radius) and radius > 0.0):
+        raise ValueError(f"radius: must be finite and > 0, got {radius}")
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    return Body(mu, 3, (radius, 0.0, 0.0), np.asarray(origin, float), turn)
 
 
 def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:

@@ -7,8 +7,11 @@ from typing import Any
 from stickslip_sim_core.protocols import (
     bend_twist,
     cantilever,
+    capstan,
+    heavy_fold,
     inclined_plane,
     lateral_buckling,
+    pull_out,
     rod_cantilever,
     rod_lateral_buckling,
     stacked_incline,
@@ -27,6 +30,9 @@ PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
         "lateral-buckling": lateral_buckling.run,
         "inclined-plane": inclined_plane.run,
         "stacked-incline": stacked_incline.run,
+        "pull-out": pull_out.run,
+        "heavy-fold": heavy_fold.run,
+        "capstan": capstan.run,
     }
 )
 

@@ -1,0 +1,141 @@
+"""Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its protocols.
+
+    python benchmarks/cloth_contact.py [camel] [overhead] [piles] [protocols]
+
+`camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
+with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches. `piles`: five sheets fall
+onto each other, by seed. `protocols`: those of contact, with their settings. Without a name all of them run.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from stickslip_sim_core import (
+    Body,
+    Cloth,
+    SelfContact,
+    fabric,
+    plane,
+    preset_named,
+    protocols,
+    self_intersections,
+    stage,
+)
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.solver import THICKNESS
+
+PROTOCOLS = ("capstan", "pull-out", "heavy-fold", "stacked-incline")
+PILES = (4, 5, 6)
+
+
+def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tuple[float, Cloth, int]:
+    """Drop and drag at mu 0.5; return CPU seconds, the cloth, and how many of its steps end with a crossing.
+
+    The seconds are without the hanging and without looking for crossings.
+    """
+    mesh = meshes.grid(stage.SIDE, stage.SIDE, vertices - 1, vertices - 1)
+    held = stage.held_by_holders(mesh)
+    hung = stage.hang(mesh, fabric(material), seed=0)
+    feels = None if mu is None else SelfContact(mu)
+    cloth = Cloth(mesh, fabric(material), preset_named("certified"), held=held, self_contact=feels)
+    cloth.set_state(hung.positions)
+    motion = stage.motion_of(cloth, [plane(0.5)], hung.positions[held], hung.tilt)
+    crossed = looking = 0.0
+
+    def watched(at: float) -> tuple[Floats, ArrayLike, Sequence[Body]]:
+        nonlocal crossed, looking
+        begin = time.process_time()
+        crossed += self_intersections(cloth.positions, mesh.triangles) > 0
+        looking += time.process_time() - begin
+        return motion(at)
+
+    begin = time.process_time()
+    for frame in range(1, frames):
+        cloth.advance(frame / stage.FRAME_RATE, watched)
+    return time.process_time() - begin - looking, cloth, int(crossed)
+
+
+def compare(material: str, vertices: int, frames: int) -> None:
+    seconds = {}
+    for mu in (None, 0.5):
+        seconds[mu], cloth, crossed = dragged(material, vertices, frames, mu)
+        print(
+            f"{material} {vertices} x {vertices}, {frames} frames, contact with itself {mu}: {seconds[mu]:.2f} CPU s, "
+            f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged, {crossed} end with a crossing, "
+            f"{cloth.newton} iterations, least distance {cloth.least_distance / THICKNESS:.4f} thicknesses, "
+            f"{ {name: round(value, 2) for name, value in cloth.phases().items()} }",
+            flush=True,
+        )
+    print(f"  ratio {seconds[0.5] / seconds[None]:.2f}", flush=True)
+
+
+def pile_up() -> None:
+    for seed in PILES:
+        pile(seed)
+
+
+def pile(seed: int, sheets: int = 5, steps: int = 60) -> None:
+    """Let sheets of 6 x 6 cm, turned and tilted, fall onto each other and a floor."""
+    rng = np.random.default_rng(seed)
+    parts = [
+        meshes.grid(0.06, 0.06, 5, 5) if i % 2 else meshes.unstructured(0.06, 0.06, 0.012, i) for i in range(sheets)
+    ]
+    places = []
+    for i, part in enumerate(parts):
+        angle, tilt = rng.uniform(0.0, 6.0), 0.1 * rng.normal(size=2)
+        c, s = np.cos(angle), np.sin(angle)
+        flat = part.rest @ np.array([[c, s], [-s, c]])
+        places.append(np.column_stack([flat, 0.01 + 0.012 * i + flat @ tilt]))
+    mesh = meshes.together(*parts)
+    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), self_contact=SelfContact(0.4))
+    cloth.set_state(np.concatenate(places))
+    begin, crossed = time.process_time(), 0
+    for _ in range(steps):
+        cloth.step(0.01, bodies=[plane(0.4)])
+        crossed += self_intersections(cloth.positions, mesh.triangles) > 0
+    print(
+        f"pile of {sheets}, seed {seed}: {time.process_time() - begin:.1f} CPU s, {cloth.unconverged_steps} of "
+        f"{cloth.steps} steps unconverged, {crossed} cross, least distance {cloth.least_distance / THICKNESS:.4f}",
+        flush=True,
+    )
+
+
+def measure_all() -> None:
+    for name in PROTOCOLS:
+        measure(name)
+
+
+def measure(name: str) -> None:
+    begin = time.process_time()
+    result = protocols.run(name, "certified")
+    print(f"{name}: error {result.error:.2g} of {result.tolerance:g}, {time.process_time() - begin:.0f} CPU s")
+    for curve in result.curves:
+        print("  ", dict(curve.parameters), [f"{error:+.2e}" for error in curve.errors])
+    print("  ", dict(result.settings), flush=True)
+
+
+PARTS: dict[str, Callable[[], None]] = {
+    "camel": lambda: compare("camel-ponte-roma", 21, 300),
+    "overhead": lambda: compare("gray-interlock", 41, 60),
+    "piles": pile_up,
+    "protocols": measure_all,
+}
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; none: all")
+    asked = parser.parse_args().parts or list(PARTS)
+    for part in asked:
+        if part not in PARTS:
+            parser.error(f"parts: must be of {', '.join(PARTS)}, got {part}")
+        PARTS[part]()
+
+
+if __name__ == "__main__":
+    main()

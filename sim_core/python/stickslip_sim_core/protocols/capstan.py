@@ -1,0 +1,151 @@
+"""Capstan: a strip is drawn over a cylinder against a light pull; friction makes the heavy pull grow with the wrap."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stickslip_sim_core import build_info
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.fabrics import isotropic
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import THICKNESS, Cloth, Surface, cylinder
+from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.reference import master_curves
+
+FRICTION = (0.1, 0.3, 0.8, 1.5)
+BENDING = (1e-4, 0.05)  # B / T1, B = D / (2 R^2)
+RADIUS, WRAP = 0.05, 2.0  # m, rad
+CELLS_PER_TURN = 72  # 5 degrees each
+FREE_CELLS = 24  # beyond the cylinder, on each side: many times sqrt(D/T1)
+LIGHT = 2.0  # T1, N/m
+DENSITY, STRETCHING = 0.1, 2e4  # kg/m^2, N/m
+SPEED, DAMPING = 0.01, 2.0  # m/s, 1/s
+SLIDING = 1.2  # s: after which the heavy pull is measured
+MEASURED = 0.8  # s: over which its mean is taken, two cells of way
+
+# Of T1 times a cell: the force that residuals are measured in.
+FORCE_SHARE = 0.01
+
+
+def run(
+    *,
+    preset: str | SolverSettings = "certified",
+    friction: Sequence[float] = FRICTION,
+    bending: Sequence[float] = BENDING,
+    tolerance: float = 0.003,
+) -> ProtocolResult:
+    """Measure ln(T2/T1) of a strip that slides over a cylinder, with cells of 5 degrees.
+
+    Args:
+        preset: Solver settings, or their name.
+        friction: Of strip and cylinder.
+        bending: B / T1, each > 0.
+        tolerance: Largest |relative error| that passes.
+    """
+    settings = preset_named(preset)
+    curves, ripple, steps, unconverged = [], 0.0, 0, 0
+    for stiff in bending:
+        measured, master = [], []
+        for mu in friction:
+            strip = Strip(mu, stiff, settings)
+            heavy, wrap = strip.draw()
+            measured.append(float(np.log(heavy.mean() / LIGHT)))
+            master.append(float(np.log(master_curves.capstan(mu, wrap, stiff))))
+            ripple = max(ripple, float(np.ptp(heavy) / heavy.mean()))
+            steps, unconverged = steps + strip.cloth.steps, unconverged + strip.cloth.unconverged_steps
+        curves.append(
+            Curve({"bending": float(stiff)}, tuple(float(mu) for mu in friction), tuple(measured), tuple(master))
+        )
+    return ProtocolResult(
+        "capstan",
+        "mu",
+        "ln(T2/T1)",
+        tuple(curves),
+        tolerance,
+        {
+            "preset": settings.name,
+            "time_step": settings.time_step,
+            "wrap": WRAP,
+            "cells_per_turn": CELLS_PER_TURN,
+            "speed": SPEED,
+            "ripple": ripple,
+            "force_scale_over_pull_on_a_cell": FORCE_SHARE,
+            "steps": steps,
+            "unconverged_steps": unconverged,
+        },
+        build_info().build_hash,
+    )
+
+
+class Strip:
+    """A strip without weight over a cylinder along y, two cells wide. A pull of `LIGHT` hangs on its free end.
+
+    Args:
+        mu: Friction.
+        bending: B / T1.
+        preset: Solver settings.
+        facets: Of a cylinder of triangles, all around; None: the cylinder is round.
+        width: In cells.
+    """
+
+    def __init__(
+        self, mu: float, bending: float, preset: SolverSettings, facets: int | None = None, width: int = 2
+    ) -> None:
+        self.preset = preset
+        cell = 2.0 * np.pi * RADIUS / CELLS_PER_TURN
+        free = drawn = FREE_CELLS
+        cells = free + drawn + round(WRAP * RADIUS / cell)
+        mesh = meshes.grid(cells * cell, width * cell, cells, width)
+        along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * cell
+        self.held = np.flatnonzero(along > along.max() - 0.1 * cell)
+        light = np.flatnonzero(along < along.min() + 0.1 * cell)
+        surfaces = [] if facets is None else [tube(facets, width * cell, mu)]
+        self.bodies = [cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])] if facets is None else []
+        self.cloth = Cloth(
+            mesh,
+            isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT),
+            preset,
+            held=self.held,
+            surfaces=surfaces,
+            force_scale=FORCE_SHARE * LIGHT * cell,
+        )
+        self.breadth = width * cell
+        self.cloth.gravity[:] = 0.0
+        self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
+        clearance = RADIUS + sum(0.51 * (surface.thickness + THICKNESS) for surface in surfaces)
+        angle = np.clip(along / RADIUS, 0.0, WRAP)
+        beyond = along - RADIUS * angle
+        self.start = np.column_stack(
+            [
+                -clearance * np.cos(angle) + beyond * np.sin(angle),
+                mesh.rest[:, 1],
+                clearance * np.sin(angle) + beyond * np.cos(angle),
+            ]
+        )
+        self.ahead = np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
+        self.cloth.set_state(self.start)
+
+    def draw(self) -> tuple[Floats, float]:
+        """Return the heavy pull at each measured step [N/m], and the angle between the far directions [rad]."""
+        dt, pulls = self.preset.time_step, []
+        first, last = round(SLIDING / dt), round((SLIDING + MEASURED) / dt)
+        for step in range(1, last + 1):
+            ends = self.start[self.held] + SPEED * step * dt * self.ahead
+            self.cloth.step(dt, held=ends, bodies=self.bodies, damping=DAMPING)
+            if step > first:
+                pulls.append(self.cloth.reactions[self.held].sum(axis=0) / self.breadth)
+        heavy = np.array(pulls)
+        mean = heavy.mean(axis=0)
+        # Far directions: straight down at the light end, along the pull at the held one.
+        return np.linalg.norm(heavy, axis=1), float(np.arctan2(mean[0], mean[2]) % (2.0 * np.pi))
+
+
+def tube(facets: int, breadth: float, mu: float) -> Surface:
+    """Return a cylinder of triangles along y whose corners are on the radius, wider than a strip of this breadth."""
+    angle = 2.0 * np.pi * np.arange(facets) / facets
+    ring = RADIUS * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
+    i = np.arange(facets)
+    j = (i + 1) % facets
+    triangles = np.concatenate([np.column_stack([i, j, facets + i]), np.column_stack([j, facets + j, facets + i])])
+    return Surface(triangles, np.concatenate([ring + np.array([0.0, s * breadth, 0.0]) for s in (-1.0, 1.0)]), mu)

@@ -1,0 +1,156 @@
+"""Pull-out: a sheet is drawn out from between two others that lie under a load; both of its sides rub."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stickslip_sim_core import build_info
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, SelfContact, plane
+from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+
+FRICTION = (0.1, 0.3, 0.8, 1.5)
+LOADS = (1.0, 4.0)  # weight of the upper sheet, over that of the fabric
+UPPER, OVER_LOWER = 1.0, 0.5  # friction with the sheet above and below, over mu
+SIDE, THICKNESS = 0.1, 5e-4  # m
+FABRIC = "gray-interlock"
+SPEED = 0.01  # m/s
+SLIDING = 1.0  # s: after which the force is measured
+MEASURED = 0.4  # s: over which its mean is taken
+ROUGH = 10.0  # friction of the floor
+LOWEST_MAX = 1e-5  # m: by which the lowest sheet may move
+
+# Of a node's weight: the force that residuals are measured in.
+FORCE_SHARE = 0.1
+
+
+def run(
+    *,
+    preset: str | SolverSettings = "certified",
+    friction: Sequence[float] = FRICTION,
+    loads: Sequence[float] = LOADS,
+    cells: int = 6,
+    structured: int = 1,
+    unstructured: int = 1,
+    tolerance: float = 0.005,
+) -> ProtocolResult:
+    """Measure the force that draws the middle of three sheets out, over the load between the upper two.
+
+    Friction is mu between the upper two, and mu/2 between the lower two. The master curve is
+    mu + mu/2 (1 + weight of the middle sheet / load).
+
+    Args:
+        preset: Solver settings, or their name.
+        friction: mu.
+        loads: Factors of the gravity on the upper sheet.
+        cells: Of the mesh of the upper sheet along a side.
+        structured: Number of structured meshes, 0 or 1.
+        unstructured: Number of unstructured ones.
+        tolerance: Largest |relative error| that passes.
+    """
+    settings = preset_named(preset)
+    curves, least, unconverged, steps = [], np.inf, 0, 0
+    names = ["grid"] * structured + [f"unstructured {seed}" for seed in range(unstructured)]
+    for load in loads:
+        for number, name in enumerate(names):
+            measured, master = [], []
+            for mu in friction:
+                pulled = Pulled(mu, load, settings, cells, None if name == "grid" else number - structured)
+                force, expected = pulled.force()
+                measured.append(force)
+                master.append(expected)
+                least = min(least, pulled.cloth.least_distance)
+                steps, unconverged = steps + pulled.cloth.steps, unconverged + pulled.cloth.unconverged_steps
+            exact = tuple(float(mu) for mu in friction)
+            curves.append(Curve({"load": float(load), "mesh": float(number)}, exact, tuple(measured), tuple(master)))
+    return ProtocolResult(
+        "pull-out",
+        "mu",
+        "force/load",
+        tuple(curves),
+        tolerance,
+        {
+            "preset": settings.name,
+            "time_step": settings.time_step,
+            "cells": cells,
+            "meshes": ", ".join(f"{i} {name}" for i, name in enumerate(names)),
+            "speed": SPEED,
+            "friction_below_over_mu": OVER_LOWER,
+            "force_scale_over_node_weight": FORCE_SHARE,
+            "least_distance_over_thickness": least / THICKNESS,
+            "steps": steps,
+            "unconverged_steps": unconverged,
+        },
+        build_info().build_hash,
+    )
+
+
+class Pulled:
+    """Three sheets on a rough floor. The upper one is held by its rear edge, the middle one drawn by its front edge.
+
+    Args:
+        mu: Friction of the upper two; that of the lower two is half of it.
+        load: Factor of the gravity on the upper sheet.
+        preset: Solver settings.
+        cells: Of the upper sheet along a side.
+        seed: Of unstructured meshes; None: grids.
+    """
+
+    def __init__(self, mu: float, load: float, preset: SolverSettings, cells: int, seed: int | None = None) -> None:
+        self.mu, self.preset = mu, preset
+        sizes = ((1.5 * SIDE, 1.2 * SIDE), (1.25 * SIDE, SIDE), (SIDE, 0.9 * SIDE))  # from the lowest upwards
+        centres = (0.0, 0.1 * SIDE, 0.0)
+        cell = SIDE / cells
+        parts = [
+            meshes.grid(width, length, round(width / cell), round(length / cell))
+            if seed is None
+            else meshes.unstructured(width, length, cell, seed + level)
+            for level, (width, length) in enumerate(sizes)
+        ]
+        laid = fabric(FABRIC)
+        self.level = np.repeat([0, 1, 2], [len(part.rest) for part in parts])
+        self.start = np.concatenate(
+            [
+                np.column_stack([part.rest + np.array([centre, 0.0]), np.full(len(part.rest), level * THICKNESS)])
+                for level, (part, centre) in enumerate(zip(parts, centres, strict=True))
+            ]
+        )
+        x = self.start[:, 0]
+        self.drawn = np.flatnonzero((self.level == 1) & (x > x[self.level == 1].max() - 1e-9))
+        self.rear = np.flatnonzero((self.level == 2) & (x < x[self.level == 2].min() + 1e-9))
+        below, above = OVER_LOWER * mu, UPPER * mu
+        self.cloth = Cloth(
+            meshes.together(*parts),
+            laid,
+            preset,
+            held=np.concatenate([self.drawn, self.rear]),
+            self_contact=SelfContact([[mu, below, mu], [below, mu, above], [mu, above, mu]], THICKNESS),
+            force_scale=FORCE_SHARE * laid.density * parts[-1].spacing ** 2 * GRAVITY,
+        )
+        self.cloth.gravity[self.level == 2] *= load
+        self.cloth.set_state(self.start)
+
+    def force(self) -> tuple[float, float]:
+        """Return the force that draws the middle sheet over the load (NaN if the lowest one moves), and the master's.
+
+        The load is what the holders of the upper sheet leave of its weight, and likewise for the middle one.
+        """
+        cloth, dt = self.cloth, self.preset.time_step
+        weight = -cloth.masses * cloth.gravity[:, 2]
+        ends = self.start[cloth.held]
+        forces, loads, rests = [], [], []
+        for step in range(1, round((SLIDING + MEASURED) / dt) + 1):
+            ends[: len(self.drawn), 0] = self.start[self.drawn, 0] + SPEED * step * dt
+            cloth.step(dt, held=ends, bodies=[plane(ROUGH)])
+            if step * dt <= SLIDING:
+                continue
+            reactions = cloth.reactions
+            forces.append(reactions[self.drawn, 0].sum())
+            loads.append(weight[self.level == 2].sum() - reactions[self.rear, 2].sum())
+            rests.append(weight[self.level == 1].sum() - reactions[self.drawn, 2].sum())
+        load, rest = float(np.mean(loads)), float(np.mean(rests))
+        moved = np.abs(cloth.positions - self.start)[self.level == 0].max()
+        force = float(np.mean(forces)) / load if moved < LOWEST_MAX else np.nan
+        return force, UPPER * self.mu + OVER_LOWER * self.mu * (1.0 + rest / load)
