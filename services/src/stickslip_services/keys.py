@@ -20,8 +20,7 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys
 from stickslip_services.errors import NotFoundError
 from stickslip_services.journal import note
-from stickslip_services.projects import check_name
-from stickslip_services.scopes import Scope
+from stickslip_services.scopes import Scope, check_project
 
 LOCAL_WORKER = "local-worker"
 """Name of the key in the file `worker-key` of the data directory."""
@@ -47,7 +46,7 @@ def create_key(
 ) -> tuple[ApiKey, str]:
     """Make a key; return it and its secret, which nobody can be told again. Raise ValueError for a bad project."""
     secret = f"sk_{secrets.token_urlsafe(32)}"
-    key = _insert(connection, name, scopes, secret, now, project=check_name(project))
+    key = _insert(connection, name, scopes, secret, now, project=check_project(project))
     told = [scope for scope in Scope if scope in scopes]
     note(connection, "key.create", key.id, now, name=name, scopes=told, project=project)
     return key, secret

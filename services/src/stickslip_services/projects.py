@@ -4,7 +4,6 @@ Leases are shared evenly between projects, and a project may have a quota. Reque
 without a name.
 """
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -16,6 +15,7 @@ from stickslip_services.database.tables import api_keys, jobs, projects
 from stickslip_services.errors import QuotaExceededError
 from stickslip_services.journal import note
 from stickslip_services.queue.ledger import OPEN
+from stickslip_services.scopes import check_project
 
 _project = ContextVar("project", default="")
 
@@ -48,16 +48,9 @@ def this_project() -> str:
     return _project.get()
 
 
-def check_name(name: str) -> str:
-    """Return the name of a project; raise ValueError where it is none."""
-    if re.fullmatch(r"([a-z0-9][a-z0-9-]{0,62})?", name) is None:
-        raise ValueError(f"project must be lower-case letters, digits and '-', at most 63 of them; got {name[:100]!r}")
-    return name
-
-
 def set_quota(connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float) -> None:
     """Give a project another quota; it holds for the next submission. Raise ValueError for a name that is none."""
-    connection.execute(delete(projects).where(projects.c.name == check_name(name)))
+    connection.execute(delete(projects).where(projects.c.name == check_project(name)))
     connection.execute(insert(projects).values(name=name, max_samples=max_samples, max_jobs=max_jobs))
     note(connection, "project.quota", name, now, max_samples=max_samples, max_jobs=max_jobs)
 

@@ -1,25 +1,37 @@
 """Projects: listing them and setting their quotas, in the database of a data directory."""
 
 import time
-from typing import Annotated
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.cli.keys import visited_database
 from stickslip_services.client.calls import ClientError
+from stickslip_services.installed import require_server
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
 
 app = typer.Typer(help="List projects, and set their quotas.", no_args_is_help=True)
 
 UNLIMITED = "any number"
 
 
+def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+    require_server("projects")
+    from stickslip_services.database.opening import visited  # the server's packages may be missing
+
+    return visited(data, database)
+
+
 @app.command("list")
 @shows_errors
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List projects with their quotas, and what of these is taken by jobs that have not ended."""
-    with visited_database(data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.projects import list_projects
 
         found = list_projects(connection)
@@ -45,7 +57,7 @@ def quota(
     database: DatabaseOption = None,
 ) -> None:
     """Set the quota of a project, from its next submission on. Jobs that are there go on."""
-    with visited_database(data, database) as connection:
+    with _visited(data, database) as connection:
         from stickslip_services.projects import set_quota
 
         try:

@@ -73,16 +73,16 @@ from stickslip_services.queue.leasing import (
     renew_all_leases,
     renew_leases,
 )
-from stickslip_services.queue.ledger import RUNNABLE, Ledger
+from stickslip_services.queue.ledger import RUNNABLE, Ending, Ledger
 from stickslip_services.queue.planner import Planner, release_claims
-from stickslip_services.queue.planning import Plan, collector_at_rest, expand
+from stickslip_services.queue.planning import Plan, Terms, collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.queue.stranded import find_stranded, note_stranded
 from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
-from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.terms import terms_for
 from stickslip_services.queue.workers import (
     NO_WORKER,
     RegisteredWorker,
@@ -133,7 +133,20 @@ class Coordinator:
             min_free_bytes=self.settings.min_free_bytes,
             clock=lambda: self.clock(),
         )
-        self.planner = Planner(self.database, lambda: self.clock(), self.settings, self.bell.ring)
+        self.planner = self.make_planner()
+
+    def make_planner(self) -> Planner:
+        """Return who plans large jobs."""
+
+        def write(connection: Connection, job: int, piece: Plan) -> None:
+            with ledger(connection, self.clock()) as book:
+                plan_piece(book, job, piece)
+
+        def fail(connection: Connection, job: int, message: str) -> None:
+            with ledger(connection, self.clock()) as book:
+                book.end_job(job, Ending(JobState.failed, Reason.internal_error, message))
+
+        return Planner(self.database, lambda: self.clock(), self.settings, write, fail)
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
@@ -511,7 +524,7 @@ class Coordinator:
     def plan_large_jobs(self) -> None:
         """Plan the jobs that are `planning`, until there are none left."""
         while not self._is_closing and self.planner.step():
-            pass
+            self.bell.ring()
 
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""

@@ -187,12 +187,6 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     return row
 
 
-def traces_of(connection: Connection, job_seqs: Collection[int]) -> dict[int, str]:
-    """Return the traceparents of the jobs that have one, by `seq`."""
-    rows = connection.execute(select(jobs.c.seq, jobs.c.trace).where(jobs.c.seq.in_(job_seqs)))
-    return {seq: trace for seq, trace in rows if trace is not None}
-
-
 def trace_of(connection: Connection, task: str) -> str | None:
     """Return the traceparent of the job that a task is charged to; None where it has none."""
     query = select(jobs.c.trace).join(tasks, tasks.c.job == jobs.c.seq).where(tasks.c.key == task_key(task))

@@ -9,7 +9,7 @@ each stage run is the dispatcher's choice.
 """
 
 import heapq
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
@@ -24,7 +24,6 @@ from stickslip_services.queue.compose import Publish, StoredTask, compose_tasks,
 from stickslip_services.queue.costs import limit_seconds, long_groups, read_costs
 from stickslip_services.queue.eta import Cost, Group
 from stickslip_services.queue.ids import task_id, task_key
-from stickslip_services.queue.jobs import traces_of
 from stickslip_services.queue.ledger import (
     LIVE,
     RUNNABLE,
@@ -184,7 +183,7 @@ def grant_leases(
 def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
     """Return what the worker is told of the tasks that it has been granted; see `compose_tasks`."""
     composed = compose_tasks(connection, [grant.task for grant in grants], publish)
-    traces = traces_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
+    traces = _traces_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
     return tuple(
         Lease(
             task_id=grant.task_id,
@@ -196,6 +195,12 @@ def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Pub
         )
         for grant in grants
     )
+
+
+def _traces_of(connection: Connection, job_seqs: Collection[int]) -> dict[int, str]:
+    """Return the traceparents of the jobs that have one, by `seq`."""
+    rows = connection.execute(select(jobs.c.seq, jobs.c.trace).where(jobs.c.seq.in_(job_seqs)))
+    return {seq: trace for seq, trace in rows if trace is not None}
 
 
 def _pick(

@@ -4,6 +4,7 @@ Of several coordinators one plans a job at a time: it has claimed the job, and r
 dies, another one, or its successor, goes on after the last piece that was written.
 """
 
+import json
 import logging
 from collections.abc import Callable, Iterator
 
@@ -12,18 +13,14 @@ from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas import tracing
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.states import JobState, Stage
 
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Database
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import jobs
-from stickslip_services.queue.closing import ledger
+from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.planning import Plan, collector_at_rest, pieces
-from stickslip_services.queue.submitting import pack_keys, plan_piece
-from stickslip_services.queue.terms import Terms
+from stickslip_services.queue.planning import Plan, Terms, collector_at_rest, pieces
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -36,14 +33,33 @@ def release_claims(connection: Connection) -> None:
     connection.execute(update(jobs).where(jobs.c.planner.is_not(None)).values(planner=None, planner_until=None))
 
 
+Write = Callable[[Connection, int, Plan], None]
+"""Writes a piece of a job's plan, in a transaction."""
+
+Fail = Callable[[Connection, int, str], None]
+"""Ends a job that cannot be planned, with a message, in a transaction."""
+
+
+def _pack_keys(connection: Connection, job: int) -> list[str]:
+    """Return the keys of the pack tasks that a job has so far, by shard."""
+    rows = connection.execute(
+        select(tasks.c.key, tasks.c.payload)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.stage == Stage.pack)
+    )
+    by_shard = {json.loads(payload)["shard"]: key.hex() for key, payload in rows}
+    return [by_shard[shard] for shard in sorted(by_shard)]
+
+
 class Planner:
     """Plans the jobs that are `planning`: those of the highest priority first, and of these the oldest."""
 
-    def __init__(self, database: Database, clock: Clock, settings: Settings, ring: Callable[[], None]) -> None:
+    def __init__(self, database: Database, clock: Clock, settings: Settings, write: Write, fail: Fail) -> None:
         self._database = database
         self._clock = clock
         self._settings = settings
-        self._ring = ring
+        self._write_piece = write
+        self._fail = fail
         self._name = new_id("planner")
         self._job: int | None = None
         self._end = 0
@@ -56,7 +72,7 @@ class Planner:
                 return False
         with self._database.write() as connection:
             row = self._claim(connection)
-            packed = [] if row is None or self._goes_on(row) else pack_keys(connection, row.seq)
+            packed = [] if row is None or self._goes_on(row) else _pack_keys(connection, row.seq)
         if row is None:
             self._job, self._pieces = None, iter(())
             return False
@@ -72,8 +88,10 @@ class Planner:
             if isinstance(error, OSError | SQLAlchemyError):
                 raise  # the disk or the database: the next time it may go
             logger.exception("job %s cannot be planned", row.id)
-            self._fail(row, error)
-        self._ring()
+            message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
+            with self._database.write() as connection:
+                if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
+                    self._fail(connection, row.seq, message)
         return True
 
     def _claim(self, connection: Connection) -> Row[tuple[object, ...]] | None:
@@ -114,12 +132,5 @@ class Planner:
             if connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
                 self._job = None  # paused, cancelled or failed meanwhile, or another coordinator goes on with it
                 return
-            with ledger(connection, self._clock()) as book:
-                plan_piece(book, job, piece)
+            self._write_piece(connection, job, piece)
         self._end = piece.end
-
-    def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
-        message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
-        with self._database.write() as connection, ledger(connection, self._clock()) as book:
-            if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                book.end_job(row.seq, Ending(JobState.failed, Reason.internal_error, message))

@@ -11,14 +11,23 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple
 
+from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import Sha256
 from stickslip_schemas.samples import KeyedPoint, keyed_points, pack_key, publish_key
 from stickslip_schemas.states import Stage
 
 from stickslip_services.database.database import batches
-from stickslip_services.queue.terms import Terms
 
 _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What a job is made with: the builds of the workers, and the certificate that vouches for them, if any does."""
+
+    builds: Builds
+    certificate: Sha256 | None
 
 
 class PlannedTask(NamedTuple):
