@@ -1,4 +1,4 @@
-"""Scopes: what a key lets its holder do; and the names of projects, for which it is done."""
+"""What a key lets its holder do: its scopes, and the name of the project that it is for."""
 
 import re
 from collections.abc import Collection

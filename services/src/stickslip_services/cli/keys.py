@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from stickslip_services.cli.common import (
-    DEFAULT_DATA,
-    DatabaseOption,
-    DataOption,
-    console,
-    say,
-    table,
-)
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 from stickslip_services.scopes import Scope
@@ -29,7 +22,8 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
 
 
-def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+def visited_database(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+    """Open the database of a coordinator, which may run, for a few rows."""
     require_server("keys")
     from stickslip_services.database.opening import visited  # the server's packages may be missing
 
@@ -48,7 +42,7 @@ def create(
     database: DatabaseOption = None,
 ) -> None:
     """Make a key and print it. It is shown this once: only its digest is kept."""
-    with _visited(data, database) as connection:
+    with visited_database(data, database) as connection:
         from stickslip_services.keys import create_key
 
         key, secret = create_key(connection, name, scope, time.time(), project=project)
@@ -61,7 +55,7 @@ def create(
 @shows_errors
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
-    with _visited(data, database) as connection:
+    with visited_database(data, database) as connection:
         from stickslip_services.keys import list_keys
 
         found = list_keys(connection)
@@ -86,7 +80,7 @@ def revoke(
     database: DatabaseOption = None,
 ) -> None:
     """Let a key open nothing any more; a running coordinator knows it within a second."""
-    with _visited(data, database) as connection:
+    with visited_database(data, database) as connection:
         from stickslip_services.keys import revoke_key
 
         revoke_key(connection, key_id, time.time())

@@ -21,6 +21,7 @@ UNLIMITED = "any number"
 
 
 def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+    """Open the database of a coordinator, which may run, for a few rows."""
     require_server("projects")
     from stickslip_services.database.opening import visited  # the server's packages may be missing
 

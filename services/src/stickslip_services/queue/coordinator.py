@@ -74,8 +74,9 @@ from stickslip_services.queue.leasing import (
     renew_leases,
 )
 from stickslip_services.queue.ledger import RUNNABLE, Ending, Ledger
+from stickslip_services.queue.plan import Plan, Terms
 from stickslip_services.queue.planner import Planner, release_claims
-from stickslip_services.queue.planning import Plan, Terms, collector_at_rest, expand
+from stickslip_services.queue.planning import collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
@@ -133,20 +134,7 @@ class Coordinator:
             min_free_bytes=self.settings.min_free_bytes,
             clock=lambda: self.clock(),
         )
-        self.planner = self.make_planner()
-
-    def make_planner(self) -> Planner:
-        """Return who plans large jobs."""
-
-        def write(connection: Connection, job: int, piece: Plan) -> None:
-            with ledger(connection, self.clock()) as book:
-                plan_piece(book, job, piece)
-
-        def fail(connection: Connection, job: int, message: str) -> None:
-            with ledger(connection, self.clock()) as book:
-                book.end_job(job, Ending(JobState.failed, Reason.internal_error, message))
-
-        return Planner(self.database, lambda: self.clock(), self.settings, write, fail)
+        self.planner = self.new_planner()
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
@@ -524,7 +512,26 @@ class Coordinator:
     def plan_large_jobs(self) -> None:
         """Plan the jobs that are `planning`, until there are none left."""
         while not self._is_closing and self.planner.step():
-            self.bell.ring()
+            pass
+
+    def new_planner(self) -> Planner:
+        """Return a planner that has claimed no job yet."""
+        return Planner(
+            self.database,
+            lambda: self.clock(),
+            self.settings,
+            self.bell.ring,
+            write=self._write_piece,
+            fail=self._fail_to_plan,
+        )
+
+    def _write_piece(self, connection: Connection, job: int, piece: Plan) -> None:
+        with ledger(connection, self.clock()) as book:
+            plan_piece(book, job, piece)
+
+    def _fail_to_plan(self, connection: Connection, job: int, message: str) -> None:
+        with ledger(connection, self.clock()) as book:
+            book.end_job(job, Ending(JobState.failed, Reason.internal_error, message))
 
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""

@@ -9,7 +9,7 @@ each stage run is the dispatcher's choice.
 """
 
 import heapq
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
@@ -197,12 +197,6 @@ def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Pub
     )
 
 
-def _traces_of(connection: Connection, job_seqs: Collection[int]) -> dict[int, str]:
-    """Return the traceparents of the jobs that have one, by `seq`."""
-    rows = connection.execute(select(jobs.c.seq, jobs.c.trace).where(jobs.c.seq.in_(job_seqs)))
-    return {seq: trace for seq, trace in rows if trace is not None}
-
-
 def _pick(
     connection: Connection,
     worker: RegisteredWorker,
@@ -368,3 +362,9 @@ def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[in
 
 def _is_started(lease: LeaseState, task: HeldTask) -> bool:
     return lease.started or task.state is TaskState.running
+
+
+def _traces_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
+    """Return the traceparents of the jobs that have one, by `seq`."""
+    rows = connection.execute(select(jobs.c.seq, jobs.c.trace).where(jobs.c.seq.in_(job_seqs)))
+    return {seq: trace for seq, trace in rows if trace is not None}

@@ -20,7 +20,8 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.planning import Plan, Terms, collector_at_rest, pieces
+from stickslip_services.queue.plan import Plan, Terms
+from stickslip_services.queue.planning import collector_at_rest, pieces
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -33,33 +34,25 @@ def release_claims(connection: Connection) -> None:
     connection.execute(update(jobs).where(jobs.c.planner.is_not(None)).values(planner=None, planner_until=None))
 
 
-Write = Callable[[Connection, int, Plan], None]
-"""Writes a piece of a job's plan, in a transaction."""
-
-Fail = Callable[[Connection, int, str], None]
-"""Ends a job that cannot be planned, with a message, in a transaction."""
-
-
-def _pack_keys(connection: Connection, job: int) -> list[str]:
-    """Return the keys of the pack tasks that a job has so far, by shard."""
-    rows = connection.execute(
-        select(tasks.c.key, tasks.c.payload)
-        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
-        .where(job_tasks.c.job == job, tasks.c.stage == Stage.pack)
-    )
-    by_shard = {json.loads(payload)["shard"]: key.hex() for key, payload in rows}
-    return [by_shard[shard] for shard in sorted(by_shard)]
-
-
 class Planner:
     """Plans the jobs that are `planning`: those of the highest priority first, and of these the oldest."""
 
-    def __init__(self, database: Database, clock: Clock, settings: Settings, write: Write, fail: Fail) -> None:
+    def __init__(
+        self,
+        database: Database,
+        clock: Clock,
+        settings: Settings,
+        ring: Callable[[], None],
+        *,
+        write: Callable[[Connection, int, Plan], None],
+        fail: Callable[[Connection, int, str], None],
+    ) -> None:
+        """`write` adds the tasks of a piece to a job, `fail` ends a job with a message, both within a transaction."""
         self._database = database
         self._clock = clock
         self._settings = settings
-        self._write_piece = write
-        self._fail = fail
+        self._ring = ring
+        self._write_piece, self._end_job = write, fail
         self._name = new_id("planner")
         self._job: int | None = None
         self._end = 0
@@ -88,10 +81,8 @@ class Planner:
             if isinstance(error, OSError | SQLAlchemyError):
                 raise  # the disk or the database: the next time it may go
             logger.exception("job %s cannot be planned", row.id)
-            message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
-            with self._database.write() as connection:
-                if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                    self._fail(connection, row.seq, message)
+            self._fail(row, error)
+        self._ring()
         return True
 
     def _claim(self, connection: Connection) -> Row[tuple[object, ...]] | None:
@@ -134,3 +125,20 @@ class Planner:
                 return
             self._write_piece(connection, job, piece)
         self._end = piece.end
+
+    def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
+        message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
+        with self._database.write() as connection:
+            if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
+                self._end_job(connection, row.seq, message)
+
+
+def _pack_keys(connection: Connection, job: int) -> list[str]:
+    """Return the keys of the pack tasks that a job has so far, by shard."""
+    rows = connection.execute(
+        select(tasks.c.key, tasks.c.payload)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.stage == Stage.pack)
+    )
+    by_shard = {json.loads(payload)["shard"]: key.hex() for key, payload in rows}
+    return [by_shard[shard] for shard in sorted(by_shard)]

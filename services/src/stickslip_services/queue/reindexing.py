@@ -27,7 +27,8 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.planning import Terms, pieces
+from stickslip_services.queue.plan import Terms
+from stickslip_services.queue.planning import pieces
 from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
 
 PIECE = 10_000

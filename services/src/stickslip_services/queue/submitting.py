@@ -27,7 +27,7 @@ from stickslip_services.database.tables import (
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks
-from stickslip_services.queue.planning import Plan, Terms
+from stickslip_services.queue.plan import Plan, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
 

@@ -1,4 +1,4 @@
-"""What a job is made with, and the rule that some kinds are made with certified presets only."""
+"""The rule that some kinds are made with certified presets only."""
 
 from sqlalchemy import Connection
 from stickslip_schemas.jobs import JobSpec
@@ -6,7 +6,7 @@ from stickslip_schemas.kinds import registered
 
 from stickslip_services.catalog.certificates import standing_certificate
 from stickslip_services.errors import PresetNotCertifiedError
-from stickslip_services.queue.planning import Terms
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.workers import builds_for
 
 
