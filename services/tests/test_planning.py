@@ -8,7 +8,6 @@ import pytest
 from sqlalchemy import select
 from stickslip_schemas.responses import Progress
 from stickslip_schemas.states import JobState, Reason, Stage
-from stickslip_schemas.store import DirectoryStore
 from stickslip_services.cli import wording
 from stickslip_services.cli.main import app
 from stickslip_services.coordinator import make_app
@@ -21,7 +20,6 @@ from stickslip_services.queue.planning import expand
 from stickslip_services.settings import Settings
 from stickslip_services.testing import (
     BUILDS,
-    HttpApi,
     ManualClock,
     PretendWorker,
     failure,
@@ -347,22 +345,30 @@ def _planned(client: httpx.Client, job_id: str) -> int:
     return count
 
 
-def test_people_see_how_far_the_plan_is(tmp_path: Path, database: str, clock: ManualClock) -> None:
-    with serving(make_app(Settings(data=tmp_path / "data", durable=False, plan_samples=PIECE), clock=clock)) as url:
-        key = (tmp_path / "data" / "worker-key").read_text().strip()
-        worker = PretendWorker(HttpApi(url, key), DirectoryStore(tmp_path / "data" / "store")).register()
-        with httpx.Client(base_url=url, trust_env=False) as client:
-            answer = client.post("/v1/jobs", json=GRID)
-            job = answer.raise_for_status().json()
-            assert (answer.status_code, job["state"], job["progress"]["planned"]) == (202, "planning", 0)
-            page = client.get(f"/jobs/{job['id']}").text
-            wait_until(lambda: _planned(client, job["id"]) == 15)
-            assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
-        assert "0 of 15 samples are planned" in page
+def test_people_see_how_far_the_plan_is(
+    settings: Settings, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stickslip_services.coordinator.PLAN_SECONDS", 1e6)  # it plans when the test says so
+    made = make_app(settings, clock=clock)
+    coordinator: Coordinator = made.state.coordinator
+    with serving(made) as url, httpx.Client(base_url=url, trust_env=False) as client:
+        worker = PretendWorker(coordinator, coordinator.store).register()
+        answer = client.post("/v1/jobs", json=GRID)
+        job = answer.raise_for_status().json()
+        assert (answer.status_code, job["state"], job["progress"]["planned"]) == (202, "planning", 0)
+        assert "0 of 15 samples are planned" in client.get(f"/jobs/{job['id']}").text
+        coordinator.planner.step()
+        assert "4 of 15 samples are planned" in client.get(f"/jobs/{job['id']}").text
+        assert "4/15" in client.get("/").text
+        assert "4 of 15 samples are planned" in CliRunner().invoke(app, ["show", job["id"], "--url", url]).stdout
+        coordinator.plan_large_jobs()
+        assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
+        assert "samples are planned" not in client.get(f"/jobs/{job['id']}").text
         worker.work()
-        assert CliRunner().invoke(app, ["watch", job["id"], "--url", url]).exit_code == 0
-        states = CliRunner().invoke(app, ["watch", job["id"], "--url", url]).stdout
-        assert states.index("planning") < states.index("queued") < states.index("succeeded")
+        watched = CliRunner().invoke(app, ["watch", job["id"], "--url", url])
+        assert watched.exit_code == 0
+        places = [watched.stdout.index(state) for state in ("planning", "queued", "succeeded")]
+        assert places == sorted(places)
 
 
 def test_progress_in_words() -> None:

@@ -1,5 +1,6 @@
 """Versions whose manifest has sections: served, pulled, checked, compared, found again and collected like others."""
 
+import asyncio
 import json
 import random
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from stickslip_schemas.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Ma
 from stickslip_schemas.selection import Selection
 from stickslip_schemas.states import JobState, Reason
 from stickslip_services.cli import app
+from stickslip_services.client.aio import AsyncClient
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import ForeignFilesError, pull, verify
 from stickslip_services.coordinator import make_app
@@ -82,6 +84,13 @@ def test_a_pull_brings_the_sections_and_a_second_one_nothing(
         (other / "0").write_text("mine")
         with pytest.raises(ForeignFilesError, match="views/c/9/0"):
             pull(client, dataset, 1, tmp_path / "other")
+        keys = list(contents.sample_keys())
+
+    async def read() -> Contents:
+        async with AsyncClient(url) as client:
+            return await client.contents(dataset, 1)
+
+    assert list(asyncio.run(read()).sample_keys()) == keys
     assert CliRunner().invoke(app, ["datasets", "diff", dataset, str(tmp_path / "d"), "--url", url]).exit_code == 0
 
 

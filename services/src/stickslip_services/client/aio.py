@@ -9,7 +9,7 @@ import httpx
 from httpx_sse import EventSource, ServerSentEvent
 from stickslip_schemas.certificate import Certificate, CertificateUpload
 from stickslip_schemas.events import JobStateEvent
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.manifest import Contents, Manifest
 from stickslip_schemas.responses import (
     CertificateEntry,
     Dataset,
@@ -172,6 +172,18 @@ class AsyncClient:
     async def manifest(self, dataset: str, version: int) -> Manifest:
         """Return the manifest of a version."""
         return await self._ask(calls.manifest(dataset, version))
+
+    async def contents(self, dataset: str, version: int) -> Contents:
+        """Return what the manifest of a version lists; the sections of a large one are all read first."""
+
+        def read() -> Contents:
+            with Client(self.url, key=self._key, patience=self.patience) as client:
+                manifest, _ = client.manifest(dataset, version)
+                root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+                kept = {file.path: client.request("GET", root + file.path).content for file in manifest.sections}
+            return Contents(manifest, lambda file: kept[file.path])
+
+        return await asyncio.to_thread(read)
 
     async def pull(self, dataset: str, version: int, target: Path) -> Pulled:
         """Download a version, in a thread of its own; see `stickslip_services.client.pulling`."""
