@@ -1,22 +1,43 @@
 """A job of a million samples, with workers that only pretend: what the service itself costs.
 
     python benchmarks/million.py plan [--samples 1000000]
+    python benchmarks/million.py publish [--samples 1000000] [--delay 0.025]
 
 `plan`: how long the answer to the submission takes; then, while the coordinator plans, how long leases of another job
-take, and what planning costs it. Prints one JSON object.
+take, and what planning costs it.
+
+`publish`: a planned job of which every task but the last is said to have ended, in a store that answers each request
+after `--delay` seconds, whatever it asks. How long the coordinator takes to compose the last task, a worker to publish,
+and the coordinator to check what the worker says; then, in the directory of the version and without the delay, how long
+the reader of the training package takes to open it, to list the samples of a split, and to filter them by a label.
+Each of the three is a process of its own, with its own peak of memory. Prints one JSON object.
 """
 
 import argparse
 import json
 import os
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 from plan import coordinator, peak_megabytes, spec
+from sqlalchemy import text
+from stickslip_schemas.chunks import encode_chunk, encode_shard
+from stickslip_schemas.layout import layout
+from stickslip_schemas.store import DirectoryStore
+from stickslip_schemas.tasks import FileEntry, PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, parsed
 
 BEFORE_SECONDS = 5.0
 """How long leases are measured while nothing is planned [s]."""
@@ -91,13 +112,203 @@ def plan(samples: int) -> dict[str, Any]:
     return result
 
 
+class SlowStore(DirectoryStore):
+    """A directory that answers like a bucket that is some milliseconds away."""
+
+    delay = 0.0
+
+    def publish(self, data: bytes) -> str:
+        """A PUT."""
+        self._wait(1)
+        return super().publish(data)
+
+    def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
+        """A GET."""
+        self._wait(1)
+        return super().read(digest, offset=offset, length=length)
+
+    def size(self, digest: str) -> int:
+        """A HEAD."""
+        self._wait(1)
+        return super().size(digest)
+
+    def holds(self, digest: str, *, size: int | None = None) -> bool:
+        """A HEAD and a GET."""
+        self._wait(2)
+        return super().holds(digest, size=size)
+
+    def show(self, digest: str, dataset: str, version: int, path: str) -> None:
+        """A copy on the server."""
+        self._wait(1)
+        super().show(digest, dataset, version, path)
+
+    def _wait(self, requests: int) -> None:
+        time.sleep(requests * self.delay)
+
+
+def publish(samples: int, delay: float) -> dict[str, Any]:
+    """Measure the last task of a job, and reading what it made."""
+    with tempfile.TemporaryDirectory() as directory:
+        data = Path(directory)
+        result: dict[str, Any] = {"samples": samples, "delay_seconds": delay}
+        result["coordinator"] = _alone("_coordinate", data, samples, delay)
+        version = next((data / "store/datasets").glob("ds-*/v1"))
+        result["manifest_kb"] = round((version / "manifest.json").stat().st_size / 1e3, 1)
+        result["files"] = sum(1 for path in version.rglob("*") if path.is_file())
+        result["reader"] = _alone("_read", version)
+    return result
+
+
+def _alone(what: str, *arguments: object) -> dict[str, Any]:
+    """Run a part in a process of its own."""
+    command = [sys.executable, __file__, what, *map(str, arguments)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def _timed(result: dict[str, Any], name: str, work: Callable[[], Any]) -> Any:
+    wall, cpu = time.perf_counter(), time.process_time()
+    value = work()
+    result[f"{name}_seconds"] = round(time.perf_counter() - wall, 2)
+    result[f"{name}_cpu_seconds"] = round(time.process_time() - cpu, 2)
+    return value
+
+
+def _coordinate(data: Path, samples: int, delay: float) -> dict[str, Any]:
+    made = Coordinator(Settings.chosen(data=data, durable=False))
+    made.start()
+    worker = PretendWorker(made, made.store).register()
+    job = made.submit(parsed(spec(samples, start=0.0) | {"views": None}), None)
+    made.plan_large_jobs()
+    result: dict[str, Any] = {"planned_peak_mb": round(peak_megabytes(os.getpid()), 1)}
+    _say_that_all_has_ended(made, DirectoryStore(data / "store"))
+    result["before_peak_mb"] = round(peak_megabytes(os.getpid()), 1)
+    made.store = slow = SlowStore(data / "store")
+    slow.delay = delay
+    (lease,) = _timed(result, "compose", lambda: worker.lease(publish=1))
+    result["lease_kb"] = round(len(lease.model_dump_json()) / 1e3, 1)
+    task = data / "task.json"
+    task.write_text(lease.task.model_dump_json())
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(_alone, "_work", task, data / "store", delay)
+        while not running.done():
+            worker.beat(lease, started=True)
+            time.sleep(1)
+        answer = running.result()
+    output = answer.pop("output")
+    verdict = _timed(result, "check", lambda: worker.report((lease, TaskResult.model_validate(output))))
+    result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
+    with made.database.read() as connection:
+        state = connection.scalar(text("SELECT state FROM jobs"))
+    assert (verdict, state) == (["accepted"], "succeeded"), (verdict, state, job)
+    made.close()
+    return result | {"worker": answer}
+
+
+def _say_that_all_has_ended(made: Coordinator, store: DirectoryStore) -> None:
+    """Write results of all tasks but the last into the database, as if they had been reported."""
+    record = RecordRef(digest=store.publish(b"a record"), row=0)
+    with made.database.write() as connection:
+        simulated = SimulateOutput(record=record, labels={}).model_dump_json()
+        connection.execute(
+            text("UPDATE tasks SET state = 'succeeded', output = :output, waiting_on = 0 WHERE stage = 'simulate'"),
+            {"output": simulated},
+        )
+        packs = connection.execute(text("SELECT seq, payload FROM tasks WHERE stage = 'pack'")).all()
+        update = text("UPDATE tasks SET state = 'succeeded', output = :output, waiting_on = 0 WHERE seq = :seq")
+        for row, output in zip(
+            packs, _packed(made, store, [json.loads(row.payload)["shard"] for row in packs]), strict=True
+        ):
+            connection.execute(update, {"seq": row.seq, "output": output.model_dump_json()})
+        connection.execute(text("UPDATE tasks SET waiting_on = 0 WHERE stage = 'publish'"))
+
+
+def _packed(made: Coordinator, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
+    """Yield what the packs of a job of rods without pictures might have made: curves that are all the same."""
+    with made.database.read() as connection:
+        row = connection.execute(text("SELECT seq, spec FROM jobs")).one()
+        of_spec = parsed(json.loads(row.spec))
+        rows = text(
+            "SELECT key, split, labels FROM samples WHERE job = :job AND slot >= :first AND slot < :end ORDER BY slot"
+        )
+        size = of_spec.samples_per_shard
+        curves = [array for array in layout(of_spec) if not array.is_label]
+        # Some different ones: a file can have only so many hard links.
+        shapes = [
+            [store.publish(encode_chunk(np.full((size, *array.shape), n, array.dtype))) for array in curves]
+            for n in range(64)
+        ]
+        sizes = {digest: store.size(digest) for digests in shapes for digest in digests}
+        for shard in shards:
+            found = connection.execute(rows, {"job": row.seq, "first": shard * size, "end": (shard + 1) * size}).all()
+            labels = [json.loads(sample.labels) for sample in found]
+            columns = []
+            for array in layout(of_spec):
+                if array.is_label:
+                    values = np.zeros((len(found), *array.shape), array.dtype)
+                    if array.name == "sample_key":
+                        values[:] = np.frombuffer(b"".join(sample.key for sample in found), np.uint8).reshape(-1, 32)
+                    elif array.name == "split":
+                        values[:] = [sample.split for sample in found]
+                    elif array.name == "valid":
+                        values[:] = True
+                    elif array.name in labels[0]:
+                        values[:] = [label[array.name] for label in labels]
+                    columns.append(encode_chunk(values))
+            yield PackOutput(
+                files=tuple(
+                    FileEntry(path=array.shard_path(shard), sha256=digest, size=sizes[digest])
+                    for array, digest in zip(curves, shapes[shard % len(shapes)], strict=True)
+                ),
+                labels=store.publish(encode_shard(columns)),
+            )
+
+
+def _work(task: Path, store: Path, delay: float) -> dict[str, Any]:
+    from stickslip_workers.stages import publish as stage
+
+    slow = SlowStore(store)
+    slow.delay = delay
+    result: dict[str, Any] = {}
+    given = PublishTask.model_validate_json(task.read_bytes())
+    (done,) = _timed(result, "publish", lambda: stage.run([given], slow))
+    result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
+    return result | {"output": done.model_dump(mode="json")}
+
+
+def _read(version: Path) -> dict[str, Any]:
+    from stickslip_training.data.reader import DatasetReader
+
+    result: dict[str, Any] = {"before_mb": round(peak_megabytes(os.getpid()), 1)}
+    reader = _timed(result, "open", lambda: DatasetReader(version))
+    slots = _timed(result, "list", lambda: reader.slots("train"))
+    found = _timed(result, "filter", lambda: slots[reader.label("gamma")[slots] < 10.0])
+    result["found"] = [len(reader), len(slots), len(found)]
+    result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
+    _timed(result, "sample", lambda: reader.read("centerline", [len(reader) // 2]))
+    result["with_a_sample_peak_mb"] = round(peak_megabytes(os.getpid()), 1)
+    return result
+
+
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("plan",))
+    if sys.argv[1:2] and sys.argv[1].startswith("_"):
+        what, *given = sys.argv[1:]
+        parts: dict[str, Callable[..., dict[str, Any]]] = {
+            "_coordinate": lambda data, samples, delay: _coordinate(Path(data), int(samples), float(delay)),
+            "_work": lambda task, store, delay: _work(Path(task), Path(store), float(delay)),
+            "_read": lambda version: _read(Path(version)),
+        }
+        print(json.dumps(parts[what](*given)))
+        return
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("plan", "publish"))
     parser.add_argument("--samples", type=int, default=1_000_000)
+    parser.add_argument("--delay", type=float, default=0.025, help="of each request to the store [s]")
     arguments = parser.parse_args()
-    print(json.dumps({"plan": plan}[arguments.what](arguments.samples), indent=2))
+    measure = plan if arguments.what == "plan" else partial(publish, delay=arguments.delay)
+    print(json.dumps(measure(arguments.samples), indent=2))
 
 
 if __name__ == "__main__":

@@ -91,10 +91,11 @@ class Machine:
         stack.callback(self.kill)
 
     def start(self, command: Collection[str], log: Path) -> None:
-        """Let the machine do something; what it says goes to a file."""
+        """Let the machine do something; what it says goes to a file. Files of /tmp/ray are its own."""
         inside = ["nsenter", f"--net=/proc/{self._holder}/ns/net", "--"]
         alone = ["unshare", "--pid", "--mount", "--mount-proc", "--uts", "--fork", "--kill-child"]
-        named = ["sh", "-c", 'hostname "$0" && exec "$@"', self.name]
+        script = 'hostname "$0" && mkdir -p /tmp/ray && mount -t tmpfs tmpfs /tmp/ray && exec "$@"'
+        named = ["sh", "-c", script, self.name]
         with log.open("ab") as file:
             self._process = subprocess.Popen(
                 [*inside, *alone, *named, *command], stdout=file, stderr=file, preexec_fn=dies_with_us

@@ -16,8 +16,9 @@ from stickslip_schemas.kinds.cloth_sphere import ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import keyed_points, samples
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
-from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.terms import terms_for
 from stickslip_services.testing import BUILDS
 from stickslip_sim_core import stage
 from stickslip_sim_core._sim_core import cloth_kernels

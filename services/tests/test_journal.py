@@ -72,7 +72,7 @@ def test_keys_and_webhooks_have_lines(coordinator: Coordinator) -> None:
         ("user ada", action)
         for action in ("key.create", "key.revoke", "webhook.create", "webhook.retry", "webhook.delete")
     ]
-    assert found[0][2] == {"name": "bert", "scopes": ["read", "submit"]}
+    assert found[0][2] == {"name": "bert", "scopes": ["read", "submit"], "project": ""}
     assert not any(secret in json.dumps(found) for secret in (secret, sign))
 
 

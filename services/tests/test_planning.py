@@ -16,8 +16,8 @@ from stickslip_services.database.tables import job_tasks, jobs, samples, task_de
 from stickslip_services.queue import planner
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
-from stickslip_services.queue.terms import Terms
 from stickslip_services.settings import Settings
 from stickslip_services.testing import (
     BUILDS,
@@ -265,9 +265,7 @@ def test_a_plan_that_cannot_be_made_fails_the_job_and_says_why(
         raise ValueError("the axis bends")
 
     monkeypatch.setattr(planner, "pieces", broken)
-    coordinator.planner = planner.Planner(
-        coordinator.database, coordinator.clock, coordinator.settings, coordinator.bell.ring
-    )
+    coordinator.planner = coordinator.new_planner()
     with coordinator.database.write() as connection:
         planner.release_claims(connection)
     assert coordinator.planner.step()
@@ -283,7 +281,7 @@ def test_another_coordinator_goes_on_when_the_first_one_has_died(
 ) -> None:
     job_id = submit(coordinator)
     coordinator.planner.step()
-    other = planner.Planner(coordinator.database, clock, coordinator.settings, coordinator.bell.ring)
+    other = coordinator.new_planner()
     assert not other.step()  # the job is claimed
     clock.advance(coordinator.settings.lease_seconds)
     assert other.step()

@@ -102,6 +102,8 @@ def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, work
     assert [entry.slot for entry in section.rejections] == [0]
     assert (section.first, len(section.sample_keys)) == (0, 4)
     assert section.sample_keys[1] == good.sample_key
+    worker.finish(publish)
+    assert not coordinator.store.exists(digest)
     check(coordinator)
 
 

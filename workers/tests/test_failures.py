@@ -36,6 +36,7 @@ def test_what_a_stage_raises(error: Exception, reason: Reason) -> None:
         (ray_errors.RayActorError(), True, Reason.renderer_crash),
         (ray_errors.RayActorError(), False, Reason.process_crash),
         (ray_errors.RayActorError(error_msg="The actor died because its node has died."), True, Reason.worker_lost),
+        (ray_errors.ActorUnavailableError("connection refused", None), True, Reason.worker_lost),
         (ray_errors.OutOfMemoryError("low on memory"), True, Reason.oom_killed),
         (ray_errors.WorkerCrashedError(), False, Reason.worker_lost),
         (ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")), True, Reason.store_unavailable),

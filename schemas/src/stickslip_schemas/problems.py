@@ -29,6 +29,7 @@ class ProblemCode(StrEnum):
     conflict = "conflict"
     precondition_failed = "precondition_failed"
     idempotency_key_reused = "idempotency_key_reused"
+    quota_exceeded = "quota_exceeded"
     kind_not_available = "kind_not_available"
     preset_not_certified = "preset_not_certified"
     stale_lease = "stale_lease"

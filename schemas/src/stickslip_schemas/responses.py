@@ -62,7 +62,8 @@ class Job(Document):
     state: JobState
     reason: Reason | None
     message: str
-    priority: int = Field(description="tasks of the job with the highest number come first")
+    project: str = Field(description="of the key that it was submitted with; empty: of none")
+    priority: int = Field(description="of the tasks of a project, those of the job with the highest number come first")
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None

@@ -23,6 +23,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
+from stickslip_schemas import tracing
 from stickslip_schemas.store import open_store
 
 from stickslip_services import __version__
@@ -82,6 +83,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
             keeper.cancel()
         await asyncio.gather(*keepers, return_exceptions=True)
         coordinator.close()
+        await run_in_threadpool(tracing.stop)  # here: a signal ends the process as soon as the server has stopped
 
     app = FastAPI(
         title="stickslip",
@@ -197,8 +199,9 @@ def main(arguments: list[str] | None = None) -> int:
         check_database(settings, Role.coordinator, with_store=True)
         # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
         with locked(settings.data) if descriptor is None else nullcontext():
+            tracing.start("stickslip-coordinator")
             return _serve(settings, descriptor)
-    except DatabaseRefusedError as error:
+    except (DatabaseRefusedError, tracing.TracingUnavailableError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
 

@@ -5,6 +5,7 @@ StickslipError
 ├── UnknownWorkerError          404
 ├── ConflictError               409
 ├── PreconditionFailedError     412
+├── QuotaExceededError          429
 ├── IdempotencyKeyReusedError   422
 ├── KindNotAvailableError       409
 ├── PresetNotCertifiedError     409
@@ -49,6 +50,19 @@ class PresetNotCertifiedError(StickslipError):
             "certificates do not count), or write `allow_uncertified: true` in the spec"
         )
         super().__init__(f"preset {preset!r} has no passing certificate: {self.rule}")
+
+
+class QuotaExceededError(StickslipError):
+    """A project has as many jobs or samples as it may have."""
+
+    def __init__(self, project: str, what: str, limit: int, *, taken: int, asked: int) -> None:
+        self.value = taken + asked
+        whose = f"the project {project!r}" if project else "requests without a project"
+        self.rule = f"{what} of {whose} that have not ended must be at most {limit}"
+        super().__init__(
+            f"{self.rule}: there are {taken}, and with the {asked} of this job there would be {self.value}. Wait until "
+            "some of them have ended, or cancel some"
+        )
 
 
 class UnknownTextureError(StickslipError):

@@ -20,7 +20,7 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys
 from stickslip_services.errors import NotFoundError
 from stickslip_services.journal import note
-from stickslip_services.scopes import Scope
+from stickslip_services.scopes import Scope, check_project
 
 LOCAL_WORKER = "local-worker"
 """Name of the key in the file `worker-key` of the data directory."""
@@ -36,15 +36,19 @@ class ApiKey:
     id: str
     name: str
     scopes: frozenset[Scope]
+    project: str
     created_at: datetime
     revoked_at: datetime | None
 
 
-def create_key(connection: Connection, name: str, scopes: Collection[Scope], now: float) -> tuple[ApiKey, str]:
-    """Make a key; return it and its secret, which nobody can be told again."""
+def create_key(
+    connection: Connection, name: str, scopes: Collection[Scope], now: float, *, project: str = ""
+) -> tuple[ApiKey, str]:
+    """Make a key; return it and its secret, which nobody can be told again. Raise ValueError for a bad project."""
     secret = f"sk_{secrets.token_urlsafe(32)}"
-    key = _insert(connection, name, scopes, secret, now)
-    note(connection, "key.create", key.id, now, name=name, scopes=[scope for scope in Scope if scope in scopes])
+    key = _insert(connection, name, scopes, secret, now, project=check_project(project))
+    told = [scope for scope in Scope if scope in scopes]
+    note(connection, "key.create", key.id, now, name=name, scopes=told, project=project)
     return key, secret
 
 
@@ -56,6 +60,7 @@ def list_keys(connection: Connection) -> list[ApiKey]:
             id=row.id,
             name=row.name,
             scopes=frozenset(map(Scope, row.scopes.split())),
+            project=row.project,
             created_at=as_datetime(row.created_at),
             revoked_at=None if row.revoked_at is None else as_datetime(row.revoked_at),
         )
@@ -98,6 +103,7 @@ class Holder:
     name: str
     """The id and the name of the key."""
     scopes: frozenset[Scope]
+    project: str
 
 
 class KeyRing:
@@ -121,19 +127,28 @@ class KeyRing:
                 with self._database.read() as connection:
                     rows = connection.execute(select(api_keys).where(api_keys.c.revoked_at.is_(None)))
                     self._holders = {
-                        row.digest: Holder(f"{row.id} {row.name}", frozenset(map(Scope, row.scopes.split())))
+                        row.digest: Holder(
+                            f"{row.id} {row.name}", frozenset(map(Scope, row.scopes.split())), row.project
+                        )
                         for row in rows
                     }
                 self._read_at = time.monotonic()
             return self._holders.get(sha256(secret.encode()))
 
 
-def _insert(connection: Connection, name: str, scopes: Collection[Scope], secret: str, now: float) -> ApiKey:
+def _insert(
+    connection: Connection, name: str, scopes: Collection[Scope], secret: str, now: float, *, project: str = ""
+) -> ApiKey:
     ordered = [scope for scope in Scope if scope in scopes]
     key_id = f"key-{secrets.token_hex(8)}"
     connection.execute(
         insert(api_keys).values(
-            id=key_id, name=name, digest=sha256(secret.encode()), scopes=" ".join(ordered), created_at=now
+            id=key_id,
+            name=name,
+            digest=sha256(secret.encode()),
+            scopes=" ".join(ordered),
+            project=project,
+            created_at=now,
         )
     )
-    return ApiKey(key_id, name, frozenset(ordered), as_datetime(now), None)
+    return ApiKey(key_id, name, frozenset(ordered), project, as_datetime(now), None)

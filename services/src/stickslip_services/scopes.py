@@ -1,5 +1,6 @@
-"""Scopes: what a key lets its holder do."""
+"""What a key lets its holder do: its scopes, and the name of the project that it is for."""
 
+import re
 from collections.abc import Collection
 from enum import StrEnum
 
@@ -28,3 +29,10 @@ _IMPLIED = {
 def allows(granted: Collection[Scope], needed: Scope) -> bool:
     """Tell whether scopes that were granted include the one that is needed."""
     return any(needed in _IMPLIED[scope] for scope in granted)
+
+
+def check_project(name: str) -> str:
+    """Return the name of a project; raise ValueError where it is none."""
+    if re.fullmatch(r"([a-z0-9][a-z0-9-]{0,62})?", name) is None:
+        raise ValueError(f"project must be lower-case letters, digits and '-', at most 63 of them; got {name[:100]!r}")
+    return name

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from pydantic import ValidationError
+from stickslip_schemas import tracing
 from stickslip_schemas.store import open_store, store_place
 from stickslip_schemas.tasks import task_adapter
 
@@ -114,6 +115,11 @@ def _dispatch(options: argparse.Namespace) -> int:
         dispatcher.stop()
 
     try:
+        tracing.start("stickslip-dispatcher")
+    except tracing.TracingUnavailableError as error:
+        logging.error("%s", error)
+        return 2
+    try:
         with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cluster:
             dispatcher = Dispatcher(settings, cluster)
             for number in (signal.SIGTERM, signal.SIGINT):
@@ -122,6 +128,8 @@ def _dispatch(options: argparse.Namespace) -> int:
     except (ClusterLostError, StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
+    finally:
+        tracing.stop()
     return 0
 
 

@@ -54,6 +54,9 @@ FAILED_ASKS = 3
 LAST_SECONDS = 5.0
 """How long the dispatcher may still report what it has after its cluster was lost [s]."""
 
+DEATH_INFO_MS = 30_000
+"""How long Ray may look for the cause where the connection to a process broke: a lost node is no fault of a task."""
+
 _ESSENTIAL = ("gcs/gcs_server", "raylet/raylet", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 """Parts of the command lines of the processes without which a cluster does not work for long."""
 
@@ -96,6 +99,7 @@ def ray_cluster(*, name: str, address: str | None, cpus: int | None) -> Iterator
     """Connect to the cluster at `address`, or start one with `cpus`."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # a call after the end must not start another cluster
+    os.environ.setdefault("RAY_timeout_ms_task_wait_for_death_info", str(DEATH_INFO_MS))
     if address is None:
         directory = _own_directory(name)
         _bury(directory)

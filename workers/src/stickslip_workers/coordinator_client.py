@@ -20,6 +20,10 @@ from stickslip_schemas.worker_api import (
 
 Answer = TypeVar("Answer", bound=BaseModel)
 
+PROMPT = httpx.Timeout(30, connect=5)
+PATIENT = httpx.Timeout(300, connect=5)
+"""For a lease and a report: of a version of a million samples, the coordinator lists or looks for all the files."""
+
 
 class CoordinatorError(Exception):
     """The coordinator did not do what it was asked."""
@@ -54,12 +58,9 @@ class CoordinatorClient:
 
     def __init__(self, url: str, key: str | None = None, tls_certificate: Path | None = None) -> None:
         # A proxy of the environment is for the world outside, not for a service beside this one.
-        timeout = httpx.Timeout(30, connect=5)
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         verify = True if tls_certificate is None else pinned(tls_certificate)
-        self._http = httpx.Client(
-            base_url=url.rstrip("/"), timeout=timeout, headers=headers, verify=verify, trust_env=False
-        )
+        self._http = httpx.Client(base_url=url.rstrip("/"), headers=headers, verify=verify, trust_env=False)
 
     def register(self, registration: WorkerRegistration) -> WorkerSession:
         """Present the dispatcher."""
@@ -67,7 +68,7 @@ class CoordinatorClient:
 
     def lease(self, request: LeaseRequest) -> LeaseBatch:
         """Ask for tasks."""
-        return self._post("/v1/worker/lease", request, LeaseBatch)
+        return self._post("/v1/worker/lease", request, LeaseBatch, timeout=PATIENT)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         """Renew leases."""
@@ -75,16 +76,19 @@ class CoordinatorClient:
 
     def report(self, reports: ReportBatch) -> ReportAnswer:
         """Report results."""
-        return self._post("/v1/worker/report", reports, ReportAnswer)
+        return self._post("/v1/worker/report", reports, ReportAnswer, timeout=PATIENT)
 
     def close(self) -> None:
         """Close the connections."""
         self._http.close()
 
-    def _post(self, path: str, document: BaseModel, answer: type[Answer]) -> Answer:
+    def _post(self, path: str, document: BaseModel, answer: type[Answer], *, timeout: httpx.Timeout = PROMPT) -> Answer:
         try:
             response = self._http.post(
-                path, content=document.model_dump_json(), headers={"Content-Type": "application/json"}
+                path,
+                content=document.model_dump_json(),
+                headers={"Content-Type": "application/json"},
+                timeout=timeout,
             )
         except httpx.TransportError as error:
             raise UnreachableError(f"{path}: {type(error).__name__}: {error}") from error

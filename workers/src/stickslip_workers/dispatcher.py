@@ -14,6 +14,7 @@ from itertools import chain, islice
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
+from stickslip_schemas import tracing
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import open_store
@@ -278,7 +279,9 @@ class Dispatcher:
         self._settle(assignment, results)
 
     def _settle(self, assignment: Assignment, results: list[TaskResult]) -> None:
+        seconds = time.monotonic() - assignment.started_at
         for lease, result in zip(assignment.leases, results, strict=True):
+            tracing.record_task(lease, result, seconds, worker=self._settings.name)
             if result.outcome == "failed":
                 log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
             self._alone.discard(lease.task_id)

@@ -35,6 +35,8 @@ def process_failure(error: Exception, *, renders: bool) -> TaskResult:
         return failure(error.cause) if isinstance(error.cause, Exception) else failed(Reason.internal_error, str(error))
     if isinstance(error, ray_errors.OutOfMemoryError):
         return failed(Reason.oom_killed, str(error))
-    if isinstance(error, ray_errors.RayActorError) and "its node has died" not in str(error):
+    # Where it is merely unavailable, the connection is lost, and Ray does not know of any death.
+    is_node_lost = isinstance(error, ray_errors.ActorUnavailableError) or "its node has died" in str(error)
+    if isinstance(error, ray_errors.RayActorError) and not is_node_lost:
         return failed(Reason.renderer_crash if renders else Reason.process_crash, str(error))
     return failed(Reason.worker_lost, str(error))

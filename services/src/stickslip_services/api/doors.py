@@ -17,7 +17,8 @@ from stickslip_schemas.problems import ProblemCode
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import problem_response
 from stickslip_services.journal import NOBODY, acting
-from stickslip_services.keys import KeyRing
+from stickslip_services.keys import Holder, KeyRing
+from stickslip_services.projects import acting_for
 from stickslip_services.scopes import Scope, allows
 
 _SAFE = ("GET", "HEAD", "OPTIONS")
@@ -91,8 +92,8 @@ class KeyMiddleware:
             admitted = await self._admitted(Headers(scope=scope), needed)
         except OperationalError:
             admitted = (503, ProblemCode.storage_error, "the coordinator cannot read its keys; its log says more")
-        if isinstance(admitted, str):
-            with acting(admitted):
+        if isinstance(admitted, Holder):
+            with acting(admitted.name), acting_for(admitted.project):
                 await self._app(scope, receive, send)
             return
         status, code, detail = admitted
@@ -101,12 +102,12 @@ class KeyMiddleware:
         response = problem_response(status, code, detail, path=scope["path"], request_id=request_id, headers=headers)
         await response(scope, receive, send)
 
-    async def _admitted(self, headers: Headers, needed: Scope) -> str | tuple[int, ProblemCode, str]:
+    async def _admitted(self, headers: Headers, needed: Scope) -> Holder | tuple[int, ProblemCode, str]:
         """Return who sends a request, or why it is refused."""
         authorization = headers.get("authorization")
         if authorization is None:
             if needed in self._open:
-                return NOBODY
+                return Holder(NOBODY, frozenset(), "")
             return 401, ProblemCode.unauthorized, f"the request needs a key of the scope `{needed}`{_HOW}"
         secret = _secret(authorization)
         if secret is None or self._ring.is_fresh:
@@ -116,7 +117,7 @@ class KeyMiddleware:
         if holder is None:
             return 401, ProblemCode.unauthorized, f"the key is not known, or it was revoked{_HOW}"
         if needed in self._open or allows(holder.scopes, needed):
-            return holder.name
+            return holder
         has = ", ".join(scope for scope in Scope if scope in holder.scopes)
         return 403, ProblemCode.scope_missing, f"the request needs the scope `{needed}`, and the key has: {has}"
 

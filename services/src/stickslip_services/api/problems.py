@@ -21,6 +21,7 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.UnknownWorkerError: (404, ProblemCode.unknown_worker),
     errors.ConflictError: (409, ProblemCode.conflict),
     errors.PreconditionFailedError: (412, ProblemCode.precondition_failed),
+    errors.QuotaExceededError: (429, ProblemCode.quota_exceeded),
     errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
     errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),
     errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
@@ -120,6 +121,8 @@ def _stickslip_error(request: Request, error: Exception) -> Response:
     fields = error.fields if isinstance(error, errors.UnknownTextureError) else []
     if isinstance(error, errors.PresetNotCertifiedError):
         fields = [FieldError(pointer="/preset", rule=error.rule, value=json.dumps(error.preset))]
+    if isinstance(error, errors.QuotaExceededError):
+        fields = [FieldError(pointer="", rule=error.rule, value=str(error.value))]
     if status >= 500:
         logger.error("%s %s: %s", request.method, request.url.path, error)
     return _answer(request, status, code, str(error), fields=fields)

@@ -12,6 +12,9 @@ from stickslip_schemas.tasks import PackOutput, PublishOutput, RenderOutput, Sim
 
 from stickslip_services.database.tables import dataset_versions, datasets
 
+HEADS_AT_ONCE = 128
+"""How many files are looked for at once; a worker waits for the answer."""
+
 
 @dataclass(frozen=True, slots=True)
 class ManifestSummary:
@@ -49,7 +52,7 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     if dataset_id(manifest.spec) != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
         raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
     files = list(contents.files())
-    sizes = in_parallel(lambda file: store.size(file.sha256), files)
+    sizes = in_parallel(lambda file: store.size(file.sha256), files, at_once=HEADS_AT_ONCE)
     for file, size in zip(files, sizes, strict=True):
         if size != file.size:
             raise CorruptArtifactError(f"{file.path} has another size than the manifest says")

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
 
 
-def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+def visited_database(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
+    """Open the database of a coordinator, which may run, for a few rows."""
     require_server("keys")
     from stickslip_services.database.opening import visited  # the server's packages may be missing
 
@@ -34,14 +35,17 @@ def _visited(data: Path, database: str | None) -> AbstractContextManager["Connec
 def create(
     name: Annotated[str, typer.Argument(help="whose key it is, or what for")],
     scope: Annotated[list[Scope], typer.Option(help="what it is for; repeatable. submit includes read, admin all")],
+    project: Annotated[
+        str, typer.Option(help="whose jobs it submits: projects share leases, and may have quotas")
+    ] = "",
     data: DataOption = DEFAULT_DATA,
     database: DatabaseOption = None,
 ) -> None:
     """Make a key and print it. It is shown this once: only its digest is kept."""
-    with _visited(data, database) as connection:
+    with visited_database(data, database) as connection:
         from stickslip_services.keys import create_key
 
-        key, secret = create_key(connection, name, scope, time.time())
+        key, secret = create_key(connection, name, scope, time.time(), project=project)
     typer.echo(secret)
     say(f"{key.id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
     say("Authorization: Bearer KEY; a browser takes it as the password of any user")
@@ -51,16 +55,17 @@ def create(
 @shows_errors
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
-    with _visited(data, database) as connection:
+    with visited_database(data, database) as connection:
         from stickslip_services.keys import list_keys
 
         found = list_keys(connection)
-    shown = table("key", "name", "scopes", "made", "revoked", no_wrap=("key",))
+    shown = table("key", "name", "scopes", "project", "made", "revoked", no_wrap=("key",))
     for key in found:
         shown.add_row(
             key.id,
             escape(key.name),
             ", ".join(scope for scope in Scope if scope in key.scopes),
+            key.project,
             f"{key.created_at:%Y-%m-%d %H:%M}",
             "" if key.revoked_at is None else f"{key.revoked_at:%Y-%m-%d %H:%M}",
         )
@@ -75,7 +80,7 @@ def revoke(
     database: DatabaseOption = None,
 ) -> None:
     """Let a key open nothing any more; a running coordinator knows it within a second."""
-    with _visited(data, database) as connection:
+    with visited_database(data, database) as connection:
         from stickslip_services.keys import revoke_key
 
         revoke_key(connection, key_id, time.time())

@@ -12,6 +12,7 @@ from stickslip_services.cli.datasets import export, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
 from stickslip_services.cli.journal import journal
 from stickslip_services.cli.keys import app as keys
+from stickslip_services.cli.projects import app as projects
 from stickslip_services.cli.reindex import reindex
 from stickslip_services.cli.textures import upload
 from stickslip_services.cli.up import up
@@ -65,4 +66,5 @@ for _name, _command in _COMMANDS.items():
 
 app.add_typer(datasets, name="datasets")
 app.add_typer(keys, name="keys")
+app.add_typer(projects, name="projects")
 app.add_typer(webhooks, name="webhooks")

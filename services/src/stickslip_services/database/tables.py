@@ -53,6 +53,8 @@ jobs = Table(
     Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String),
+    Column("project", String, nullable=False, server_default=""),  # of the key that it was submitted with
+    Column("trace", String),  # the span that it was submitted in, as a W3C traceparent
     Column("kind", String, nullable=False),
     Column("spec", Text, nullable=False),  # JSON
     Column("sample_count", Integer, nullable=False),
@@ -289,9 +291,18 @@ api_keys = Table(
     Column("name", String, nullable=False),
     Column("digest", String, nullable=False, unique=True),  # SHA-256 of the secret, which is nowhere
     Column("scopes", String, nullable=False),  # words, with spaces between
+    Column("project", String, nullable=False, server_default=""),
     Column("created_at", Float, nullable=False),
     Column("revoked_at", Float),
     sqlite_autoincrement=True,
+)
+
+projects = Table(  # those with a quota; the others exist by being named
+    "projects",
+    metadata,
+    Column("name", String, primary_key=True),
+    Column("max_samples", _Wide),  # null: any number
+    Column("max_jobs", Integer),  # null: any number
 )
 
 journal = Table(  # triggers of the migration refuse to change or to delete its rows

@@ -4,18 +4,21 @@ What only reads is not here: routes ask `jobs`, `workers` and the catalog.
 """
 
 import logging
+import time
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import InitVar, dataclass, field
 
 from sqlalchemy import Connection
+from stickslip_schemas import tracing
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store, is_unavailable, open_store
-from stickslip_schemas.tasks import PublishOutput
+from stickslip_schemas.tasks import PublishOutput, PublishTask
 from stickslip_schemas.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -38,6 +41,7 @@ from stickslip_services.database.opening import connect
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.journal import note
 from stickslip_services.keys import admit_local_worker
+from stickslip_services.projects import check_quota, this_project
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.eta_watch import EtaWatch
@@ -59,6 +63,7 @@ from stickslip_services.queue.jobs import (
     resume_job,
     runnable_jobs,
     show_job,
+    trace_of,
     unplanned_jobs,
 )
 from stickslip_services.queue.leasing import (
@@ -68,16 +73,17 @@ from stickslip_services.queue.leasing import (
     renew_all_leases,
     renew_leases,
 )
-from stickslip_services.queue.ledger import RUNNABLE, Ledger
+from stickslip_services.queue.ledger import RUNNABLE, Ending, Ledger
+from stickslip_services.queue.plan import Plan, Terms
 from stickslip_services.queue.planner import Planner, release_claims
-from stickslip_services.queue.planning import Plan, collector_at_rest, expand
+from stickslip_services.queue.planning import collector_at_rest, expand
 from stickslip_services.queue.reopening import end_made, made_jobs, make_again
 from stickslip_services.queue.reports import take_reports
 from stickslip_services.queue.retrying import fail_tries, find_held, give_back, is_sweep_due, lose, sweep
 from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.queue.stranded import find_stranded, note_stranded
 from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
-from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.terms import terms_for
 from stickslip_services.queue.workers import (
     NO_WORKER,
     RegisteredWorker,
@@ -115,6 +121,8 @@ class Coordinator:
     _is_closing: bool = field(init=False, default=False)
     _frames: dict[str, dict[str, tuple[int, int]]] = field(init=False, default_factory=dict)
     """What the last heartbeat of each worker told of its simulations, by task. Not kept over a restart."""
+    _lists: dict[str, tuple[Sha256, ...]] = field(init=False, default_factory=dict)
+    """The lists that tasks were given to publish by. Those that a restart forgets, `gc` finds."""
 
     def __post_init__(self, given_clock: Clock | None) -> None:
         self.database = connect(self.settings)
@@ -126,7 +134,7 @@ class Coordinator:
             min_free_bytes=self.settings.min_free_bytes,
             clock=lambda: self.clock(),
         )
-        self.planner = Planner(self.database, lambda: self.clock(), self.settings, self.bell.ring)
+        self.planner = self.new_planner()
 
     def start(self) -> None:
         """Bring the database up to date and take up the work where it was left."""
@@ -151,13 +159,27 @@ class Coordinator:
 
     # --- users ----------------------------------------------------------------------------------------------------
 
-    def submit(self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0) -> JobDetail | Replay:
-        """Make a job of a spec; with a key that has been here before, return the first answer."""
-        check_textures(self.store, spec)
-        with collector_at_rest():
-            return self._submit(spec, idempotency_key, priority)
+    def submit(
+        self, spec: JobSpec, idempotency_key: str | None, *, priority: int = 0, traceparent: str | None = None
+    ) -> JobDetail | Replay:
+        """Make a job of a spec; with a key that has been here before, return the first answer.
 
-    def _submit(self, spec: JobSpec, idempotency_key: str | None, priority: int) -> JobDetail | Replay:
+        Where spans are exported, all of the job hangs below one, and this one below `traceparent` of who asks.
+
+        Raises QuotaExceededError where the project that asks has as much in flight as it may have.
+        """
+        check_textures(self.store, spec)
+        with (
+            collector_at_rest(),
+            tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count) as span,
+        ):
+            answer = self._submit(spec, idempotency_key, priority, span.traceparent)
+            span.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
+            return answer
+
+    def _submit(
+        self, spec: JobSpec, idempotency_key: str | None, priority: int, trace: str | None
+    ) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
         planned_for: Terms | None = None
@@ -165,6 +187,7 @@ class Coordinator:
             with self.database.read() as connection:
                 if idempotency_key and (replay := find_replay(connection, idempotency_key, print_)):
                     return replay
+                check_quota(connection, this_project(), spec.sample_count)
                 terms = terms_for(connection, spec)
             at_once = terms is not None and spec.sample_count <= self.settings.plan_samples
             if terms is not None and at_once and planned_for != terms:
@@ -174,9 +197,10 @@ class Coordinator:
                     return replay
                 if terms_for(connection, spec) != terms:
                     continue  # a worker with other builds has registered in between, or a certificate
+                check_quota(connection, this_project(), spec.sample_count)
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, priority=priority)
+                    job = insert_job(book, spec, priority=priority, project=this_project(), trace=trace)
                     self._enqueue(book, job, terms, plan if at_once else None)
                 shown = self.show(connection, job)
                 note(
@@ -304,6 +328,7 @@ class Coordinator:
         # What a task builds on has ended: nobody needs to be kept from writing while the tasks are composed.
         with self.database.read() as connection:
             leases = compose_leases(connection, grants, self.store.publish)
+        self._lists |= {lease.task_id: lease.task.sections for lease in leases if isinstance(lease.task, PublishTask)}
         return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
@@ -323,6 +348,7 @@ class Coordinator:
     def report(self, batch: ReportBatch) -> ReportAnswer:
         """Take results in."""
         versions: dict[str, ManifestSummary] = {}
+        began = time.monotonic()
         reports = [self._checked(report, versions) for report in batch.reports]
         with self._book() as book:
             worker = find_worker(book.connection, batch.worker_id)
@@ -342,7 +368,22 @@ class Coordinator:
             fail_tries(book, charged, self.settings)
             for consumer, digests in taken.damaged:
                 make_again(book, consumer, digests)
+        for verdict in taken.verdicts:
+            if verdict.verdict == "accepted" and verdict.task_id in versions:
+                self._delete_lists(verdict.task_id)
+                self._trace_commit(verdict.task_id, time.monotonic() - began)
         return ReportAnswer(verdicts=taken.verdicts)
+
+    def _trace_commit(self, task_id: str, seconds: float) -> None:
+        if tracing.is_on():
+            with self.database.read() as connection:
+                trace = trace_of(connection, task_id)
+            tracing.record("commit", parent=trace, seconds=seconds, task=task_id)
+
+    def _delete_lists(self, task_id: str) -> None:
+        with suppress(OSError):
+            for digest in self._lists.pop(task_id, ()):
+                self.store.delete(digest)
 
     def _checked(self, report: Report, versions: dict[str, ManifestSummary]) -> Report:
         """Return the report, or a failure where the store does not have what it says; read manifests on the way."""
@@ -472,6 +513,25 @@ class Coordinator:
         """Plan the jobs that are `planning`, until there are none left."""
         while not self._is_closing and self.planner.step():
             pass
+
+    def new_planner(self) -> Planner:
+        """Return a planner that has claimed no job yet."""
+        return Planner(
+            self.database,
+            lambda: self.clock(),
+            self.settings,
+            self.bell.ring,
+            write=self._write_piece,
+            fail=self._fail_to_plan,
+        )
+
+    def _write_piece(self, connection: Connection, job: int, piece: Plan) -> None:
+        with ledger(connection, self.clock()) as book:
+            plan_piece(book, job, piece)
+
+    def _fail_to_plan(self, connection: Connection, job: int, message: str) -> None:
+        with ledger(connection, self.clock()) as book:
+            book.end_job(job, Ending(JobState.failed, Reason.internal_error, message))
 
     def alive_workers(self, connection: Connection) -> list[RegisteredWorker]:
         """Return the workers that were heard of within the time that a lease lasts."""

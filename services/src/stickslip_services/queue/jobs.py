@@ -26,6 +26,7 @@ from stickslip_services.errors import (
 from stickslip_services.queue.costs import read_costs
 from stickslip_services.queue.eta import StageTimings
 from stickslip_services.queue.events import set_job_state
+from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.workers import NO_WORKER, RegisteredWorker, count_slots
@@ -186,6 +187,12 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     return row
 
 
+def trace_of(connection: Connection, task: str) -> str | None:
+    """Return the traceparent of the job that a task is charged to; None where it has none."""
+    query = select(jobs.c.trace).join(tasks, tasks.c.job == jobs.c.seq).where(tasks.c.key == task_key(task))
+    return connection.scalar(query)
+
+
 def show_job(
     connection: Connection, job: int, workers: Collection[RegisteredWorker], frames: Frames = MappingProxyType({})
 ) -> JobDetail:
@@ -296,6 +303,7 @@ def _shown(
             state=row.state,
             reason=row.reason,
             message=row.message,
+            project=row.project,
             priority=row.priority,
             created_at=as_datetime(row.created_at),
             started_at=None if row.started_at is None else as_datetime(row.started_at),

@@ -1,8 +1,9 @@
 """Leases: who may run which task, and until when.
 
 A lease is (worker, token); the token of a task increments at each lease, so that a worker that lost its lease is told
-from the one that has it. Between jobs the next task goes to the job of the highest priority, and of those to the one
-that has the fewest tasks on lease: a small job does not wait behind a big one, and jobs of one size share evenly.
+from the one that has it. The next task goes to the project that has the fewest tasks on lease; of its jobs, to the one
+of the highest priority, and of those to the one that has the fewest tasks on lease: a small job does not wait behind a
+big one, jobs of one size share evenly, and no project can take all workers by its priorities or its number of jobs.
 Within a job and stage the order is that of the slots, so that shards fill up one after the other. How many tasks of
 each stage run is the dispatcher's choice.
 """
@@ -12,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
+from stickslip_schemas import tracing
 from stickslip_schemas.states import Stage, TaskState
 from stickslip_schemas.worker_api import Lease, LeaseState
 
@@ -23,6 +25,7 @@ from stickslip_services.queue.costs import limit_seconds, long_groups, read_cost
 from stickslip_services.queue.eta import Cost, Group
 from stickslip_services.queue.ids import task_id, task_key
 from stickslip_services.queue.ledger import (
+    LIVE,
     RUNNABLE,
     HeldTask,
     Ledger,
@@ -41,6 +44,7 @@ _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # in the word
 @dataclass(frozen=True, slots=True)
 class _Ready:
     seq: int
+    job: int
     key: bytes
     stage: Stage
     kind: str
@@ -75,6 +79,7 @@ _READY_TASKS = Prepared(
 _JOBS_WITH_PENDING = Prepared(
     select(
         job_counts.c.job,
+        jobs.c.project,
         jobs.c.priority,
         func.coalesce(
             func.sum(job_counts.c.count).filter(job_counts.c.state.in_((TaskState.leased, TaskState.running))), 0
@@ -82,8 +87,18 @@ _JOBS_WITH_PENDING = Prepared(
     )
     .join(jobs, jobs.c.seq == job_counts.c.job)
     .where(jobs.c.state.in_(RUNNABLE), job_counts.c.stage == bindparam("b_stage"))
-    .group_by(job_counts.c.job, jobs.c.priority)
+    .group_by(job_counts.c.job, jobs.c.project, jobs.c.priority)
     .having(func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.pending) > 0)
+)
+_ON_LEASE = Prepared(
+    select(jobs.c.project, func.sum(job_counts.c.count))
+    .join(jobs, jobs.c.seq == job_counts.c.job)
+    .where(
+        jobs.c.state.in_(LIVE),
+        job_counts.c.stage == bindparam("b_stage"),
+        job_counts.c.state.in_((TaskState.leased, TaskState.running)),
+    )
+    .group_by(jobs.c.project)
 )
 _LEASE = Prepared(
     update(tasks)
@@ -123,6 +138,7 @@ class Grant:
     """A task that has been leased and is still to be composed."""
 
     task: StoredTask
+    job: int
     task_id: str
     token: int
     attempt: int
@@ -148,6 +164,7 @@ def grant_leases(
     grants = [
         Grant(
             task=StoredTask(task.seq, task.stage, task.payload, task.preview),
+            job=task.job,
             task_id=task_id(task.stage, task.key),
             token=task.token + 1,
             attempt=task.attempts + 1,
@@ -166,12 +183,14 @@ def grant_leases(
 def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
     """Return what the worker is told of the tasks that it has been granted; see `compose_tasks`."""
     composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+    traces = _traces_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
     return tuple(
         Lease(
             task_id=grant.task_id,
             token=grant.token,
             attempt=grant.attempt,
             limit_seconds=grant.limit_seconds,
+            trace=traces.get(grant.job),
             task=composed[grant.task.seq],
         )
         for grant in grants
@@ -186,9 +205,9 @@ def _pick(
     costs: Mapping[Group, Cost],
     at_most: float | None,
 ) -> list[_Ready]:
-    """Choose ready tasks of a stage, one at a time: of the highest priority, from the job with the fewest on lease."""
-    queue: list[tuple[int, int, int, list[_Ready]]] = []  # -priority, tasks on lease, job, its tasks in reverse order
-    for job, priority, on_lease in _jobs_with_pending(connection, stage):
+    """Choose ready tasks of a stage, one at a time; see the module for which comes next."""
+    queues: dict[str, list[_Waiting]] = {}
+    for job, project, priority, on_lease in _jobs_with_pending(connection, stage):
         ready = [
             task
             for kind in worker.kinds
@@ -197,21 +216,40 @@ def _pick(
             )
         ]
         if ready:
-            queue.append((-priority, on_lease, job, ready[::-1]))
-    heapq.heapify(queue)
+            queues.setdefault(project, []).append((-priority, on_lease, job, ready[::-1]))
+    for queue in queues.values():
+        heapq.heapify(queue)
+    on_lease_of = dict(_ON_LEASE.tuples(connection, {"b_stage": stage})) if len(queues) > 1 else {}
+    projects = [(on_lease_of.get(name, 0), name) for name in queues]
+    heapq.heapify(projects)
     picked: list[_Ready] = []
-    while queue and len(picked) < count:
-        order, on_lease, job, ready = queue[0]
-        picked.append(ready.pop())
-        if ready:
-            heapq.heapreplace(queue, (order, on_lease + 1, job, ready))
+    while projects and len(picked) < count:
+        on_lease, name = projects[0]
+        picked.append(_pop(queues[name]))
+        if queues[name]:
+            heapq.heapreplace(projects, (on_lease + 1, name))
         else:
-            heapq.heappop(queue)
+            heapq.heappop(projects)
     return picked
 
 
-def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, int, int]]:
-    """Return (job, priority, number of tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
+_Waiting = tuple[int, int, int, list[_Ready]]
+"""-priority, tasks on lease, job, its ready tasks in reverse order."""
+
+
+def _pop(queue: list[_Waiting]) -> _Ready:
+    """Take the next task from the jobs of a project."""
+    order, on_lease, job, ready = queue[0]
+    task = ready.pop()
+    if ready:
+        heapq.heapreplace(queue, (order, on_lease + 1, job, ready))
+    else:
+        heapq.heappop(queue)
+    return task
+
+
+def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, str, int, int]]:
+    """Return (job, project, priority, tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
     return _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage})
 
 
@@ -238,6 +276,7 @@ def _ready_tasks(
     return [
         _Ready(
             seq=row.seq,
+            job=job,
             key=row.key,
             stage=stage,
             kind=kind,
@@ -323,3 +362,9 @@ def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[in
 
 def _is_started(lease: LeaseState, task: HeldTask) -> bool:
     return lease.started or task.state is TaskState.running
+
+
+def _traces_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
+    """Return the traceparents of the jobs that have one, by `seq`."""
+    rows = connection.execute(select(jobs.c.seq, jobs.c.trace).where(jobs.c.seq.in_(job_seqs)))
+    return {seq: trace for seq, trace in rows if trace is not None}

@@ -4,25 +4,24 @@ Of several coordinators one plans a job at a time: it has claimed the job, and r
 dies, another one, or its successor, goes on after the last piece that was written.
 """
 
+import json
 import logging
 from collections.abc import Callable, Iterator
 
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
+from stickslip_schemas import tracing
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.states import JobState, Stage
 
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Database
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import jobs
-from stickslip_services.queue.closing import ledger
+from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.planning import Plan, collector_at_rest, pieces
-from stickslip_services.queue.submitting import pack_keys, plan_piece
-from stickslip_services.queue.terms import Terms
+from stickslip_services.queue.plan import Plan, Terms
+from stickslip_services.queue.planning import collector_at_rest, pieces
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -38,11 +37,22 @@ def release_claims(connection: Connection) -> None:
 class Planner:
     """Plans the jobs that are `planning`: those of the highest priority first, and of these the oldest."""
 
-    def __init__(self, database: Database, clock: Clock, settings: Settings, ring: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        database: Database,
+        clock: Clock,
+        settings: Settings,
+        ring: Callable[[], None],
+        *,
+        write: Callable[[Connection, int, Plan], None],
+        fail: Callable[[Connection, int, str], None],
+    ) -> None:
+        """`write` adds the tasks of a piece to a job, `fail` ends a job with a message, both within a transaction."""
         self._database = database
         self._clock = clock
         self._settings = settings
         self._ring = ring
+        self._write_piece, self._end_job = write, fail
         self._name = new_id("planner")
         self._job: int | None = None
         self._end = 0
@@ -55,7 +65,7 @@ class Planner:
                 return False
         with self._database.write() as connection:
             row = self._claim(connection)
-            packed = [] if row is None or self._goes_on(row) else pack_keys(connection, row.seq)
+            packed = [] if row is None or self._goes_on(row) else _pack_keys(connection, row.seq)
         if row is None:
             self._job, self._pieces = None, iter(())
             return False
@@ -63,8 +73,9 @@ class Planner:
             with collector_at_rest():
                 if not self._goes_on(row):
                     self._pieces = self._begin(row, packed)
-                piece = next(self._pieces)
-                self._write(row.seq, piece)
+                with tracing.span("plan", parent=row.trace, job=row.id, first=row.planned):
+                    piece = next(self._pieces)
+                    self._write(row.seq, piece)
         except Exception as error:
             self._job = None
             if isinstance(error, OSError | SQLAlchemyError):
@@ -112,12 +123,22 @@ class Planner:
             if connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
                 self._job = None  # paused, cancelled or failed meanwhile, or another coordinator goes on with it
                 return
-            with ledger(connection, self._clock()) as book:
-                plan_piece(book, job, piece)
+            self._write_piece(connection, job, piece)
         self._end = piece.end
 
     def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
-        with self._database.write() as connection, ledger(connection, self._clock()) as book:
+        with self._database.write() as connection:
             if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                book.end_job(row.seq, Ending(JobState.failed, Reason.internal_error, message))
+                self._end_job(connection, row.seq, message)
+
+
+def _pack_keys(connection: Connection, job: int) -> list[str]:
+    """Return the keys of the pack tasks that a job has so far, by shard."""
+    rows = connection.execute(
+        select(tasks.c.key, tasks.c.payload)
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.stage == Stage.pack)
+    )
+    by_shard = {json.loads(payload)["shard"]: key.hex() for key, payload in rows}
+    return [by_shard[shard] for shard in sorted(by_shard)]

@@ -7,71 +7,17 @@ import gc
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.samples import KeyedPoint, keyed_points, pack_key, publish_key
 from stickslip_schemas.states import Stage
 
 from stickslip_services.database.database import batches
-from stickslip_services.queue.terms import Terms
+from stickslip_services.queue.plan import Plan, PlannedSample, PlannedTask, Terms
 
 _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
-
-
-class PlannedTask(NamedTuple):
-    """A task as a job needs it."""
-
-    stage: str  # a plain str: sqlite3 binds it three times as fast as a member of Stage
-    build: str
-    payload: str
-    depends_on: tuple[bytes, ...] = ()
-    preview: bool = False
-    cost_group: str = ""
-
-
-class PlannedSample(NamedTuple):
-    """A slot of the dataset."""
-
-    slot: int
-    key: bytes
-    simulate_task: bytes
-    render_task: bytes | None
-    split: int
-    labels: str
-
-
-@dataclass(slots=True)
-class Plan:
-    """Tasks of a job by content key, in the order in which they should run, and samples: all, or those of a piece."""
-
-    spec: JobSpec
-    first: int
-    """The first slot."""
-    tasks: dict[bytes, PlannedTask] = field(default_factory=dict)
-    samples: list[PlannedSample] = field(default_factory=list)
-
-    @property
-    def end(self) -> int:
-        """The slot after the last one."""
-        return self.first + len(self.samples)
-
-    @property
-    def is_last(self) -> bool:
-        """True where it ends with the task that publishes."""
-        return self.end == self.spec.sample_count
-
-    @property
-    def publish_key(self) -> bytes:
-        """Key of the last task, of the last piece."""
-        return next(reversed(self.tasks))
-
-    @property
-    def simulation_count(self) -> int:
-        """Number of different simulations."""
-        return sum(task.stage == _SIMULATE for task in self.tasks.values())
 
 
 @contextmanager

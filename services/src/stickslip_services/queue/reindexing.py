@@ -27,9 +27,9 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.ledger import Ending
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import pieces
 from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
-from stickslip_services.queue.terms import Terms
 
 PIECE = 10_000
 """Samples that are planned at once."""

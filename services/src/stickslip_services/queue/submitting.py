@@ -27,8 +27,7 @@ from stickslip_services.database.tables import (
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks
-from stickslip_services.queue.planning import Plan
-from stickslip_services.queue.terms import Terms
+from stickslip_services.queue.plan import Plan, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
 
@@ -38,12 +37,14 @@ _ADD_GROUPS = Prepared(
 )
 
 
-def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0) -> int:
+def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "", trace: str | None = None) -> int:
     """Write a job down, without its tasks; return its `seq`."""
     result = book.connection.execute(
         insert(jobs).values(
             id=new_id("job"),
             name=spec.name,
+            project=project,
+            trace=trace,
             kind=spec.kind,
             spec=spec.model_dump_json(),
             sample_count=spec.sample_count,
@@ -87,17 +88,6 @@ def plan_piece(book: Ledger, job: int, piece: Plan) -> None:
         set_job_state(book.connection, job, JobState.running, book.now)
     elif piece.first > 0:
         set_job_state(book.connection, job, JobState.queued, book.now)
-
-
-def pack_keys(connection: Connection, job: int) -> list[str]:
-    """Return the keys of the pack tasks that a job has so far, by shard."""
-    rows = connection.execute(
-        select(tasks.c.key, tasks.c.payload)
-        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
-        .where(job_tasks.c.job == job, tasks.c.stage == Stage.pack)
-    )
-    by_shard = {json.loads(payload)["shard"]: key.hex() for key, payload in rows}
-    return [by_shard[shard] for shard in sorted(by_shard)]
 
 
 def _has_started_tasks(connection: Connection, job: int) -> bool:

@@ -1,24 +1,13 @@
-"""What a job is made with, and the rule that some kinds are made with certified presets only."""
-
-from dataclasses import dataclass
+"""The rule that some kinds are made with certified presets only."""
 
 from sqlalchemy import Connection
-from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import Sha256
 from stickslip_schemas.kinds import registered
 
 from stickslip_services.catalog.certificates import standing_certificate
 from stickslip_services.errors import PresetNotCertifiedError
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.workers import builds_for
-
-
-@dataclass(frozen=True, slots=True)
-class Terms:
-    """What a job is made with: the builds of the workers, and the certificate that vouches for them, if any does."""
-
-    builds: Builds
-    certificate: Sha256 | None
 
 
 def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:

@@ -11,8 +11,9 @@ from stickslip_schemas.states import TaskState
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import dataset_versions, jobs, tasks
 from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import collector_at_rest, expand
-from stickslip_services.queue.terms import Terms, terms_for
+from stickslip_services.queue.terms import terms_for
 
 LOOKED_UP = 10_000
 """The largest grid whose tasks are looked up one by one, to see which have a result."""

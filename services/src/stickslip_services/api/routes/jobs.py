@@ -48,7 +48,7 @@ _REPLAYED: dict[str, Any] = {
     responses={
         200: _REPLAYED,
         202: {"description": "The job is in the queue", "headers": _LOCATION},
-        **problem_responses(409, *BODY_PROBLEMS),
+        **problem_responses(409, 429, *BODY_PROBLEMS),
     },
     openapi_extra=body_schema("JobSpec"),
 )
@@ -66,9 +66,16 @@ def post_job(
     priority: Annotated[
         int, Query(ge=-100, le=100, description="tasks of the job with the highest number come first")
     ] = 0,
+    traceparent: Annotated[
+        str | None,
+        Header(max_length=255, description="the span that asks [W3C Trace Context], where spans are exported"),
+    ] = None,
 ) -> Response:
-    """Submit a job. What of it is there already is not done again; what had failed is tried again."""
-    job = coordinator.submit(spec, idempotency_key, priority=priority)
+    """Submit a job. What of it is there already is not done again; what had failed is tried again.
+
+    429: the project of the key has as many jobs or samples as it may have.
+    """
+    job = coordinator.submit(spec, idempotency_key, priority=priority, traceparent=traceparent)
     if isinstance(job, Replay):
         return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
     return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})

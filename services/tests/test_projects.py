@@ -1,0 +1,144 @@
+"""Projects: whose jobs they are, what they may have in flight, and how they share the workers."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from stickslip_schemas.states import JobState
+from stickslip_services.cli.main import app
+from stickslip_services.coordinator import make_app
+from stickslip_services.errors import QuotaExceededError
+from stickslip_services.journal import read_journal
+from stickslip_services.projects import acting_for, find_project, list_projects, set_quota
+from stickslip_services.queue.audit import audit
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, parsed, rods, serving, show_job
+from typer.testing import CliRunner
+
+pytestmark = pytest.mark.databases
+
+
+def submit(coordinator: Coordinator, project: str, *, priority: int = 0, **spec: Any) -> str:
+    with acting_for(project):
+        job = coordinator.submit(parsed(rods(**spec)), None, priority=priority)
+    return job.id  # type: ignore[union-attr]
+
+
+def limit(coordinator: Coordinator, project: str, **most: int | None) -> None:
+    with coordinator.database.write() as connection:
+        limits: dict[str, int | None] = {"max_samples": None, "max_jobs": None, **most}
+        set_quota(connection, project, **limits, now=coordinator.clock())
+
+
+def shares(coordinator: Coordinator, worker: PretendWorker, count: int, jobs: dict[float, str]) -> Counter[str]:
+    """Lease simulations, and return how many are of each project; a job is known by its gamma."""
+    leases = worker.lease(simulate=count)
+    return Counter(jobs[lease.task.simulation.gamma] for lease in leases)  # type: ignore[union-attr]
+
+
+def test_a_quota_of_samples_refuses_what_is_too_much(coordinator: Coordinator, worker: PretendWorker) -> None:
+    limit(coordinator, "lab", max_samples=6)
+    first = submit(coordinator, "lab")
+    assert show_job(coordinator, first).project == "lab"
+    with pytest.raises(QuotaExceededError, match=r"samples of the project 'lab' .* at most 6: there are 4, .* be 8"):
+        submit(coordinator, "lab", gamma=(8.0, 9.0))
+    submit(coordinator, "lab", gamma=(8.0,))
+    submit(coordinator, "other", gamma=(8.0, 9.0))  # of a project without a quota
+    with coordinator.database.read() as connection:
+        assert (find_project(connection, "lab").samples, find_project(connection, "lab").jobs) == (6, 2)
+    worker.work()
+    submit(coordinator, "lab", gamma=(8.0, 9.0))  # all of it has ended
+    limit(coordinator, "lab")
+    submit(coordinator, "lab", gamma=(1.0, 2.0, 3.0, 4.0, 5.0))
+    with coordinator.database.read() as connection:
+        assert audit(connection) == []
+        assert [project.name for project in list_projects(connection)] == ["", "lab", "other"]
+        assert [line.subject for line in read_journal(connection) if line.action == "project.quota"] == ["lab", "lab"]
+
+
+def test_a_quota_of_jobs_counts_those_that_have_not_ended(coordinator: Coordinator, worker: PretendWorker) -> None:
+    limit(coordinator, "", max_jobs=1)
+    first = submit(coordinator, "")
+    with pytest.raises(QuotaExceededError, match=r"jobs of requests without a project .* at most 1: there are 1"):
+        submit(coordinator, "", gamma=(7.0,))
+    coordinator.pause(first)
+    with pytest.raises(QuotaExceededError):
+        submit(coordinator, "", gamma=(7.0,))
+    coordinator.cancel(first)
+    assert show_job(coordinator, first).state is JobState.cancelled
+    submit(coordinator, "", gamma=(7.0,))
+
+
+def test_a_large_job_counts_before_it_is_planned(coordinator: Coordinator, worker: PretendWorker) -> None:
+    coordinator.settings = coordinator.settings.model_copy(update={"plan_samples": 2})
+    limit(coordinator, "lab", max_samples=5)
+    assert show_job(coordinator, submit(coordinator, "lab")).state is JobState.planning
+    with pytest.raises(QuotaExceededError):
+        submit(coordinator, "lab", gamma=(7.0,))
+
+
+def test_projects_share_evenly_however_many_jobs_they_have(coordinator: Coordinator, worker: PretendWorker) -> None:
+    phi1 = tuple(float(n) for n in range(1, 21))
+    jobs = {}
+    for gamma in (1.0, 2.0, 3.0):
+        submit(coordinator, "many", gamma=(gamma,), phi1=phi1, priority=10)
+        jobs[gamma] = "many"
+    submit(coordinator, "one", gamma=(4.0,), phi1=phi1)
+    jobs[4.0] = "one"
+    total = shares(coordinator, worker, 8, jobs)
+    assert total == {"many": 4, "one": 4}
+    total += shares(coordinator, worker, 5, jobs)
+    assert sorted(total.values()) == [6, 7]
+    submit(coordinator, "late", gamma=(5.0,), phi1=phi1)
+    jobs[5.0] = "late"
+    new = shares(coordinator, worker, 6, jobs)
+    assert new == {"late": 6}  # until it has as many as the others
+    assert total + new + shares(coordinator, worker, 50, jobs) == {"one": 20, "late": 20, "many": 29}
+
+
+def test_priorities_order_the_jobs_of_a_project(coordinator: Coordinator, worker: PretendWorker) -> None:
+    phi1 = (1.0, 2.0, 3.0)
+    submit(coordinator, "lab", gamma=(1.0,), phi1=phi1)
+    submit(coordinator, "lab", gamma=(2.0,), phi1=phi1, priority=1)
+    submit(coordinator, "other", gamma=(3.0,), phi1=phi1, priority=-1)
+    leases = worker.lease(simulate=4)
+    assert sorted(lease.task.simulation.gamma for lease in leases) == [2.0, 2.0, 3.0, 3.0]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("option", [["--samples", "5"], ["--jobs", "1"]])
+def test_the_api_answers_429_and_names_the_rule(tmp_path: Path, option: list[str], database: str) -> None:
+    data = tmp_path / "data"
+    settings = Settings.chosen(data=data, durable=False, require_keys=True)
+    with serving(make_app(settings)) as url:
+        made = CliRunner().invoke(
+            app, ["keys", "create", "ann", "--scope", "submit", "--project", "lab", "--data", str(data)]
+        )
+        assert made.exit_code == 0, made.output
+        done = CliRunner().invoke(app, ["projects", "quota", "lab", *option, "--data", str(data)])
+        assert done.exit_code == 0, done.output
+        headers = {"Authorization": f"Bearer {made.stdout.strip()}"}
+        with httpx.Client(base_url=url, headers=headers, trust_env=False) as client:
+            first = client.post("/v1/jobs", json=rods())
+            assert (first.status_code, first.json()["project"]) == (202, "lab")
+            refused = client.post("/v1/jobs", json=rods(gamma=(8.0, 9.0)))
+            problem = refused.json()
+            assert (refused.status_code, problem["code"]) == (429, "quota_exceeded")
+            (field,) = problem["errors"]
+            what = option[0][2:]
+            assert field["rule"] == f"{what} of the project 'lab' that have not ended must be at most {option[1]}"
+            assert field["value"] == {"samples": "8", "jobs": "2"}[what]
+            assert len(client.get("/v1/jobs").json()["items"]) == 1
+            client.post(f"/v1/jobs/{first.json()['id']}:cancel")
+            assert client.post("/v1/jobs", json=rods(gamma=(8.0, 9.0))).status_code == 202
+        shown = CliRunner().invoke(app, ["projects", "list", "--data", str(data)])
+        assert "lab" in shown.stdout, shown.output
+
+
+def test_a_project_needs_a_name_that_can_be_typed(tmp_path: Path, coordinator: Coordinator) -> None:
+    data = str(coordinator.settings.data)
+    done = CliRunner().invoke(app, ["projects", "quota", "Two Words", "--jobs", "1", "--data", data])
+    assert done.exit_code == 1
+    assert "project must be lower-case letters" in " ".join(done.stderr.split())
