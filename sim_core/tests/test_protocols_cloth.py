@@ -136,7 +136,9 @@ class TestPresets:
     @pytest.mark.parametrize("preset", sorted(PRESETS))
     def test_every_preset_names_the_protocols(self, preset: str) -> None:
         certification = protocols.CERTIFICATION[preset]
-        assert set(certification.protocols) == {"stick-slip", "cantilever", "lateral-buckling", "inclined-plane"}
+        always = {"stick-slip", "cantilever", "lateral-buckling", "inclined-plane"}
+        contact = {"capstan", "heavy-fold", "stacked-incline", "pull-out"}
+        assert set(certification.protocols) == (always if preset.startswith("thesis-") else always | contact)
         assert certification.numbers["time_step"] == PRESETS[preset].time_step
 
     @pytest.mark.parametrize("preset", ["thesis-high", "thesis-low-small-dt", "thesis-low-big-dt", "fast"])

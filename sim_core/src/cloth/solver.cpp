@@ -36,7 +36,7 @@ struct LinearSolve {
 };
 
 // How far nodes move before pairs are looked for anew, over the side of a cell.
-constexpr double margin_share = 0.15;
+constexpr double margin_share = 0.25;
 
 using Triples = std::vector<std::array<int, 3>>;
 

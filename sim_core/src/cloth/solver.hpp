@@ -14,7 +14,7 @@
 #include "cloth/properties.hpp"
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
-#include "contact/pairs.hpp"
+#include "contact/pair_settings.hpp"
 
 namespace sim_core {
 

@@ -7,16 +7,11 @@
 
 #include "cloth/problem.hpp"
 #include "contact/pair_law.hpp"
+#include "contact/pair_settings.hpp"
 #include "contact/path.hpp"
 #include "contact/state.hpp"
 
 namespace sim_core {
-
-// Of sheets and surfaces.
-struct PairSettings {
-  std::vector<double> thickness;  // m: two keep the mean of theirs apart
-  Eigen::MatrixXd mu;             // of each two; negative where they do not feel each other
-};
 
 struct Pair {
   Candidate who;

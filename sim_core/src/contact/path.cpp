@@ -53,12 +53,16 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
   Buffer<double> at = from;
   bool whole = true;
   for (int hop = 0; hop < hops_max; ++hop) {
-    rebuild(at);
-    const double way = moved(at, to);
-    if (!(way > margin_)) return cap_near(at, to) && whole;
-    const double share = margin_ / way;
-    Buffer<double> next = at;
-    for (int i : surface.vertices) at_node(next, i) += share * (at_node(to, i) - at_node(at, i));
+    // From the middle of a hop both of its ends are within the margin.
+    const double way = moved(at, to), share = way > 2.0 * margin_ ? 2.0 * margin_ / way : 1.0;
+    const auto part = [&](double of_way) {
+      Buffer<double> out = at;
+      for (int i : surface.vertices) at_node(out, i) += of_way * (at_node(to, i) - at_node(at, i));
+      return out;
+    };
+    rebuild(part(0.5 * share));
+    if (share == 1.0) return cap_near(at, to) && whole;
+    Buffer<double> next = part(share);
     const Buffer<double> wanted = next;
     if (!cap_near(at, next)) {
       // Who is stopped has arrived.

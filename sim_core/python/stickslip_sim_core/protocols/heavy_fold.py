@@ -32,7 +32,7 @@ def run(
     *,
     preset: str | SolverSettings = "certified",
     friction: Sequence[float] = FRICTION,
-    cells: int = 160,
+    cells: int = 120,
     tolerance: float = 0.005,
 ) -> ProtocolResult:
     """Measure the height of the loop and how far its nose lies before the landing, over L_gb.

@@ -31,7 +31,7 @@ def run(
     preset: str | SolverSettings = "certified",
     friction: Sequence[float] = FRICTION,
     loads: Sequence[float] = LOADS,
-    cells: int = 6,
+    cells: int = 4,
     structured: int = 1,
     unstructured: int = 1,
     tolerance: float = 0.005,

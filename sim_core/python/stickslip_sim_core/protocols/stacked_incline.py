@@ -39,7 +39,7 @@ def run(
     preset: str | SolverSettings = "certified",
     friction: Sequence[float] = FRICTION,
     sheets: Sequence[int] = SHEETS,
-    cells: int = 8,
+    cells: int = 4,
     structured: int = 1,
     unstructured: int = 1,
     tolerance: float = 0.002,
