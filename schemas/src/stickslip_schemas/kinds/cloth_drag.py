@@ -84,8 +84,8 @@ class ClothDragSpec(ClothSpec):
         le=10,
         description="friction coefficient of the cloth with itself; null: it passes through itself",
         json_schema_extra={
-            "x-cost": "with a number, a cloth that folds over itself takes 3 times the CPU time. camel-ponte-roma takes "
-            "up to 10 times, and is rejected at most values of mu from 0.8 on"
+            "x-cost": "with a number, a cloth that folds over itself takes 3 times the CPU time. camel-ponte-roma "
+            "takes up to 10 times, and is rejected at most values of mu from 0.8 on"
         },
     )
     lamps: dict[OwnName, LampNumbers] = Field(
