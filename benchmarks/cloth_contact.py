@@ -1,9 +1,10 @@
 """Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its protocols.
 
-    python benchmarks/cloth_contact.py [camel] [overhead] [piles] [protocols]
+    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [piles] [protocols]
 
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
-with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches. `piles`: five sheets fall
+with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
+`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `piles`: five sheets fall
 onto each other, by seed. `protocols`: those of contact, with their settings. Without a name all of them run.
 """
 
@@ -17,6 +18,8 @@ from stickslip_sim_core import (
     Body,
     Cloth,
     SelfContact,
+    drop_and_drag,
+    drop_on_cloth,
     fabric,
     plane,
     preset_named,
@@ -73,6 +76,27 @@ def compare(material: str, vertices: int, frames: int) -> None:
     print(f"  ratio {seconds[0.5] / seconds[None]:.2f}", flush=True)
 
 
+def stretched(vertices: int, frames: int) -> None:
+    """Drag a cloth over a floor and over a stretched cloth of as many vertices."""
+    begin = time.process_time()
+    drop_and_drag("gray-interlock", 0.5, vertices=vertices, frames=frames)
+    between = time.process_time()
+    cloth = drop_on_cloth("gray-interlock", "11oz-black-denim", 0.5, vertices=vertices, frames=frames)
+    seconds = between - begin, time.process_time() - between
+    print(
+        f"{vertices} x {vertices}, {frames} frames, over a floor {seconds[0]:.1f} CPU s, over a stretched cloth "
+        f"{seconds[1]:.1f}: {seconds[1] / seconds[0]:.1f} times; {cloth.unconverged_steps} of {cloth.steps} steps "
+        f"unconverged, least distance {cloth.least_distance / THICKNESS:.4f} thicknesses, "
+        f"{(cloth.self_intersections > 0).sum()} frames cross",
+        flush=True,
+    )
+
+
+def stretch_all() -> None:
+    for vertices in (21, 41):
+        stretched(vertices, 50)
+
+
 def pile_up() -> None:
     for seed in PILES:
         pile(seed)
@@ -121,6 +145,7 @@ def measure(name: str) -> None:
 PARTS: dict[str, Callable[[], None]] = {
     "camel": lambda: compare("camel-ponte-roma", 21, 300),
     "overhead": lambda: compare("gray-interlock", 41, 60),
+    "stretched": stretch_all,
     "piles": pile_up,
     "protocols": measure_all,
 }
