@@ -21,10 +21,10 @@ from stickslip_blender.preview import sheet
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.drag_stage import HELD_OUT_VIEWPOINTS
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import HELD_OUT_TEXTURES, Texture
-from stickslip_schemas.viewpoints import HELD_OUT_VIEWPOINTS
 
 Clip = npt.NDArray[np.uint8]
 

@@ -16,10 +16,10 @@ from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.holders import Holders
 from stickslip_blender.textures import texture_image
 from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.drag_stage import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.textures import HELD_OUT_TEXTURES, Texture
-from stickslip_schemas.viewpoints import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS
 
 
 def main() -> None:

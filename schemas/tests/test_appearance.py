@@ -12,6 +12,7 @@ from stickslip_schemas.appearance import Calibration
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.cloth import ClothRender, Lighting, Substrate
+from stickslip_schemas.drag_stage import Viewpoint
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.layout import layout
@@ -19,7 +20,6 @@ from stickslip_schemas.pictures import MAX_BYTES, UnfitPictureError, read_pictur
 from stickslip_schemas.problems import field_errors
 from stickslip_schemas.samples import samples
 from stickslip_schemas.textures import Texture
-from stickslip_schemas.viewpoints import Viewpoint
 
 BUILDS = Builds(sim_core="1" * 64, simulate="2" * 64, render="3" * 64, pack="4" * 64)
 LAB: dict[str, Any] = {

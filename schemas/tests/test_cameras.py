@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from stickslip_schemas.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
-from stickslip_schemas.viewpoints import Viewpoint
+from stickslip_schemas.drag_stage import Viewpoint
 
 LEVEL = Camera(  # three units in front of the origin on the x axis, looking back at it
     name="level",

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.cloth import KERNELS
+from stickslip_schemas.drag_stage import Viewpoint
 from stickslip_schemas.fabrics import Material
 from stickslip_schemas.keys import canonical_json, content_key, derived_seed
 from stickslip_schemas.kinds import job_spec_adapter
@@ -23,7 +24,6 @@ from stickslip_schemas.samples import (
     split_of,
 )
 from stickslip_schemas.textures import Texture
-from stickslip_schemas.viewpoints import Viewpoint
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
@@ -181,8 +181,8 @@ PINNED: dict[str, object] = {
     "split": 0,
     "color_seed": 1423131992,
     "spec": "473d8dc6dc2024b5e3f18fbc9953dca6f325c8f53e87629de6d8277bf2b4c8db",
-    "cloth_simulation": "cd4fa25293c36d85fe5571770462b8652db024c0f2440f95bd8cdbc7d335d872",
-    "cloth_render": "0505c5981a500398f88a83306d7273983210efb82f0b9b723e398dd1affba93b",
+    "cloth_simulation": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
+    "cloth_render": "3c2b35606083d3125e50c1f1cfb77725a5802eb33db4d3d035fb21f5ae0a16ac",
 }
 
 

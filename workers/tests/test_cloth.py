@@ -18,6 +18,7 @@ from stickslip_schemas.cameras import load_rig
 from stickslip_schemas.chunks import encode_trajectory
 from stickslip_schemas.cloth import PICTURE_DECIBELS
 from stickslip_schemas.codecs import encode_clip
+from stickslip_schemas.drag_stage import Viewpoint
 from stickslip_schemas.jobs import Quality
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.layout import layout
@@ -26,7 +27,6 @@ from stickslip_schemas.samples import dataset_id, samples
 from stickslip_schemas.states import Reason
 from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
-from stickslip_schemas.viewpoints import Viewpoint
 from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module

@@ -67,8 +67,7 @@ def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
 
 def in_order_of_chunks(array: ArrayLayout, values: np.ndarray) -> bool:
     """Tell whether samples (samples, *sample shape) of an array lie in memory in the order that chunks have."""
-    order = axes_order(array) if array.is_clip else None
-    return bool((values if order is None else values.transpose(order)).flags.c_contiguous)
+    return bool((values.transpose(axes_order(array)) if array.is_clip else values).flags.c_contiguous)
 
 
 def empty_in_order(array: ArrayLayout, count: int) -> np.ndarray:
@@ -76,7 +75,8 @@ def empty_in_order(array: ArrayLayout, count: int) -> np.ndarray:
     shape = (count, *array.shape)
     if not array.is_clip:
         return np.empty(shape, dtype=array.dtype)
-    order = (0, *(1 + axis for axis in _ROWS_FIRST))  # its own inverse
+    order = axes_order(array)  # its own inverse
+    assert order is not None
     return np.empty([shape[axis] for axis in order], dtype=array.dtype).transpose(order)
 
 

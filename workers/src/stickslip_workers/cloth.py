@@ -73,6 +73,35 @@ def named_fabric(name: str, numbers: "FabricNumbers | None") -> "Fabric":
     return fabric(name) if numbers is None else own_fabric(name, **numbers.model_dump())
 
 
+class DraggedRun(ClothRun, Protocol):
+    """What a run on the stage of drop-and-drag has, too."""
+
+    @property
+    def contact_force(self) -> npt.NDArray[np.float64]: ...
+
+    @property
+    def holder_force(self) -> npt.NDArray[np.float64]: ...
+
+    @property
+    def bias_side(self) -> int: ...
+
+    @property
+    def landed_side(self) -> int: ...
+
+    @property
+    def bias(self) -> float: ...
+
+
+def forces_of(run: DraggedRun) -> dict[str, Array]:
+    """Return the record of a dragged cloth, beside its trajectory."""
+    return {name: np.asarray(getattr(run, name), dtype=np.float32) for name in ("contact_force", "holder_force")}
+
+
+def drop_labels(run: DraggedRun) -> dict[str, Any]:
+    """Return the labels of a drop: see `stickslip_schemas.drag_stage`."""
+    return {"bias_side": int(run.bias_side), "landed_side": int(run.landed_side), "bias": float(run.bias)}
+
+
 def result_of(
     simulation: "ClothSimulation",
     fabric: "Fabric",

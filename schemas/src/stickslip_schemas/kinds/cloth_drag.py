@@ -23,8 +23,8 @@ from stickslip_schemas.cloth import (
     SubstrateAxis,
     TextureAxis,
 )
+from stickslip_schemas.drag_stage import DROP_LABELS, Viewpoint, ViewpointName
 from stickslip_schemas.jobs import SeedRule
-from stickslip_schemas.viewpoints import Viewpoint, ViewpointName
 
 
 class ClothDragAxes(ClothAxes):
@@ -48,7 +48,8 @@ class ClothDragSimulation(ClothSimulation):
     """The trajectory of a dragged cloth: all that it depends on besides the build."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
-    self_friction: float | None = None
+    # Left out where it is null: keys and splits are then those of documents that are older than the field.
+    self_friction: float | None = Field(default=None, exclude_if=lambda value: value is None)
 
 
 class ClothDragRender(ClothRender):
@@ -114,18 +115,7 @@ class ClothDragSpec(ClothSpec):
         return (
             *self.clip_arrays(),
             *self.physical_arrays(),
-            ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
-            ArrayLayout(
-                "landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"
-            ),
-            ArrayLayout(
-                "bias",
-                "float64",
-                (),
-                (),
-                "what broke the symmetry: horizontal over vertical gravity during the drop",
-                fill=NAN,
-            ),
+            *DROP_LABELS,
             *self.solver_arrays(),
             *(self.over_time(name, "float32", (3,), ("xyz",), text, fill=NAN) for name, text in forces),
             *self.mesh_arrays(),

@@ -24,9 +24,9 @@ from stickslip_schemas.cloth import (
     TextureAxis,
     codes,
 )
+from stickslip_schemas.drag_stage import DROP_LABELS, Viewpoint, ViewpointName
 from stickslip_schemas.fabrics import FabricNumbers, Material
 from stickslip_schemas.jobs import SeedRule
-from stickslip_schemas.viewpoints import Viewpoint, ViewpointName
 
 
 class ClothOnClothAxes(ClothAxes):
@@ -111,16 +111,11 @@ class ClothOnClothSpec(ClothSpec):
             ("contact_force", "force of the stretched cloth on the cloth [N]"),
             ("holder_force", "force of the holders on the cloth [N]"),
         )
-        bias = "what broke the symmetry: horizontal over vertical gravity during the drop"
         return (
             *self.clip_arrays(),
             *self.physical_arrays(),
             codes("substrate_material", self.names("substrate_material")),
-            ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
-            ArrayLayout(
-                "landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"
-            ),
-            ArrayLayout("bias", "float64", (), (), bias, fill=NAN),
+            *DROP_LABELS,
             ArrayLayout(
                 "least_distance",
                 "float64",

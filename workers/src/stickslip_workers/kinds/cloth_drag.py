@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import TaskResult
 
-from stickslip_workers.cloth import fabric_of, kernel_level, result_of
+from stickslip_workers.cloth import drop_labels, fabric_of, forces_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind
 from stickslip_workers.progress import tell
 
@@ -34,16 +33,7 @@ def _simulate_one(simulation: "ClothDragSimulation", store: Store) -> TaskResult
         seed=simulation.seed,
         on_frame=tell,
     )
-    forces = {
-        "contact_force": np.asarray(run.contact_force, dtype=np.float32),
-        "holder_force": np.asarray(run.holder_force, dtype=np.float32),
-    }
-    labels = {
-        "bias_side": int(run.bias_side),
-        "landed_side": int(run.landed_side),
-        "bias": float(run.bias),
-    }
-    return result_of(simulation, fabric, run, store, record=forces, labels=labels)
+    return result_of(simulation, fabric, run, store, record=forces_of(run), labels=drop_labels(run))
 
 
 KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth", kernel=kernel_level)

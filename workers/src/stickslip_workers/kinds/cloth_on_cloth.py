@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 from stickslip_schemas.store import Store
 from stickslip_schemas.tasks import TaskResult
 
-from stickslip_workers.cloth import fabric_of, kernel_level, named_fabric, result_of
+from stickslip_workers.cloth import drop_labels, fabric_of, forces_of, kernel_level, named_fabric, result_of
 from stickslip_workers.kinds import Kind
 from stickslip_workers.progress import tell
 
@@ -35,17 +34,8 @@ def _simulate_one(simulation: "ClothOnClothSimulation", store: Store) -> TaskRes
         seed=simulation.seed,
         on_frame=tell,
     )
-    forces = {
-        "contact_force": np.asarray(run.contact_force, dtype=np.float32),
-        "holder_force": np.asarray(run.holder_force, dtype=np.float32),
-    }
-    labels = {
-        "bias_side": int(run.bias_side),
-        "landed_side": int(run.landed_side),
-        "bias": float(run.bias),
-        "least_distance": float(run.least_distance),
-    }
-    return result_of(simulation, fabric, run, store, record=forces, labels=labels)
+    labels = drop_labels(run) | {"least_distance": float(run.least_distance)}
+    return result_of(simulation, fabric, run, store, record=forces_of(run), labels=labels)
 
 
 KIND = Kind(simulate=_simulate, batch=1, solver="stickslip_sim_core.cloth", kernel=kernel_level)

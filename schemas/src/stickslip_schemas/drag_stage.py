@@ -1,8 +1,9 @@
-"""Cameras of the stage of drop-and-drag, the rig `drag`."""
+"""The stage of drop-and-drag [thesis, 4.2.3]: its cameras, the rig `drag`, and the labels of a drop."""
 
 from enum import StrEnum
 from typing import Annotated
 
+from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import quantity
 from stickslip_schemas.cloth import OwnName, name_schema
 
@@ -35,3 +36,16 @@ ViewpointName = Annotated[OwnName, quantity("Viewpoint"), name_schema(Viewpoint)
 TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
 HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)
 """`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
+
+DROP_LABELS = (
+    ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
+    ArrayLayout("landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"),
+    ArrayLayout(
+        "bias",
+        "float64",
+        (),
+        (),
+        "what broke the symmetry: horizontal over vertical gravity during the drop",
+        fill=NAN,
+    ),
+)
