@@ -72,7 +72,7 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
     const double share = static_cast<double>(size) / all, dt = share * (end - begin);
     const Drive drive = motion(begin + (end - begin) * (tick + size) / all);
     StepReport report;
-    const bool solved = stepper_.attempt(dt, drive, report);
+    const bool solved = stepper_.attempt(dt, drive, level_ >= finest_, report);
     const double missed = stepper_.missed() / control_.error;
     if (solved ? level_ < finest_ && missed > reject_at : level_ < last_) {
       stepper_.reject();

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "math/stopwatch.hpp"
 
@@ -17,6 +18,11 @@ constexpr int reversals_from = 4;
 // With pairs: rounds of making pairs bear in an iteration, and the tolerance of GMRES, which predicts their gaps.
 constexpr int rounds_max = 6;
 constexpr double pairs_tolerance = 1e-4;
+// The smoothed law begins with this share of the thickness, and gets sharper by this factor once forces miss it by no
+// more than so many times those that it smooths over. GMRES then solves to this tolerance, and no node goes further in an
+// iteration than so many margins of what is known to be near.
+constexpr double smooth_from = 0.1, smooth_less = 0.1, smooth_near = 5.0;
+constexpr double smooth_tolerance = 1e-6, smooth_reach = 4.0;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
 constexpr double length_tolerance = 2e-9;
 // Nodes that are stopped one by one strain the cloth: so all go less far together, down to this share, before any one
@@ -79,7 +85,7 @@ void Newton::predict(const StepProblem& problem, Buffer<double>& x, bool from_re
 }
 
 StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations,
-                          StepReport& report, double krylov_tolerance) {
+                          StepReport& report, double krylov_tolerance, bool smoothly) {
   const int free_nodes = assembly_.numbering.free_nodes;
   contact.hold_reversed = false;
   predict(problem, x, from_rest);
@@ -92,6 +98,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   factors.of(problem.dt);
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
+  if (pairs) pairs->smoothing = smoothly ? smooth_from * pairs->near.thickness : 0.0;
   if (pairs) pairs->begin(problem.start, ends_, contact.stiffness, contact_share);
   Norms norms = look(problem, x);
   if (pairs) pairs->mark_best();
@@ -102,11 +109,12 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   trial_ = best_ = x;
   double least = norms.squared;
   int strained = 0;
+  double last_share = 0.0;
   strained_ = false;
   for (int iteration = 0; iteration < iterations; ++iteration) {
     contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
-    if (iteration > 0 && norms.largest <= settings_.tolerance && arrived(x)) break;
+    if (iteration > 0 && !smoothly && norms.largest <= settings_.tolerance && arrived(x)) break;
     if (!std::isfinite(norms.squared)) break;
     strained = strained_ ? strained + 1 : 0;
     if (strained > strained_max && iterations < settings_.newton_max) break;
@@ -114,7 +122,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     correct(problem, x, krylov_tolerance, report);
     // Along the line, non-monotone [Grippo et al. 1986].
     const double limit = *std::max_element(window, window + 4);
-    double share = 1.0;
+    double share = pairs && pairs->smoothing > 0.0 ? reach() : 1.0;
     Norms next;
     for (int cut = 0;; ++cut) {
       trial_ = x;
@@ -138,13 +146,23 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     for (int i = 0; i < free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
     modes = contact.mode;
     std::swap(x, trial_);
+    last_share = share;
     norms = next;
     if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);
     window[iteration % 4] = norms.squared;
+    if (pairs && pairs->smoothing > 0.0 && sharpen(problem, x, share, norms)) {
+      if (pairs->smoothing == 0.0) break;
+      std::fill(window, window + 4, norms.squared);
+      least = std::numeric_limits<double>::infinity();
+    }
     if (norms.squared < least) {
       least = norms.squared, best_ = x;
       if (pairs) pairs->mark_best();
     }
+  }
+  if (pairs && pairs->smoothing > 0.0) {
+    pairs->smoothing = 0.0;
+    norms = look(problem, x, last_share);
   }
   if (!(norms.largest <= settings_.tolerance)) {
     x = best_;
@@ -153,6 +171,30 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     norms = look(problem, x);
   }
   return {norms.largest <= settings_.tolerance && arrived(x), norms.largest};
+}
+
+// The share of the change that takes no node further than is known of what is near.
+double Newton::reach() const {
+  double farthest = 0.0;
+  for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+    farthest = std::max(farthest, at_node(change_, i).cast<double>().norm());
+  }
+  return std::min(1.0, smooth_reach * pairs->near.margin() / farthest);
+}
+
+// Once the smoothed law holds nearly: whether the exact one does, or else makes it sharper. Returns whether it did
+// either.
+bool Newton::sharpen(const StepProblem& problem, const Buffer<double>& x, double share, Norms& norms) {
+  if (!(norms.largest <= std::max(smooth_near * pairs->smoothed_force(), settings_.tolerance))) return false;
+  const double smoothing = pairs->smoothing;
+  if (norms.largest <= settings_.tolerance && arrived(x)) {
+    pairs->smoothing = 0.0;
+    norms = look(problem, x, share);
+    if (norms.largest <= settings_.tolerance) return true;
+  }
+  pairs->smoothing = smooth_less * smoothing;
+  norms = look(problem, x, share);
+  return true;
 }
 
 // Solves J change = -F to the tolerance of GMRES, in the directions that contact leaves free; it prescribes the others.
@@ -172,7 +214,9 @@ void Newton::correct(const StepProblem& problem, const Buffer<double>& x, double
   }
   if (!pairs) return;
   int round = 0;
-  for (; round < rounds_max && pairs->activate(change_); ++round) correct_with_pairs(problem, x, report);
+  if (pairs->smoothing == 0.0) {
+    for (; round < rounds_max && pairs->activate(change_); ++round) correct_with_pairs(problem, x, report);
+  }
   strained_ = round == rounds_max;
   pairs->solved(change_);
 }
@@ -185,7 +229,7 @@ void Newton::correct_with_pairs(const StepProblem& problem, const Buffer<double>
   contact.force = force_;
   pair_rows_ = pairs->rows();
   assembly_.matrix.pairs = &pair_rows_;
-  const KrylovResult solved = solve_linear(pair_factor_.view(), std::min(settings_.krylov_tolerance, pairs_tolerance));
+  const KrylovResult solved = solve_linear(pair_factor_.view(), pairs->smoothing > 0.0 ? smooth_tolerance : std::min(settings_.krylov_tolerance, pairs_tolerance));
   assembly_.matrix.pairs = nullptr;
   pair_factor_.spent(solved.iterations);
   report.krylov += solved.iterations;

@@ -18,7 +18,7 @@ bool PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Contac
   for (const Pair& pair : pairs.list()) {
     if (pair.bears()) names.push_back({pair.who.kind, pair.who.first, pair.feature, pair.row.mode, pair.insistence});
   }
-  const bool stale = !made_ || std::abs(dt - dt_) > 1e-9 * dt_ || excess_ > settings.refactor_after ||
+  const bool stale = !made_ || pairs.smoothing > 0.0 || std::abs(dt - dt_) > 1e-9 * dt_ || excess_ > settings.refactor_after ||
                      last_ >= settings.krylov_max ||
                      changed(contact, names) > changed_share * static_cast<double>(names.size());
   if (!stale) return false;

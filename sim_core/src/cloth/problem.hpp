@@ -60,12 +60,14 @@ struct FoldData {
   float* coefficients;  // (triangles, 2): aa, ab
 };
 
-// Pairs of cloth with cloth that bear: each takes its force from the motion v = sum w_i dx_i of its four nodes.
+// Pairs of cloth with cloth that bear. Each has three weights of its four nodes: those of its closest points, and their
+// derivatives by where these lie. Its motions v_a = sum w_ai dx_i make forces f_a = sum C_ab v_b, of which node i gets
+// sum w_ai f_a.
 struct PairData {
   int count;
   const int* nodes;        // (count, 4), -1 for held ones
-  const float* weights;    // (count, 4)
-  const float* stiffness;  // (count, 3, 4): columns, N/m
+  const float* weights;    // (count, 3, 4)
+  const float* stiffness;  // (count, 3 b, 3 columns, 3 a, 4): C, N/m
 };
 
 // K = mass + bending (x) 1 + membrane + folds + pairs, over the free nodes.

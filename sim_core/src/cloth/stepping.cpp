@@ -15,6 +15,8 @@ constexpr double loose = 0.1;
 constexpr double easy = 0.6;
 // Times the patience where pairs are near: then halves of a step are hardly easier than the whole.
 constexpr double near_pairs = 2.5;
+// Iterations by way of a smoothed law.
+constexpr int smooth_iterations = 100;
 
 }  // namespace
 
@@ -59,8 +61,14 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
 }
 
 int Stepper::patience() const {
-  const bool near = newton.pairs && !newton.pairs->list().empty();
-  return static_cast<int>((near ? near_pairs : 1.0) * settings_.patience);
+  return static_cast<int>((near() ? near_pairs : 1.0) * settings_.patience);
+}
+
+bool Stepper::near() const { return newton.pairs && !newton.pairs->list().empty(); }
+
+StepOutcome Stepper::solve_smoothly(const StepProblem& problem, StepReport& report) {
+  assembly_.definite = true;
+  return newton.solve(problem, x, false, smooth_iterations, report, settings_.krylov_tolerance, true);
 }
 
 void Stepper::advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report) {
@@ -81,12 +89,16 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
   if (depth >= depth_hint_) {
     assembly_.definite = depth > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
     outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
-                           settings_.krylov_tolerance);
+                           settings_.krylov_tolerance, false);
     // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
-    if (!outcome.converged && (deepest || !newton.pairs || newton.pairs->list().empty())) {
+    if (!outcome.converged && near()) {
       x = driven;
-      outcome =
-          newton.solve(problem, x, deepest, settings_.newton_max, report, std::max(loose, settings_.krylov_tolerance));
+      outcome = solve_smoothly(problem, report);
+    }
+    if (!outcome.converged && (deepest || !near())) {
+      x = driven;
+      outcome = newton.solve(problem, x, deepest, settings_.newton_max, report,
+                             std::max(loose, settings_.krylov_tolerance), false);
     }
   }
   if (!outcome.converged && !deepest) {
@@ -121,14 +133,19 @@ void Stepper::take(double dt, double residual, StepReport& report) {
   last_dt_ = dt;
 }
 
-bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
+bool Stepper::attempt(double dt, const Drive& drive, bool hard, StepReport& report) {
   check(dt, drive);
   drive_nodes(0.0, 1.0, dt, drive);
   assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, predicted_, false);
-  tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance);
+  const Buffer<double> driven = x;
+  tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
+  if (!tried_.converged && hard && near()) {
+    x = driven;
+    tried_ = solve_smoothly(problem, report);
+  }
   tried_dt_ = dt;
   return tried_.converged;
 }

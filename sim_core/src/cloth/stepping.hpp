@@ -30,8 +30,8 @@ class Stepper {
   StepReport step(double dt, const Drive& drive);
 
   // One attempt at a step, as a whole and within the settings' patience, to be accepted or rejected: then nothing has
-  // happened.
-  bool attempt(double dt, const Drive& drive, StepReport& report);
+  // happened. `hard`: by way of a smoothed law, too, where pairs are near.
+  bool attempt(double dt, const Drive& drive, bool hard, StepReport& report);
   void accept(const Drive& drive, StepReport& report);
   void reject();
   // Largest distance of a free node from where it was predicted in the last attempt, m.
@@ -43,6 +43,8 @@ class Stepper {
 
  private:
   int patience() const;
+  bool near() const;
+  StepOutcome solve_smoothly(const StepProblem& problem, StepReport& report);
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);
   void count_contacts(StepReport& report) const;

@@ -16,6 +16,18 @@
 //
 // with t = tau/|tau|, beta = mu r_N/|tau|, P = 1 - n n^T - t t^T and s = min(kappa, beta k/(1 - beta)), by which
 // friction turns with the slip.
+//
+// Where this does not find which pairs bear and which slip, the law is smoothed over an energy epsilon, as by the
+// logarithms of what is left to r_N >= 0 and to |r_T| <= mu r_N: r_N g = epsilon and u = -2 epsilon r_T/((mu r_N)^2 -
+// |r_T|^2). In the form above, which holds whatever sign g has [Chen & Harker 1993; Kanzow 1996],
+//
+//     r_N = R_N = (z + sqrt(z^2 + 4 k epsilon))/2,  z = r_N - k g,
+//     r_T = rho t,  rho + 2 k epsilon rho/((mu R_N)^2 - rho^2) = |tau|,
+//
+// and it is the exact law in the limit of no epsilon.
+//
+// As the normal turns, friction turns with it: dr = turning dn, to which sticking pairs, whose force is what holds
+// them, add nothing.
 #pragma once
 
 #include <Eigen/Core>
@@ -28,6 +40,7 @@ struct PairSight {
   Eigen::Vector3d slip;            // m: of the first over the second since the start of the step, across the normal
   Eigen::Vector3d force;           // N: on the first
   double mu, stiffness, proximal;  // k and kappa, N/m
+  double smoothing = 0.0;          // epsilon, J
 };
 
 struct PairRow {
@@ -35,6 +48,7 @@ struct PairRow {
   Eigen::Matrix3d stiffness = Eigen::Matrix3d::Zero();  // N/m
   Eigen::Matrix3d symmetric = Eigen::Matrix3d::Zero();  // its part for the factor: without mu kappa t n^T
   Eigen::Vector3d force = Eigen::Vector3d::Zero();      // N
+  Eigen::Matrix3d turning = Eigen::Matrix3d::Zero();    // N: by the normal's change
 };
 
 // The branch that holds there. A pair that sinks in is about to bear more than r_N: it sticks up to mu (r_N - k g).

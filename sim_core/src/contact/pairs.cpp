@@ -14,9 +14,10 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 using Eigen::Vector4d;
+using Motions = Eigen::Matrix<double, 9, 1>;
 
 // Stiffness of the law, and of the proximal term, over that of a pair's nodes.
-constexpr double law_share = 0.1, proximal_share = 10.0;
+constexpr double law_share = 0.1, proximal_share = 10.0, smooth_proximal_share = 1000.0;
 // A pair whose predicted gap is below minus so much of the thickness is made to bear.
 constexpr double predicted_gap = 0.02;
 // Edges whose squared sine is smaller have no pair, nor have those that are closest nearer to an end than so much of
@@ -44,6 +45,36 @@ Matrix3d axes(PairKind kind, const FourPoints& x) {
   return out;
 }
 
+// How the closest points move over their pieces, and how the normal turns, by a pair's motions m, m_1, m_2: they lie
+// where rho is across the directions a_k = sum w_ki x_i, so that
+//
+//     sum_l a_k . a_l dtheta_l = -(a_k . m + rho . m_k),   dn = (1 - n n^T) (m + sum a_k dtheta_k)/d.
+void turn(Pair& pair, const Buffer<double>& x) {
+  pair.sliding.setZero();
+  pair.turning.setZero();
+  if (!pair.bears() || pair.sight.force.isZero(0.0)) return;
+  const FourPoints at = points_of(pair.who, x);
+  const int count = (pair.along_first.isZero(0.0) ? 0 : 1) + (pair.along_second.isZero(0.0) ? 0 : 1);
+  const double distance = pair.sight.gap + pair.thickness;
+  const Vector3d n = pair.sight.normal, rho = distance * n;
+  Eigen::Matrix<double, 3, 2> a;
+  a << between_closest(pair.along_first, at), between_closest(pair.along_second, at);
+  Eigen::Matrix<double, 2, 9> asked = Eigen::Matrix<double, 2, 9>::Zero();
+  for (int k = 0; k < count; ++k) {
+    asked.block<1, 3>(k, 0) = -a.col(k).transpose();
+    asked.block<1, 3>(k, 3 + 3 * k) = -rho.transpose();
+  }
+  if (count == 2) {
+    const Eigen::Matrix2d inner = a.transpose() * a;
+    pair.sliding = inner.inverse() * asked;
+  } else if (count == 1) {
+    pair.sliding.row(0) = asked.row(0) / a.col(0).squaredNorm();
+  }
+  Eigen::Matrix<double, 3, 9> way = a * pair.sliding;
+  way.leftCols<3>() += Matrix3d::Identity();
+  pair.turning = pair.row.turning * (way - n * (n.transpose() * way)) / distance;
+}
+
 // By how much a pair that bears misses what its row asks for, m.
 double missed(const PairSight& sight, int mode) {
   return std::hypot(sight.gap, mode == contact_stick ? sight.slip.norm() : 0.0);
@@ -51,8 +82,29 @@ double missed(const PairSight& sight, int mode) {
 
 }  // namespace
 
+Motions Pair::motions(const Buffer<float>& change, int free_nodes) const {
+  Motions out = given;
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] >= free_nodes) continue;
+    const Vector3d way = at_node(change, who.node[c]).cast<double>();
+    out.segment<3>(0) += weights[c] * way;
+    out.segment<3>(3) += along_first[c] * way;
+    out.segment<3>(6) += along_second[c] * way;
+  }
+  return out;
+}
+
+Eigen::Matrix<double, 9, 9> Pair::stiffness() const {
+  Eigen::Matrix<double, 9, 9> out;
+  out.topRows<3>() = -turning;
+  out.topLeftCorner<3, 3>() += row.stiffness;
+  out.middleRows<3>(3) = -sight.force * sliding.row(0);
+  out.bottomRows<3>() = -sight.force * sliding.row(1);
+  return out;
+}
+
 Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
-  Vector3d out = given;
+  Vector3d out = given.head<3>();
   for (int c = 0; c < 4; ++c) {
     if (who.node[c] < free_nodes) out += weights[c] * at_node(change, who.node[c]).cast<double>();
   }
@@ -60,7 +112,8 @@ Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
 }
 
 Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
-  return row.force - row.stiffness * motion(change, free_nodes);
+  const Motions way = motions(change, free_nodes);
+  return row.force - row.stiffness * way.head<3>() + turning * way;
 }
 
 Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
@@ -99,6 +152,7 @@ void Pairs::look(const Buffer<double>& x, double share, Buffer<double>& residual
   merge();
   for (Pair& pair : pairs_) {
     pair.row = pair_row(pair.sight);
+    turn(pair, x);
     if (pair.sight.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.sight.force;
   }
@@ -177,11 +231,32 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   const double distance = rho.norm();
   least_distance_ = std::min(least_distance_, distance);
   double softness = 0.0;
-  Vector3d given = Vector3d::Zero();
+  Vector4d along_first = Vector4d::Zero(), along_second = Vector4d::Zero();
+  if (who.kind == PairKind::edge_edge) {
+    along_first << -1.0, 1.0, 0.0, 0.0;
+    along_second << 0.0, 0.0, 1.0, -1.0;
+  } else {
+    int base = -1;
+    for (int c = 1; c < 4; ++c) {
+      if (weights[c] == 0.0) continue;
+      if (base < 0) {
+        base = c;
+        continue;
+      }
+      Vector4d& along = along_first.isZero(0.0) ? along_first : along_second;
+      along[base] = 1.0;
+      along[c] = -1.0;
+    }
+  }
+  Motions given = Motions::Zero();
   for (int c = 0; c < 4; ++c) {
     const int node = who.node[c];
     softness += weights[c] * weights[c] * softness_[node];
-    if (node >= free_nodes_) given += weights[c] * (at_node(*ends_, node) - at_node(x, node));
+    if (node < free_nodes_) continue;
+    const Vector3d way = at_node(*ends_, node) - at_node(x, node);
+    given.segment<3>(0) += weights[c] * way;
+    given.segment<3>(3) += along_first[c] * way;
+    given.segment<3>(6) += along_second[c] * way;
   }
   if (!(softness > 0.0) || !(distance > 0.0)) return;
   const Vector3d n = rho / distance;
@@ -197,9 +272,12 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
       {who,
        feature,
        weights,
-       {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, proximal_share / softness},
+       {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, (smoothing > 0.0 ? smooth_proximal_share : proximal_share) / softness,
+        law_share / softness * smoothing * smoothing},
        first - 0.5 * rho,
        thickness,
+       along_first,
+       along_second,
        given});
 }
 
@@ -216,7 +294,7 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
       pairs_[i].insistence = before[o].insistence;
       const int mode = before[o].row.mode;
       const double last = missed(before[o].sight, mode), now = missed(pairs_[i].sight, mode);
-      if (share == 1.0 && mode != contact_open && last > insist_from && last < insist_up_to * pairs_[i].thickness &&
+      if (smoothing == 0.0 && share == 1.0 && mode != contact_open && last > insist_from && last < insist_up_to * pairs_[i].thickness &&
           now > insist_above * last) {
         pairs_[i].insistence = std::min(insist_more * before[o].insistence, insist_max);
       }
@@ -312,6 +390,12 @@ bool Pairs::active() const {
                      [](const Pair& pair) { return pair.bears() || !pair.sight.force.isZero(0.0); });
 }
 
+double Pairs::smoothed_force() const {
+  double sum = 0.0;
+  for (const Pair& pair : pairs_) sum += pair.sight.stiffness;
+  return pairs_.empty() ? 0.0 : smoothing * sum / static_cast<double>(pairs_.size());
+}
+
 int Pairs::bearing() const {
   return static_cast<int>(std::count_if(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.bears(); }));
 }
@@ -323,6 +407,8 @@ bool Pairs::activate(const Buffer<float>& change) {
     const Vector3d force = pair.sight.force + pair.force_change(change, free_nodes_);
     if (force.dot(pair.sight.normal) >= 0.0) continue;
     pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.sight.force};
+    pair.turning.setZero();
+    pair.sliding.setZero();
     pair.added = false;
     pair.released = changed = true;
   }
@@ -361,11 +447,16 @@ PairData Pairs::rows() {
     if (!pair.bears()) continue;
     for (int c = 0; c < 4; ++c) {
       nodes_.push_back(pair.who.node[c] < free_nodes_ ? pair.who.node[c] : -1);
-      weights_.push_back(static_cast<float>(pair.weights[c]));
     }
-    for (int column = 0; column < 3; ++column) {
-      for (int r = 0; r < 3; ++r) stiffness_.push_back(static_cast<float>(pair.row.stiffness(r, column)));
-      stiffness_.push_back(0.0f);
+    for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
+      for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
+    }
+    const Eigen::Matrix<double, 9, 9> stiffness = pair.stiffness();
+    for (int column = 0; column < 9; ++column) {
+      for (int r = 0; r < 9; ++r) {
+        stiffness_.push_back(static_cast<float>(stiffness(r, column)));
+        if (r % 3 == 2) stiffness_.push_back(0.0f);
+      }
     }
   }
   return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
@@ -373,10 +464,12 @@ PairData Pairs::rows() {
 
 void Pairs::subtract_right_side(Buffer<float>& force) const {
   for (const Pair& pair : pairs_) {
-    const Vector3d change = pair.row.force - pair.row.stiffness * pair.given;
+    Motions change = -pair.stiffness() * pair.given;
+    change.head<3>() += pair.row.force;
     if (change.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] < free_nodes_) at_node(force, pair.who.node[c]) -= (pair.weights[c] * change).cast<float>();
+      if (pair.who.node[c] >= free_nodes_) continue;
+      at_node(force, pair.who.node[c]) -= (pair.weights[c] * change.segment<3>(0) + pair.along_first[c] * change.segment<3>(3) + pair.along_second[c] * change.segment<3>(6)).cast<float>();
     }
   }
 }

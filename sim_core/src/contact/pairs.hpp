@@ -21,7 +21,13 @@ struct Pair {
   PairSight sight;
   Eigen::Vector3d middle;  // of the two points, m
   double thickness;        // m
-  Eigen::Vector3d given;   // m: of its motion, by nodes that are held and not yet at their ends
+  // The derivatives of the weights by where the closest points lie.
+  Eigen::Vector4d along_first, along_second;
+  // m: of its motions, by nodes that are held and not yet at their ends
+  Eigen::Matrix<double, 9, 1> given = Eigen::Matrix<double, 9, 1>::Zero();
+  // Of where the closest points lie, and of the force as the normal turns, by the motions.
+  Eigen::Matrix<double, 2, 9> sliding = Eigen::Matrix<double, 2, 9>::Zero();
+  Eigen::Matrix<double, 3, 9> turning = Eigen::Matrix<double, 3, 9>::Zero();
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force by the last linear problem, N
   PairRow row{};
   double insistence = 1.0;               // by which its proximal stiffness has grown in this attempt
@@ -30,6 +36,9 @@ struct Pair {
   bool bears() const { return row.mode != contact_open; }
   // Of its first point over its second, m, and the change of its force by it, N.
   Eigen::Vector3d motion(const Buffer<float>& change, int free_nodes) const;
+  Eigen::Matrix<double, 9, 1> motions(const Buffer<float>& change, int free_nodes) const;
+  // C, N/m.
+  Eigen::Matrix<double, 9, 9> stiffness() const;
   Eigen::Vector3d force_change(const Buffer<float>& change, int free_nodes) const;
 };
 
@@ -39,6 +48,7 @@ class Pairs {
   Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes);
 
   Neighbourhood near;
+  double smoothing = 0.0;  // m: over which the law is smooth; 0 for the exact one
 
   // Forgets all forces.
   void restart();
@@ -71,6 +81,8 @@ class Pairs {
   void subtract_right_side(Buffer<float>& force) const;
 
   int bearing() const;
+  // By which forces are off in the mean by smoothing, N.
+  double smoothed_force() const;
   // Least distance of any two pieces that do not hang together at the last look, m; infinite where none is near.
   double least_distance() const { return least_distance_; }
 

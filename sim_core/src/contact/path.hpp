@@ -27,6 +27,7 @@ class Neighbourhood {
   // at `from` keeps a fifth of its distance.
   double common_share(const Buffer<double>& from, const Buffer<double>& to);
 
+  double margin() const { return margin_; }
   int rebuilds = 0;
 
  private:

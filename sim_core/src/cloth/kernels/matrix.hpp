@@ -27,15 +27,21 @@ inline void add_folds(const FoldData& folds, const Node* in, Node* out) {
 inline void add_pairs(const PairData& pairs, const Node* in, Node* out) {
   for (int p = 0; p < pairs.count; ++p) {
     const int* nodes = pairs.nodes + 4L * p;
-    const float* weights = pairs.weights + 4L * p;
-    const Node* column = reinterpret_cast<const Node*>(pairs.stiffness) + 3L * p;
-    Node motion{};
-    for (int c = 0; c < 4; ++c) {
-      if (nodes[c] >= 0) motion += spread(weights[c]) * in[nodes[c]];
+    const float* weights = pairs.weights + 12L * p;
+    const Node* column = reinterpret_cast<const Node*>(pairs.stiffness) + 27L * p;
+    Node force[3] = {};
+    for (int b = 0; b < 3; ++b) {
+      Node motion{};
+      for (int c = 0; c < 4; ++c) {
+        if (nodes[c] >= 0) motion += spread(weights[4 * b + c]) * in[nodes[c]];
+      }
+      for (int r = 0; r < 3; ++r, column += 3) {
+        for (int a = 0; a < 3; ++a) force[a] += column[a] * spread(motion[r]);
+      }
     }
-    const Node force = column[0] * spread(motion[0]) + column[1] * spread(motion[1]) + column[2] * spread(motion[2]);
     for (int c = 0; c < 4; ++c) {
-      if (nodes[c] >= 0) out[nodes[c]] += spread(weights[c]) * force;
+      if (nodes[c] < 0) continue;
+      out[nodes[c]] += spread(weights[c]) * force[0] + spread(weights[4 + c]) * force[1] + spread(weights[8 + c]) * force[2];
     }
   }
 }
