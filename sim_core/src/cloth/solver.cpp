@@ -90,6 +90,18 @@ std::unique_ptr<Pairs> pairs_of(const ClothMesh& mesh, const Numbering& numberin
   return std::make_unique<Pairs>(std::move(surface), settings, margin_share * cell, numbering.free_nodes);
 }
 
+// Radius of the smallest circle around a triangle at rest, m: its circumcircle, or that of its longest side.
+double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
+  std::array<double, 3> side;
+  for (int c = 0; c < 3; ++c) {
+    side[c] =
+        (mesh.rest.row(mesh.triangles(triangle, c)) - mesh.rest.row(mesh.triangles(triangle, (c + 1) % 3))).norm();
+  }
+  std::sort(side.begin(), side.end());
+  const auto [a, b, c] = side;
+  return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
+}
+
 std::unique_ptr<SmoothContact> smooth_of(const ClothMesh& mesh, const Numbering& numbering,
                                          const PairSettings& settings, const SurfaceMeshes& surfaces) {
   Buffer<double> x(4L * numbering.nodes, 0.0);
@@ -97,8 +109,16 @@ std::unique_ptr<SmoothContact> smooth_of(const ClothMesh& mesh, const Numbering&
   for (int i = 0; i < numbering.others; ++i) at_node(x, others[i]) = surfaces.positions.row(i).transpose();
   Triples triangles;
   append(surfaces.triangles, others, triangles);
+  std::vector<double> radius(numbering.free_nodes, 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    const double own = circle_around(mesh, t);
+    for (int c = 0; c < 3; ++c) {
+      const int node = numbering.node[mesh.triangles(t, c)];
+      if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
+    }
+  }
   return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces), settings,
-                                         surfaces.crease, x, numbering.free_nodes);
+                                         surfaces.crease, x, radius);
 }
 
 }  // namespace

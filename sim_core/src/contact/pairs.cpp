@@ -64,7 +64,7 @@ Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
 }
 
 Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
-    : near(std::move(surface), *std::max_element(settings.thickness.begin(), settings.thickness.end()), margin),
+    : near(std::move(surface), settings.farthest(), margin),
       settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),

@@ -214,6 +214,18 @@ PatchShape Patches::shape(const Buffer<double>& x) const {
     }
   }
   for (Vector3d& normal : out.normals) normal.normalize();
+  // Of the circle that touches at a corner and goes through the next: 2 N . (P_i - P_j)/|P_i - P_j|^2.
+  out.curvature.assign(groups_, {0.0, 0.0});
+  for (std::size_t t = 0; t < triangles_.size(); ++t) {
+    for (int k = 0; k < 3; ++k) {
+      for (int to : {next(k), after_next(k)}) {
+        const Vector3d edge = at_node(x, triangles_[t][k]) - at_node(x, triangles_[t][to]);
+        const double bulge = 2.0 * out.normals[group_[t][k]].dot(edge) / edge.squaredNorm();
+        auto& most = out.curvature[group_[t][k]];
+        most = {std::max(most[0], bulge), std::max(most[1], -bulge)};
+      }
+    }
+  }
   return out;
 }
 
@@ -335,6 +347,12 @@ double Patches::side_of(const PatchShape& shape, const Vector3d& p, int t, const
     }
   }
   return normal.dot(p - c) < 0.0 ? -1.0 : 1.0;
+}
+
+double Patches::curvature(const PatchShape& shape, int t, const Vector3d& weights, double side) const {
+  double out = 0.0;
+  for (int k = 0; k < 3; ++k) out += weights[k] * shape.curvature[group_[t][k]][side < 0.0];
+  return out;
 }
 
 Vector3d Patches::point(const PatchShape& shape, int t, const Vector3d& weights) const {

@@ -31,10 +31,12 @@
 
 namespace sim_core {
 
-// Where a surface is: its nodes, and the normals of the corners of its triangles.
+// Where a surface is: its nodes, and of the corners of its triangles the normals and the largest curvature of an edge
+// there, seen from the side where the normals point to and from the other, 0 where it is hollow.
 struct PatchShape {
   Buffer<double> x;
-  std::vector<Eigen::Vector3d> normals;  // by group of corners
+  std::vector<Eigen::Vector3d> normals;               // by group of corners
+  std::vector<std::array<double, 2>> curvature = {};  // 1/m
 };
 
 struct Foot {
@@ -61,6 +63,9 @@ class Patches {
   // On which side p is of the triangles themselves, of which its closest point is this one of this triangle [Baerentzen
   // & Aanaes 2005].
   double side_of(const PatchShape& shape, const Eigen::Vector3d& p, int triangle, const Eigen::Vector3d& weights) const;
+
+  // How much the surface bulges there towards a side, between its corners, 1/m.
+  double curvature(const PatchShape& shape, int triangle, const Eigen::Vector3d& weights, double side) const;
 
   // The point of the surface, and axes that turn with it there, of which the last is N.
   Eigen::Vector3d point(const PatchShape& shape, int triangle, const Eigen::Vector3d& weights) const;

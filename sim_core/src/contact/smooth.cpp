@@ -15,6 +15,8 @@ using Eigen::Vector3d;
 
 // Nodes look for surfaces as far as they may come in a step, times this.
 constexpr double reach_share = 1.5;
+// Curvatures that count, times the radius of a triangle's circle: what is sharper pokes through between nodes.
+constexpr double curvature_max = 0.5;
 
 std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, const std::vector<int>& sheet_of_node,
                             int sheets, const std::vector<double>& crease) {
@@ -27,15 +29,16 @@ std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, co
 
 SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
                              const PairSettings& settings, const std::vector<double>& crease, const Buffer<double>& x,
-                             int free_nodes)
+                             const std::vector<double>& radius)
     : sheet_of_node_(std::move(sheet_of_node)),
-      free_nodes_(free_nodes),
+      radius_(radius),
+      free_nodes_(static_cast<int>(radius.size())),
       settings_(settings),
       patches_(triangles, x, creases(triangles, sheet_of_node_, settings.sheets, crease)),
       tree_(patches_.triangles(), x),
-      track_{std::vector<int>(free_nodes, -1), std::vector<double>(free_nodes, 1.0)},
+      track_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
       kept_(track_),
-      feet_(free_nodes) {
+      feet_(radius.size()) {
   for (const auto& corners : triangles) first_ = std::min(first_, *std::min_element(corners.begin(), corners.end()));
 }
 
@@ -96,9 +99,17 @@ std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
   if (!found) return std::nullopt;
   if (found->on_patch) track_.triangle[node] = found->triangle;
   feet_[node] = *found;
-  const int surface = surface_of(found->triangle);
-  const double apart = 0.5 * (settings_.thickness[sheet_of_node_[node]] + settings_.thickness[surface]);
-  return SmoothTouch{found->height - apart, found->normal, surface - settings_.sheets};
+  return SmoothTouch{found->height - apart(node, *found), found->normal,
+                     surface_of(found->triangle) - settings_.sheets};
+}
+
+// What a node keeps, m: pairs stay idle as long as the triangles around it lie on the surface.
+double SmoothContact::apart(int node, const Foot& foot) const {
+  const int sheet = sheet_of_node_[node], surface = surface_of(foot.triangle);
+  const double r = radius_[node];
+  const double curvature = patches_.curvature(end_, foot.triangle, foot.weights, track_.side[node]);
+  const double sinking = 0.5 * r * r * std::min(curvature, curvature_max / r);
+  return std::max(settings_.mean(sheet, surface), settings_.apart(sheet, surface) + sinking);
 }
 
 // The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was somewhere, while

@@ -1,7 +1,9 @@
 // Contacts of the cloth's nodes with the smooth surfaces through the vertices of prescribed triangles.
 //
 // A node keeps half of both thicknesses away from the surface and feels it as it feels a body, by one normal and one
-// gap. It stays on the side of the triangles on which it is when a step begins. What nodes do not catch, triangles
+// gap. Where the surface is so curved that the triangles between nodes would cut into it, nodes keep further away: a
+// triangle in a circle of radius r sinks by r^2 kappa/2 below its corners on a surface of curvature kappa. A node stays
+// on the side of the triangles on which it is when a step begins. What nodes do not catch, triangles
 // that poke through between them, is left to pairs of closest points.
 #pragma once
 
@@ -25,9 +27,9 @@ struct SmoothTouch {
 class SmoothContact {
  public:
   // `triangles`: nodes; `sheet_of_node`: of cloth, and after them surfaces. `crease`: of each surface, see
-  // Patches. x: where the surfaces are.
+  // Patches. x: where the surfaces are. `radius`: of the circle around the largest triangle at each free node, m.
   SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, const PairSettings& settings,
-                const std::vector<double>& crease, const Buffer<double>& x, int free_nodes);
+                const std::vector<double>& crease, const Buffer<double>& x, const std::vector<double>& radius);
 
   // Forgets which triangles are touched.
   void restart();
@@ -49,7 +51,10 @@ class SmoothContact {
   void take_shapes(const Buffer<double>& start, const Buffer<double>& ends);
   int surface_of(int triangle) const { return sheet_of_node_[patches_.triangles()[triangle][0]]; }
 
+  double apart(int node, const Foot& foot) const;
+
   std::vector<int> sheet_of_node_;
+  std::vector<double> radius_;
   int free_nodes_;
   int first_ = std::numeric_limits<int>::max();  // of the surfaces' nodes, which are the last
   PairSettings settings_;
