@@ -9,7 +9,8 @@ namespace {
 
 using Eigen::Array3d;
 
-// Of the distance of a pair, what a motion leaves.
+// Of the distance of a pair, or of the thickness where that is less, what a motion leaves: what slides past each other
+// comes from far to about the thickness.
 constexpr double keep = 0.2;
 // Rounds in which nodes are capped one by one; after them all are by the same share.
 constexpr int rounds_max = 8;
@@ -24,13 +25,17 @@ Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double mar
       margin_(margin),
       share_(surface.sheet_of_node.size(), 1.0) {}
 
-// Half of the largest side of the box of the motions, which bounds them but for a common one.
-double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to) const {
+// Half of the diagonal of the box of the motions, which bounds them but for a common one.
+double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to) const { return moved(from, to, to); }
+
+// The same if each node goes to one of two places, or between them.
+double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const {
   Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
   for (int i : surface.vertices) {
-    const Array3d way = (at_node(to, i) - at_node(from, i)).array();
-    low = low.min(way);
-    high = high.max(way);
+    const Array3d way = (at_node(to, i) - at_node(from, i)).array(),
+                  other = (at_node(or_to, i) - at_node(from, i)).array();
+    low = low.min(way).min(other);
+    high = high.max(way).max(other);
   }
   return 0.5 * (high - low).matrix().norm();
 }
@@ -48,30 +53,42 @@ const std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {
 
 bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
   if (!reference_.empty() && moved(reference_, from) <= margin_ && moved(reference_, to) <= margin_) {
-    return cap_near(from, to);
+    Buffer<double> capped = to;
+    if (cap_near(from, capped)) return true;
+    if (moved(reference_, from, to) <= margin_) {
+      to = std::move(capped);
+      return false;
+    }
   }
   Buffer<double> at = from;
   bool whole = true;
   for (int hop = 0; hop < hops_max; ++hop) {
-    // From the middle of a hop both of its ends are within the margin.
-    const double way = moved(at, to), share = way > 2.0 * margin_ ? 2.0 * margin_ / way : 1.0;
-    const auto part = [&](double of_way) {
+    const auto part = [&](double share) {
       Buffer<double> out = at;
-      for (int i : surface.vertices) at_node(out, i) += of_way * (at_node(to, i) - at_node(at, i));
+      for (int i : surface.vertices) at_node(out, i) += share * (at_node(to, i) - at_node(at, i));
       return out;
     };
+    // From the middle of a hop both of its ends are within the margin, but for a common way. Nodes that are stopped do
+    // not go that: so where there are any, the hop is shorter.
+    double share = std::min(1.0, 2.0 * margin_ / moved(at, to));
     rebuild(part(0.5 * share));
-    if (share == 1.0) return cap_near(at, to) && whole;
-    Buffer<double> next = part(share);
-    const Buffer<double> wanted = next;
-    if (!cap_near(at, next)) {
-      // Who is stopped has arrived.
+    Buffer<double> wanted = part(share), next = wanted;
+    bool stopped = !cap_near(at, next);
+    const double shorter = margin_ / moved(part(0.5), at, to);
+    if (stopped && shorter < share) {
+      share = shorter;
+      rebuild(part(0.5 * share));
+      wanted = next = part(share);
+      stopped = !cap_near(at, next);
+    }
+    if (stopped) {  // who is has arrived
       whole = false;
       for (int i : surface.vertices) {
         if (at_node(next, i) != at_node(wanted, i)) at_node(to, i) = at_node(next, i);
       }
     }
     at = std::move(next);
+    if (share == 1.0) return whole;
   }
   for (int i : surface.vertices) at_node(to, i) = at_node(at, i);
   return false;
@@ -80,7 +97,7 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
 double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<double>& to) {
   double least = 1.0;
   for (const Candidate& pair : pairs(from)) {
-    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), keep));
+    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), keep, thickness));
   }
   return least;
 }
@@ -97,7 +114,7 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
     least = 1.0;
     for (const Candidate& pair : pairs_) {
       const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]), place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, keep);
+      const double safe = safe_share(pair.kind, points_of(pair, from), ends, keep, thickness);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == rounds_max) continue;

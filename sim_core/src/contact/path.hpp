@@ -19,18 +19,20 @@ class Neighbourhood {
   // The pairs, for positions x.
   const std::vector<Candidate>& pairs(const Buffer<double>& x);
 
-  // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance, so that nothing
-  // crosses on the straight ways between: each node by as much as its pairs demand. Returns whether nothing was moved.
+  // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance or of the thickness, so
+  // that nothing crosses on the straight ways between: each node by as much as its pairs demand. Returns whether
+  // nothing was moved.
   bool cap(const Buffer<double>& from, Buffer<double>& to);
 
   // The share of the straight way from `from` to `to` that all nodes can go together, so that every pair that is near
-  // at `from` keeps a fifth of its distance.
+  // at `from` keeps a fifth of its distance or of the thickness.
   double common_share(const Buffer<double>& from, const Buffer<double>& to);
 
   int rebuilds = 0;
 
  private:
   double moved(const Buffer<double>& from, const Buffer<double>& to) const;
+  double moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const;
   void rebuild(const Buffer<double>& x);
   bool cap_near(const Buffer<double>& from, Buffer<double>& to);
 
