@@ -166,7 +166,7 @@ def test_nothing_crosses_on_a_capped_way(seed: int, way: float) -> None:
         ]
     )
     towards = np.where(np.arange(len(x)) < len(a.rest), 1.0, -1.0)[:, None] * np.array([0.0, 0.0, way])
-    to = x + towards + way * rng.normal(size=x.shape) + 10.0 * way
+    to = x + towards + way * rng.normal(size=x.shape) + 3.0 * way
     assert self_intersections(to, triangles) > 0
     end = core.cap_motion(triangles, x, to, 5e-4, 0.002)
     for share in np.linspace(0.0, 1.0, 200 if way < 0.1 else 50):
