@@ -139,7 +139,7 @@ bool Stepper::attempt(double dt, const Drive& drive, bool hard, StepReport& repo
   assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
-  newton.predict(problem, predicted_, false);
+  newton.predict(problem, x, predicted_, false);
   const Buffer<double> driven = x;
   tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
   if (!tried_.converged && hard && near()) {

@@ -31,6 +31,9 @@ constexpr double hand_on_cosine = 0.5;
 constexpr double insist_above = 0.5, insist_from = 2e-9, insist_up_to = 0.02, insist_more = 4.0, insist_max = 4096.0;
 // Pairs whose middles are nearer than so much of the thickness are one; forces are handed on up to so far.
 constexpr double merge_share = 0.2, hand_on_share = 0.5;
+// Pieces further apart than so many thicknesses, and what they may have come towards each other in this step, are no
+// pair.
+constexpr double near_share = 2.0;
 
 auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
 
@@ -117,7 +120,7 @@ Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
 }
 
 Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
-    : near(std::move(surface), *std::max_element(settings.thickness.begin(), settings.thickness.end()), margin),
+    : near(std::move(surface), settings.farthest(), margin),
       settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
@@ -167,7 +170,8 @@ void Pairs::select(const Buffer<double>& x) {
   };
   const Surface& surface = near.surface;
   const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
-  const std::vector<Candidate>& candidates = near.pairs(x);
+  std::vector<Candidate>& candidates = near.pairs(x);
+  const double reach = near_share * near.thickness + 2.0 * near.moved(*start_, x);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
   std::vector<Found> found;
@@ -177,8 +181,11 @@ void Pairs::select(const Buffer<double>& x) {
     found.clear();
     for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
          ++c) {
-      const Candidate& who = candidates[c];
-      const Vector4d weights = closest_weights(who.kind, points_of(who, x));
+      Candidate& who = candidates[c];
+      if (who.distance > reach) continue;
+      const FourPoints at = points_of(who, x);
+      const Vector4d weights = closest_weights(who.kind, at);
+      who.distance = between_closest(weights, at).norm();
       int corners = 0, corner = 0, opposite = 0;
       for (int i = 0; i < 3; ++i) {
         if (weights[1 + i] != 0.0) {
@@ -202,7 +209,7 @@ void Pairs::select(const Buffer<double>& x) {
       const int around = feature < triangles           ? 1
                          : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
                                                        : surface.triangles_of_node[feature - triangles - edges];
-      if (static_cast<int>(next - i) != around) continue;
+      if (static_cast<int>(next - i) != around || candidates[found[i].candidate].distance > reach) continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
         const auto first = std::lower_bound(pairs_.begin(), pairs_.end(), other,
@@ -217,10 +224,13 @@ void Pairs::select(const Buffer<double>& x) {
     }
   }
   for (; c < candidates.size(); ++c) {
-    const Candidate& who = candidates[c];
+    Candidate& who = candidates[c];
+    if (who.distance > reach) continue;
     const FourPoints at = points_of(who, x);
     const Vector4d weights = closest_weights(who.kind, at);
-    if (weights.cwiseAbs().minCoeff() < end_share || crossing_squared(at) < crossing_least) continue;
+    who.distance = between_closest(weights, at).norm();
+    if (who.distance > reach || weights.cwiseAbs().minCoeff() < end_share || crossing_squared(at) < crossing_least)
+      continue;
     add(who, who.second, weights, x);
   }
 }
@@ -265,7 +275,7 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
   const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
-  const double mu = settings_.mu(a, b), thickness = 0.5 * (settings_.thickness[a] + settings_.thickness[b]);
+  const double mu = settings_.mu(a, b), thickness = settings_.apart(a, b);
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
   pairs_.push_back(
