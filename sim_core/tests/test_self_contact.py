@@ -350,6 +350,16 @@ class TestNothingCrosses:
         assert tolerated < 1e-3 * size
         assert cloth.velocities[level == 1, 2].mean() > -0.05  # they did collide
 
+    def test_forces_of_pairs_are_equal_and_opposite(self) -> None:
+        """To rounding. Friction acts on both sides of the thickness, and so turns: by the thickness times friction."""
+        seen = tumbles.tumble("folding-0")
+        tumbles.watch(seen, 100)
+        sums = tumbles.balance(seen.cloth)
+        assert sums.pairs > 30
+        assert np.abs(sums.force).max() < 1e-15 * sums.size
+        assert sums.moment == pytest.approx(sums.moment_of_friction, abs=1e-12 * THICKNESS * sums.size)
+        assert np.linalg.norm(sums.moment) > 0.05 * THICKNESS * sums.size  # it is not nothing
+
     def test_rerun_is_bit_identical(self) -> None:
         def run() -> tuple[bytes, bytes]:
             two = stacked_incline.Stack(2, 0.5, CERTIFIED, 4, 1)
