@@ -20,7 +20,7 @@ DENSITY = 0.2  # kg/m^2
 GAP = 1.0 / 16.0  # thickness over L_gb
 STRETCHING = 1.5e4  # over rho g L_gb
 LOWER, UPPER = 4.0, 3.0  # length of the layers that lie, over L_gb
-FRICTION = (0.1, 0.3, 1.0)
+FRICTION = (0.3, 1.0)
 
 # Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing moves further [m].
 FIRST_SHARE, GROWTH, LONGEST, DAMPING, REST = 0.1, 1.1, 0.05, 8.0, 1e-9
