@@ -22,8 +22,8 @@ constexpr double length_tolerance = 2e-9;
 // Nodes that are stopped one by one strain the cloth: so all go less far together, down to this share, before any one
 // is stopped by itself.
 constexpr double common_least = 0.1;
-// A correction that leads further than so many hops is no guide.
-constexpr int hops_max = 2;
+// A correction that leads further than so many hops of its search for pairs is no guide.
+constexpr int hops_max = 1;
 // Iterations in a row that are stopped short, or take all rounds, after which an attempt is given up.
 constexpr int strained_max = 4;
 
