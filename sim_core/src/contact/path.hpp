@@ -19,13 +19,13 @@ class Neighbourhood {
   // The pairs, for positions x. Of each, `distance` is at most its distance there.
   std::vector<Candidate>& pairs(const Buffer<double>& x);
 
-  // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance or of the thickness, so
-  // that nothing crosses on the straight ways between: each node by as much as its pairs demand. Returns whether
-  // nothing was moved.
-  bool cap(const Buffer<double>& from, Buffer<double>& to);
+  // Moves `to` back towards `from` where a pair would come nearer than half its distance or half the thickness, so that
+  // nothing crosses on the straight ways between: each node by as much as its pairs demand. Returns whether nothing was
+  // moved. Ways of more than `hops_max` times two margins end there: pairs are looked for anew on each hop.
+  bool cap(const Buffer<double>& from, Buffer<double>& to, int hops_max = 64);
 
   // The share of the straight way from `from` to `to` that all nodes can go together, so that every pair that is near
-  // at `from` keeps a fifth of its distance or of the thickness.
+  // at `from` keeps half its distance or half the thickness.
   double common_share(const Buffer<double>& from, const Buffer<double>& to);
 
   double margin() const { return margin_; }
