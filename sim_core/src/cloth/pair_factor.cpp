@@ -7,7 +7,7 @@ namespace sim_core {
 namespace {
 
 // Nodes that may be held otherwise than in the factor, over the pairs; and what may have no place in its pattern.
-constexpr double changed_share = 0.03, missing_share = 0.05;
+constexpr double changed_share = 0.01, missing_share = 0.05;
 // A node is held otherwise if that has changed by more than this share, and by more than this share of its own
 // stiffness.
 constexpr float hold_change = 0.5f, hold_least = 0.1f;
