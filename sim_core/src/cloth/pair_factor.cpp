@@ -68,7 +68,8 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
   due_.resize(free_nodes);
   for (std::size_t i = 0; i < free_nodes; ++i) {
     const int node = static_cast<int>(i);
-    contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
+    bodies_[i].setZero();
+    if (contact.mode[i] != contact_open) contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
   }
   holds_ = bodies_;
   for (const Entry& entry : wanted_) add_holds(entry, holds_);
