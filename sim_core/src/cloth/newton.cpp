@@ -147,8 +147,10 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
         if (!pairs->near.cap(x, trial_, hops)) {
           strained_ = true;
           const double common = std::max(pairs->near.common_share(x, wanted_), common_least);
-          for (std::size_t i = 0; i < trial_.size(); ++i) trial_[i] = x[i] + common * (wanted_[i] - x[i]);
-          pairs->near.cap(x, trial_, hops);
+          if (common < 1.0) {
+            for (std::size_t i = 0; i < trial_.size(); ++i) trial_[i] = x[i] + common * (wanted_[i] - x[i]);
+            pairs->near.cap(x, trial_, hops);
+          }
         }
       }
       evaluate(trial_, true);

@@ -7,7 +7,7 @@ namespace sim_core {
 namespace {
 
 // Nodes that may be held otherwise than in the factor, over the pairs; and what may have no place in its pattern.
-constexpr double changed_share = 0.03, missing_share = 0.05;
+constexpr double changed_share = 0.01, missing_share = 0.05;
 // A node is held otherwise if that has changed by more than this share, and by more than this share of its own
 // stiffness.
 constexpr float hold_change = 0.5f, hold_least = 0.1f;
@@ -69,7 +69,8 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
   due_.resize(free_nodes);
   for (std::size_t i = 0; i < free_nodes; ++i) {
     const int node = static_cast<int>(i);
-    contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
+    bodies_[i].setZero();
+    if (contact.mode[i] != contact_open) contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
   }
   holds_ = bodies_;
   for (const Entry& entry : wanted_) add_holds(entry, holds_);
