@@ -15,7 +15,7 @@ constexpr double keep = 0.2;
 // Rounds in which nodes are capped one by one; after them all are by the same share.
 constexpr int rounds_max = 8;
 // Ways longer than so many margins end there.
-constexpr int hops_max = 16;
+constexpr int hops_max = 8;
 
 std::pair<Array3d, Array3d> box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
   Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
