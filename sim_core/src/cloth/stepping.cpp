@@ -13,7 +13,7 @@ namespace {
 constexpr double loose = 0.1;
 // Iterations up to which steps may grow again, of those that a step may take.
 constexpr double easy = 0.6;
-// Times the patience where pairs are near: then halves of a step are hardly easier than the whole.
+// Times the patience where pairs matter: then halves of a step are hardly easier than the whole.
 constexpr double near_pairs = 2.5;
 
 }  // namespace
@@ -59,7 +59,7 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
 }
 
 int Stepper::patience() const {
-  const bool near = newton.pairs && !newton.pairs->list().empty();
+  const bool near = newton.pairs && newton.pairs->matter();
   return static_cast<int>((near ? near_pairs : 1.0) * settings_.patience);
 }
 
@@ -83,7 +83,7 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
     outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
                            settings_.krylov_tolerance);
     // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
-    if (!outcome.converged && (deepest || !newton.pairs || newton.pairs->list().empty())) {
+    if (!outcome.converged && (deepest || !newton.pairs || !newton.pairs->matter())) {
       x = driven;
       outcome =
           newton.solve(problem, x, deepest, settings_.newton_max, report, std::max(loose, settings_.krylov_tolerance));

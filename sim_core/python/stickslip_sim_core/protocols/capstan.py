@@ -142,7 +142,7 @@ class Strip:
 
 
 def tube(facets: int, breadth: float, mu: float) -> Surface:
-    """Return a cylinder of triangles along y, wider than a strip of this breadth, the middle of which touches at RADIUS."""
+    """Return a cylinder of triangles along y, wider than such a strip, the middle of which touches at the radius."""
     angle = 2.0 * np.pi * np.arange(facets) / facets
     ring = (RADIUS - THICKNESS) * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
     i = np.arange(facets)
