@@ -1,11 +1,12 @@
 """Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its protocols.
 
-    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [drops] [momentum] [protocols]
+    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [facets] [sphere] [drops] [momentum] [protocols]
         [--only PREFIX] [--figures FOLDER]
 
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
 with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
-`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `drops`: sheets fall,
+`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `facets`: capstan over cylinders
+of triangles. `sphere`: a cloth on a sphere that turns, of triangles and round. `drops`: sheets fall,
 fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see what crosses.
 `momentum`: what forces of pairs and their moments add up to. `protocols`: those of contact, with their settings; the
 stacked incline is on four meshes. Without a name all of them run; `--only pile` leaves out the drops and protocols
@@ -26,9 +27,11 @@ from stickslip_sim_core import (
     drop_and_drag,
     drop_on_cloth,
     fabric,
+    isotropic,
     plane,
     preset_named,
     protocols,
+    rotating_sphere,
     self_intersections,
     stage,
 )
@@ -36,6 +39,9 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import THICKNESS
 from stickslip_sim_core.scenes import tumbles
+from stickslip_sim_core.protocols import capstan
+from stickslip_sim_core.reference import master_curves
+from stickslip_sim_core.scenes.cloth_sphere import SETTLING
 
 PROTOCOLS: dict[str, dict[str, int]] = {
     "capstan": {},
@@ -143,6 +149,40 @@ def momentum_all() -> None:
         momentum(name, steps)
 
 
+def over_facets() -> None:
+    """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells, shorter and longer."""
+    for mu in capstan.FRICTION:
+        for facets in (None, 72, 60, 24):
+            strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets)
+            heavy, wrap = strip.draw()
+            cloth, expected = strip.cloth, np.log(master_curves.capstan(mu, wrap, 0.05))
+            print(
+                f"capstan, mu {mu}, facets {facets}: "
+                f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
+                f"ripple {np.ptp(heavy) / heavy.mean():.2%}, {cloth.newton / cloth.steps:.1f} iterations a step, "
+                f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged",
+                flush=True,
+            )
+
+
+def turned_spheres() -> None:
+    """Turn a sphere of ever finer triangles below a stiff cloth, and compare with a round one."""
+    felt = isotropic(0.3, 500.0, 2e-4)
+    found = []
+    for subdivisions in (None, 2, 3, 4):
+        begin = time.process_time()
+        scene = rotating_sphere(felt, 0.3, vertices=41, frames=75, subdivisions=subdivisions)
+        found.append(scene)
+        settled, off = scene.times > 0.75 * SETTLING, np.abs(scene.positions - found[0].positions).max(axis=(1, 2))
+        print(
+            f"sphere of {'no triangles' if subdivisions is None else 20 * 4**subdivisions}: "
+            f"{time.process_time() - begin:.1f} CPU s, {scene.unconverged_steps} of {scene.steps} steps unconverged, "
+            f"bears {scene.sphere_force[settled, 2].mean():.6f} N; "
+            f"off the round one by {1e3 * off[settled][0]:.2g} mm at rest, {1e3 * off[-1]:.2g} mm at the end",
+            flush=True,
+        )
+
+
 def measure_all(only: str, figures: Path | None) -> None:
     for name, settings in PROTOCOLS.items():
         if name.startswith(only):
@@ -168,6 +208,8 @@ PARTS: Mapping[str, Callable[[str], None]] = {
     "stretched": lambda _: stretch_all(),
     "drops": tumble_all,
     "momentum": lambda _: momentum_all(),
+    "facets": lambda _: over_facets(),
+    "sphere": lambda _: turned_spheres(),
 }
 
 

@@ -13,7 +13,7 @@ namespace {
 constexpr double loose = 0.1;
 // Iterations up to which steps may grow again, of those that a step may take.
 constexpr double easy = 0.6;
-// Times the patience where pairs are near: then halves of a step are hardly easier than the whole.
+// Times the patience where pairs matter: then halves of a step are hardly easier than the whole.
 constexpr double near_pairs = 2.5;
 // Iterations by way of a smoothed law.
 constexpr int smooth_iterations = 100;
@@ -64,7 +64,7 @@ int Stepper::patience() const {
   return static_cast<int>((near() ? near_pairs : 1.0) * settings_.patience);
 }
 
-bool Stepper::near() const { return newton.pairs && !newton.pairs->list().empty(); }
+bool Stepper::near() const { return newton.pairs && newton.pairs->matter(); }
 
 StepOutcome Stepper::solve_smoothly(const StepProblem& problem, StepReport& report) {
   assembly_.definite = true;

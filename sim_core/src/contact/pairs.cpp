@@ -395,6 +395,13 @@ void Pairs::count_errors(double stiffness, Norms& norms) const {
   }
 }
 
+bool Pairs::matter() const {
+  return std::any_of(pairs_.begin(), pairs_.end(), [this](const Pair& pair) {
+    const auto sheet = [&](int c) { return near.surface.sheet_of_node[pair.who.node[c]]; };
+    return pair.bears() || std::max(sheet(0), sheet(3)) < settings_.sheets;
+  });
+}
+
 bool Pairs::active() const {
   return std::any_of(pairs_.begin(), pairs_.end(),
                      [](const Pair& pair) { return pair.bears() || !pair.sight.force.isZero(0.0); });

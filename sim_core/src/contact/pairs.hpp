@@ -64,6 +64,8 @@ class Pairs {
   // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
   void count_errors(double stiffness, Norms& norms) const;
   const std::vector<Pair>& list() const { return pairs_; }
+  // Whether there is a pair that bears, or cloth that is near cloth. Idle pairs with surfaces only watch.
+  bool matter() const;
   // Whether there is a force or a pair that bears.
   bool active() const;
 

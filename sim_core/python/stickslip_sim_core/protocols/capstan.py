@@ -113,7 +113,7 @@ class Strip:
         self.breadth = width * cell
         self.cloth.gravity[:] = 0.0
         self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
-        clearance = RADIUS + sum(0.51 * (surface.thickness + THICKNESS) for surface in surfaces)
+        clearance = RADIUS + (0.0 if facets is None else 0.01 * THICKNESS)
         angle = np.clip(along / RADIUS, 0.0, WRAP)
         beyond = along - RADIUS * angle
         self.start = np.column_stack(
@@ -142,9 +142,9 @@ class Strip:
 
 
 def tube(facets: int, breadth: float, mu: float) -> Surface:
-    """Return a cylinder of triangles along y whose corners are on the radius, wider than a strip of this breadth."""
+    """Return a cylinder of triangles along y, wider than such a strip, the middle of which touches at the radius."""
     angle = 2.0 * np.pi * np.arange(facets) / facets
-    ring = RADIUS * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
+    ring = (RADIUS - THICKNESS) * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
     i = np.arange(facets)
     j = (i + 1) % facets
     triangles = np.concatenate([np.column_stack([i, j, facets + i]), np.column_stack([j, facets + j, facets + i])])
