@@ -116,14 +116,16 @@ def render(folder: Path, out: Path, names: list[str]) -> None:
                     "cy": scale * (camera.cy + 0.5) - 0.5,
                 }
             )
-            document = kind_named(look["kind"]).render_type(
-                **look,
-                rig_digest=rig_digest(look["rig"]),
-                camera=larger,
-                quality="standard",
-                instants=shown_frames(FRAMES, instants),
-                light_seed=3,
-                crease_seed=1,
+            document = kind_named(look["kind"]).render_type.model_validate(
+                {
+                    **look,
+                    "rig_digest": rig_digest(look["rig"]),
+                    "camera": larger,
+                    "quality": "standard",
+                    "instants": shown_frames(FRAMES, instants),
+                    "light_seed": 3,
+                    "crease_seed": 1,
+                }
             )
             task = RenderTask(render=document, record=RecordRef(digest=store.publish(record), row=0))
             result = TaskResult.model_validate(actor.render(task.model_dump(mode="json")))
