@@ -65,10 +65,11 @@ def watch(tumble: Tumble, steps: int | None = None) -> Watched:
         begin = time.process_time()
         cloth.step(STEP, held=tumble.held(step * STEP), bodies=tumble.bodies)
         seconds += time.process_time() - begin
-        crossed = crossings(cloth.positions, own, cloth.positions, own)
+        at = cloth.positions
+        crossed = crossings(at, own, at, own)
         for surface in cloth.surfaces:
-            at, triangles = surface.at(cloth.time), np.asarray(surface.triangles)
-            crossed += crossings(cloth.positions, own, at, triangles) + crossings(at, triangles, cloth.positions, own)
+            others, triangles = surface.at(cloth.time), np.asarray(surface.triangles)
+            crossed += crossings(at, own, others, triangles) + crossings(others, triangles, at, own)
         crossing += crossed > 0
     least = cloth.least_distance / THICKNESS
     return Watched(cloth.steps, cloth.unconverged_steps, crossing, least, cloth.newton, seconds)
