@@ -13,6 +13,7 @@ from stickslip_sim_core.rods.solve import RodSolution, solve_rods
 from stickslip_sim_core.scenes.cloth_drag import drop_and_drag
 from stickslip_sim_core.scenes.cloth_on_cloth import drop_on_cloth
 from stickslip_sim_core.scenes.cloth_sphere import RotatingSphere, rotating_sphere
+from stickslip_sim_core.scenes.shawl import Shawl, shawl_on_figure
 from stickslip_sim_core.stage import DropAndDrag
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "RodSolution",
     "RotatingSphere",
     "SelfContact",
+    "Shawl",
     "SolverSettings",
     "Surface",
     "box",
@@ -51,6 +53,7 @@ __all__ = [
     "rotating_sphere",
     "self_contact_distance",
     "self_intersections",
+    "shawl_on_figure",
     "solve_general_rods",
     "solve_rods",
     "sphere",

@@ -17,7 +17,7 @@ from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, SelfContact, S
 LENGTH, WIDTH = 1.2, 0.6
 """Of the shawl, along the warp and across [m]."""
 
-APEX, STEEPNESS, NECKLINE = 0.9, 1.0, 0.16
+APEX, STEEPNESS, NECKLINE = 0.83, 0.8, 0.14
 """The shawl starts as part of a cone about the neck, whose apex is so high [m] and whose sides slope so steeply [rad]; the middle of its
 upper edge is so far from the apex [m]."""
 
@@ -53,13 +53,13 @@ class Shawl:
     times: Floats
     """(frames,) [s]"""
 
-    body_rest: Floats
+    skin_rest: Floats
     """(N, 3) [m]: the figure's skin at rest."""
 
-    body_triangles: NDArray[np.int32]
+    skin_triangles: NDArray[np.int32]
     """(U, 3)"""
 
-    body_weights: Floats
+    skin_weights: Floats
     """(N, bones): how much each vertex follows each bone, see `character.Figure`."""
 
     bones: Floats
@@ -102,7 +102,7 @@ def laid(rest: Floats) -> Floats:
     return np.stack([-out * np.cos(azimuth), out * np.sin(azimuth), APEX - far * np.sin(STEEPNESS)], axis=1)
 
 
-def shawl(
+def shawl_on_figure(
     fabric: str | Fabric,
     mu: float,
     *,
@@ -176,9 +176,9 @@ def shawl(
         rest=mesh.rest,
         triangles=mesh.triangles,
         times=times,
-        body_rest=body.rest,
-        body_triangles=body.triangles,
-        body_weights=body.weights,
+        skin_rest=body.rest,
+        skin_triangles=body.triangles,
+        skin_weights=body.weights,
         bones=np.stack([bones(float(t), swing) for t in times]),
         contact_force=np.stack(forces),
         self_intersections=np.array([self_intersections(p, mesh.triangles) if finite else 0 for p in path], np.int32),
