@@ -11,8 +11,8 @@ from stickslip_schemas.keys import canonical_json, content_key, derived_seed
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
-from stickslip_schemas.kinds.shawl import ShawlViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
+from stickslip_schemas.kinds.shawl import ShawlViewpoint
 from stickslip_schemas.samples import (
     SPLITS,
     Sample,

@@ -1,8 +1,8 @@
 """A figure from the hips up, whose skin follows its bones, and the motion of the scene `shawl`.
 
-World axes: x is where it looks, y its left, z up; it stands on the floor z = 0, from which its hips rise. Its skin at rest is the
-zero of a smooth union of ellipsoids and tapered limbs [Quilez 2013], as even triangles. Bones move it by linear blend
-skinning: a vertex goes where the mean of the bones takes it, each by its weight.
+World axes: x is where it looks, y its left, z up; its hips rise from the floor z = 0. Its skin at rest is the zero of a
+smooth union of ellipsoids and tapered limbs [Quilez 2013], as even triangles. Bones move it by linear blend skinning: a
+vertex goes where the mean of the bones takes it, each by its weight.
 """
 
 import itertools
@@ -52,7 +52,7 @@ def _ellipsoid(center: tuple[float, float, float], radii: tuple[float, float, fl
 
 
 def _limb(*joints: tuple[float, float, float, float]) -> Field:
-    """Return about the distance from a limb along joints (x, y, z, radius), whose radius changes evenly between them."""
+    """Return about the distance from a limb along joints (x, y, z, radius); radii change evenly between joints."""
     knots = np.array(joints)
 
     def distance(p: Floats) -> Floats:
@@ -191,8 +191,8 @@ def _turn(axis: int, angle: float, joint: tuple[float, float, float] = (0.0, 0.0
 def bones(time: float, swing: float = 1.0) -> Floats:
     """Return the motions of the bones at a time [s]: (bones, 3, 4), those of `Figure.moved`.
 
-    At rest for `STILL` seconds; then it breathes, turns from the waist to both sides, steps from foot to foot, rises on its toes, looks
-    around and lifts its arms a little.
+    At rest for `STILL` seconds; then it breathes, turns from the waist to both sides, steps from foot to foot, rises on
+    its toes, looks around and lifts its arms a little.
 
     Args:
         time: [s]

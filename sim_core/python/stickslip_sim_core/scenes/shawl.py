@@ -18,8 +18,8 @@ LENGTH, WIDTH = 1.2, 0.6
 """Of the shawl, along the warp and across [m]."""
 
 APEX, STEEPNESS, NECKLINE = 0.83, 0.8, 0.14
-"""The shawl starts as part of a cone about the neck, whose apex is so high [m] and whose sides slope so steeply [rad]; the middle of its
-upper edge is so far from the apex [m]."""
+"""The shawl starts as part of a cone about the neck: how high its apex is [m], how steeply it slopes [rad], and how far
+from the apex the middle of the shawl's upper edge is [m]."""
 
 SELF_FRICTION = 0.5
 """Of the shawl with itself, unless another is asked for."""
@@ -39,7 +39,7 @@ FRAMES, FRAME_RATE = 150, 15.0
 
 @dataclass(frozen=True, eq=False)
 class Shawl:
-    """A cloth on a figure's shoulders. World axes: x is where the figure looks at first, z is up, the floor is z = 0."""
+    """A cloth on a figure's shoulders. World axes: the figure looks along x at first, z is up, the floor is z = 0."""
 
     positions: Floats
     """(frames, V, 3) [m]"""
