@@ -1,7 +1,6 @@
 """A scene of a user's own: from its file to trajectories, with the same rule for certificates as for datasets."""
 
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -115,7 +114,7 @@ def simulate_scene(
     try:
         _write(partial_out, scene, meshes, run, result, obj=obj)
         partial_out.chmod(0o755)
-        os.rename(partial_out, out)
+        partial_out.rename(out)
     except BaseException:
         shutil.rmtree(partial_out, ignore_errors=True)
         raise
@@ -191,7 +190,7 @@ def _sheet(scene: SceneFile, name: str, mesh: Mesh) -> Sheet:
     """Return a sheet where it starts, with its holders."""
     given = scene.sheets[name]
     start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))]) @ rotation(given.turn).T + np.array(given.origin)
-    parts: list[tuple[Array, Callable[[float], Array]]] = []
+    parts: list[tuple[npt.NDArray[np.int64], Callable[[float], Array]]] = []
     taken = np.zeros(len(start), dtype=bool)
     for holder, held in given.holders.items():
         place = f"sheets.{name}.holders.{holder}"
@@ -201,7 +200,7 @@ def _sheet(scene: SceneFile, name: str, mesh: Mesh) -> Sheet:
         if (inside & taken).any():
             raise SceneError(f"{place}: must not hold what another holder holds")
         taken |= inside
-        parts.append((np.flatnonzero(inside), _moving(start[inside], held.motion)))
+        parts.append((np.flatnonzero(inside).astype(np.int64), _moving(start[inside], held.motion)))
     vertices = np.concatenate([np.empty(0, dtype=np.int64), *(part for part, _ in parts)])
 
     def held_at(time: float) -> Array:

@@ -10,6 +10,7 @@ from stickslip_schemas.tasks import TaskResult
 from stickslip_workers.cloth import fabric_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind
 from stickslip_workers.progress import tell
+from stickslip_workers.stages.records import Array
 
 if TYPE_CHECKING:
     from stickslip_schemas.kinds.shawl import ShawlSimulation
@@ -35,7 +36,7 @@ def _simulate_one(simulation: "ShawlSimulation", store: Store) -> TaskResult:
         seed=simulation.seed,
         on_frame=tell,
     )
-    record = {
+    record: dict[str, Array] = {
         name: np.asarray(getattr(run, name), dtype=np.float32)
         for name in ("contact_force", "bones", "skin_rest", "skin_weights")
     }
