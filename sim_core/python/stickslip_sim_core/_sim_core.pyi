@@ -153,7 +153,7 @@ class StepReport:
 class ClothSolver:
     """Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp."""
 
-    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')] | None, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int]) -> None: ...
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')] | None, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int], surface_positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: Sequence[float]) -> None: ...
 
     def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], surfaces: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
 
@@ -212,6 +212,11 @@ def contact_candidates(triangles: Annotated[NDArray[numpy.int32], dict(shape=(No
 
 def cap_motion(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], start: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], end: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], thickness: float, margin: float) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]:
     """Internal: see contact/path.hpp."""
+
+def feet(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], x: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: float, points: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> tuple[Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], list[int]]:
+    """
+    Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see contact/patches.hpp.
+    """
 
 def pair_law(gap: float, normal: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], slip: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], force: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], mu: float, stiffness: float, proximal: float) -> tuple[int, Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float]:
     """

@@ -84,7 +84,8 @@ void bind_cloth(nb::module_& m) {
              double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
              int patience, int halvings_max, double step_error, int coarsest, int finest, const std::string& kernel,
              const std::vector<double>& thickness, const std::optional<Eigen::MatrixXd>& mu,
-             const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex) {
+             const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
+             const Points3& surface_positions, const std::vector<double>& crease) {
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, {stretching}, rigidity, damping});
@@ -93,13 +94,14 @@ void bind_cloth(nb::module_& m) {
                 rest, triangles, list, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
                 {step_error, coarsest, finest}, kernel,
-                mu ? std::optional<PairSettings>({thickness, *mu}) : std::nullopt,
-                {surface_triangles, surface_of_vertex});
+                mu ? std::optional<PairSettings>({thickness, *mu, static_cast<int>(thickness.size() - crease.size())})
+                   : std::nullopt,
+                {surface_triangles, surface_of_vertex, surface_positions, crease});
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
           "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
           "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "surface_triangles"_a,
-          "surface_of_vertex"_a)
+          "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a)
       .def(
           "step",

@@ -5,10 +5,14 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <limits>
+#include <optional>
 #include <tuple>
 
 #include "cloth/mesh.hpp"
+#include "contact/nearest.hpp"
 #include "contact/pair_law.hpp"
+#include "contact/patches.hpp"
 #include "contact/path.hpp"
 
 namespace sim_core {
@@ -24,12 +28,16 @@ FourPoints four(const Four& x) { return {x.row(0), x.row(1), x.row(2), x.row(3)}
 
 PairKind kind_of(bool edges) { return edges ? PairKind::edge_edge : PairKind::vertex_triangle; }
 
-Surface surface_of(const Triangles& triangles, const Points3& x) {
-  std::vector<std::array<int, 3>> corners;
+std::vector<std::array<int, 3>> triples_of(const Triangles& triangles) {
+  std::vector<std::array<int, 3>> out;
   for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
-    corners.push_back({triangles(t, 0), triangles(t, 1), triangles(t, 2)});
+    out.push_back({triangles(t, 0), triangles(t, 1), triangles(t, 2)});
   }
-  return {corners, std::vector<int>(x.rows(), 0), Felt::Constant(1, 1, true)};
+  return out;
+}
+
+Surface surface_of(const Triangles& triangles, const Points3& x) {
+  return {triples_of(triangles), std::vector<int>(x.rows(), 0), Felt::Constant(1, 1, true)};
 }
 
 Buffer<double> buffer_of(const Points3& x) {
@@ -71,6 +79,32 @@ void bind_contact(nb::module_& m) {
         return out;
       },
       "triangles"_a, "start"_a, "end"_a, "thickness"_a, "margin"_a, "Internal: see contact/path.hpp.");
+  m.def(
+      "feet",
+      [](const Triangles& triangles, const Points3& x, double crease, const Points3& points) {
+        const Buffer<double> at = buffer_of(x);
+        const Patches patches(triples_of(triangles), at, std::vector<double>(triangles.rows(), crease));
+        const TriangleTree tree(patches.triangles(), at);
+        const PatchShape shape = patches.shape(at);
+        Eigen::VectorXd height = Eigen::VectorXd::Constant(points.rows(), std::numeric_limits<double>::quiet_NaN());
+        Points3 normal(points.rows(), 3), point(points.rows(), 3);
+        std::vector<std::int32_t> triangle(points.rows(), -1);
+        for (Eigen::Index i = 0; i < points.rows(); ++i) {
+          const Eigen::Vector3d p = points.row(i).transpose();
+          const Nearest near = tree.nearest(p, 1e300, [](int) { return true; });
+          const double side = patches.side_of(shape, p, near.triangle, near.weights);
+          const std::optional<Foot> foot = patches.foot(shape, p, near.triangle, side);
+          if (!foot) continue;
+          height[i] = side * foot->height;
+          normal.row(i) = side * foot->normal.transpose();
+          point.row(i) = foot->point.transpose();
+          triangle[i] = foot->on_patch ? foot->triangle : -1;
+        }
+        return std::make_tuple(height, normal, point, triangle);
+      },
+      "triangles"_a, "x"_a, "crease"_a, "points"_a,
+      "Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see "
+      "contact/patches.hpp.");
   m.def(
       "pair_law",
       [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force,

@@ -66,13 +66,23 @@ bool Newton::arrived(const Buffer<double>& x) const {
                               ends_.begin() + 4L * assembly_.numbering.free_nodes);
 }
 
-void Newton::predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const {
-  for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+void Newton::predict(const StepProblem& problem, const Buffer<double>& ends, Buffer<double>& x, bool from_rest) {
+  const int free_nodes = assembly_.numbering.free_nodes;
+  for (int i = 0; i < free_nodes; ++i) {
     Vector3d p = at_node(problem.start, i);
     if (!from_rest) p += problem.dt * at_node(problem.velocity, i);
+    at_node(x, i) = p;
+  }
+  if (contact.surfaces) contact.surfaces->begin(problem.start, ends, x);
+  for (int i = 0; i < free_nodes; ++i) {
+    Vector3d p = at_node(x, i);
     for (const Body& body : problem.at_end) {
       const Gap gap = gap_of(body, p);
       if (gap.distance < 0.0) p -= gap.distance * gap.normal;
+    }
+    if (contact.surfaces) {
+      const std::optional<SmoothTouch> touch = contact.surfaces->touch(i, p);
+      if (touch && touch->gap < 0.0) p -= touch->gap * touch->normal;
     }
     at_node(x, i) = p;
   }
@@ -82,7 +92,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
                           StepReport& report, double krylov_tolerance) {
   const int free_nodes = assembly_.numbering.free_nodes;
   contact.hold_reversed = false;
-  predict(problem, x, from_rest);
+  predict(problem, x, x, from_rest);
   if (pairs) {
     const Stopwatch watch(phases.contact);
     ends_ = x;

@@ -44,8 +44,8 @@ class Newton {
   StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report,
                     double krylov_tolerance);
 
-  // Where the velocity leads, or the start, out of the bodies.
-  void predict(const StepProblem& problem, Buffer<double>& x, bool from_rest) const;
+  // Where the velocity leads the free nodes of x, or the start, out of the bodies and surfaces; these are at `ends`.
+  void predict(const StepProblem& problem, const Buffer<double>& ends, Buffer<double>& x, bool from_rest);
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
 

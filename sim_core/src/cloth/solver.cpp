@@ -67,21 +67,58 @@ void check_thickness(const ClothMesh& mesh, const std::vector<int>& sheets, cons
   }
 }
 
+// Sheets, and after them surfaces; -1 of slopes.
+std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces) {
+  const std::vector<int> sheets = mesh.sheets();
+  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
+  std::vector<int> out(numbering.nodes, -1);
+  for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = sheets[i];
+  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  for (int i = 0; i < numbering.others; ++i) out[others[i]] = count + surfaces.surface_of_vertex[i];
+  return out;
+}
+
 std::unique_ptr<Pairs> pairs_of(const ClothMesh& mesh, const Numbering& numbering, const PairSettings& settings,
                                 const SurfaceMeshes& surfaces) {
-  const std::vector<int> sheets = mesh.sheets();
-  check_thickness(mesh, sheets, settings);
-  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
-  std::vector<int> sheet_of_node(numbering.nodes, -1);
-  for (int i = 0; i < numbering.vertices; ++i) sheet_of_node[numbering.node[i]] = sheets[i];
-  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
-  for (int i = 0; i < numbering.others; ++i) sheet_of_node[others[i]] = count + surfaces.surface_of_vertex[i];
+  check_thickness(mesh, mesh.sheets(), settings);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
-  append(surfaces.triangles, others, triangles);
-  Surface surface(std::move(triangles), std::move(sheet_of_node), (settings.mu.array() >= 0.0).matrix());
+  append(surfaces.triangles, numbering.node.data() + numbering.vertices + numbering.slopes, triangles);
+  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces),
+                  (settings.mu.array() >= 0.0).matrix());
   const double cell = std::sqrt(2.0 * mesh.area.mean());
   return std::make_unique<Pairs>(std::move(surface), settings, margin_share * cell, numbering.free_nodes);
+}
+
+// Radius of the smallest circle around a triangle at rest, m: its circumcircle, or that of its longest side.
+double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
+  std::array<double, 3> side;
+  for (int c = 0; c < 3; ++c) {
+    side[c] =
+        (mesh.rest.row(mesh.triangles(triangle, c)) - mesh.rest.row(mesh.triangles(triangle, (c + 1) % 3))).norm();
+  }
+  std::sort(side.begin(), side.end());
+  const auto [a, b, c] = side;
+  return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
+}
+
+std::unique_ptr<SmoothContact> smooth_of(const ClothMesh& mesh, const Numbering& numbering,
+                                         const PairSettings& settings, const SurfaceMeshes& surfaces) {
+  Buffer<double> x(4L * numbering.nodes, 0.0);
+  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  for (int i = 0; i < numbering.others; ++i) at_node(x, others[i]) = surfaces.positions.row(i).transpose();
+  Triples triangles;
+  append(surfaces.triangles, others, triangles);
+  std::vector<double> radius(numbering.free_nodes, 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    const double own = circle_around(mesh, t);
+    for (int c = 0; c < 3; ++c) {
+      const int node = numbering.node[mesh.triangles(t, c)];
+      if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
+    }
+  }
+  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces), settings,
+                                         surfaces.crease, x, radius);
 }
 
 }  // namespace
@@ -110,6 +147,7 @@ struct ClothSolver::Impl {
         newton(stepper.newton),
         numbering(assembly.numbering) {
     if (touch) newton.pairs = pairs_of(mesh, numbering, *touch, surfaces);
+    if (numbering.others > 0) newton.contact.surfaces = smooth_of(mesh, numbering, *touch, surfaces);
   }
 
   void load(const Points3& positions, const Points3& slopes, Buffer<double>& into) const {
@@ -204,6 +242,16 @@ Points3 ClothSolver::surface_forces() const {
   Points3 out(impl_->numbering.others, 3);
   for (int i = 0; i < impl_->numbering.others; ++i) {
     out.row(i) = -at_node(impl_->newton.residual, impl_->other(i)).transpose();
+  }
+  const ContactState& contact = impl_->newton.contact;
+  for (int i = 0; i < impl_->numbering.free_nodes; ++i) {
+    if (contact.touched[i] < impl_->stepper.bodies()) continue;
+    const Foot& foot = contact.surfaces->foot(i);
+    for (int k = 0; k < 3; ++k) {
+      const int vertex = impl_->numbering.vertex[contact.surfaces->triangles()[foot.triangle][k]];
+      out.row(vertex - impl_->numbering.vertices - impl_->numbering.slopes) -=
+          foot.weights[k] * at_node(impl_->newton.residual, i).transpose();
+    }
   }
   return out;
 }

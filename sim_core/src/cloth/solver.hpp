@@ -18,10 +18,13 @@
 
 namespace sim_core {
 
-// Triangles that are no cloth, and which surface each of their vertices belongs to.
+// Triangles that are no cloth, which surface each of their vertices belongs to, where these are at first, and the angle
+// from which edges of each surface stay sharp, rad.
 struct SurfaceMeshes {
   Triangles triangles;
   std::vector<std::int32_t> surface_of_vertex;
+  Points3 positions;
+  std::vector<double> crease;
 };
 
 class ClothSolver {
@@ -51,9 +54,10 @@ class ClothSolver {
 
   Points3 positions() const;
   Points3 velocities() const;
-  // Force of bodies on each free vertex, of holders on each held one, at the end of the last step, N.
+  // Force of bodies and smooth surfaces on each free vertex, of holders on each held one, at the end of the last step,
+  // N.
   Points3 reactions() const;
-  // Which body each vertex touches (-1: none), and whether it slides.
+  // Which body each vertex touches, or after the bodies which surface (-1: none), and whether it slides.
   std::vector<std::int32_t> contacts() const;
   std::vector<std::int32_t> sliding() const;
 

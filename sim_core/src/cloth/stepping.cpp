@@ -127,7 +127,7 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
-  newton.predict(problem, predicted_, false);
+  newton.predict(problem, x, predicted_, false);
   tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance);
   tried_dt_ = dt;
   return tried_.converged;

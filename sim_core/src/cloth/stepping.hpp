@@ -37,6 +37,8 @@ class Stepper {
   // Largest distance of a free node from where it was predicted in the last attempt, m.
   double missed() const;
 
+  // Of the last step: how many there were.
+  int bodies() const { return static_cast<int>(bodies_before_.size()); }
   // Of the last step: its length [s], and the change of momentum over it [N].
   double last_dt() const { return last_dt_; }
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }

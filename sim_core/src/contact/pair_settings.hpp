@@ -1,7 +1,8 @@
-// What contacts of cloth with cloth are told.
+// What contacts of cloth with cloth and surfaces are told.
 #pragma once
 
 #include <Eigen/Core>
+#include <algorithm>
 #include <vector>
 
 namespace sim_core {
@@ -10,6 +11,23 @@ namespace sim_core {
 struct PairSettings {
   std::vector<double> thickness;  // m: two keep the mean of theirs apart
   Eigen::MatrixXd mu;             // of each two; negative where they do not feel each other
+  int sheets;                     // that come before the surfaces
+
+  double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
+  // What pairs of closest points keep apart, m. Nodes feel surfaces by themselves: pairs only catch what comes nearer
+  // between the nodes than the facets of a curved surface do.
+  double apart(int a, int b) const {
+    constexpr double surface_share = 0.25;
+    return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
+  }
+  // The largest of these.
+  double farthest() const {
+    double out = 0.0;
+    for (int a = 0; a < mu.rows(); ++a) {
+      for (int b = 0; b <= a; ++b) out = mu(a, b) < 0.0 ? out : std::max(out, apart(a, b));
+    }
+    return out;
+  }
 };
 
 }  // namespace sim_core

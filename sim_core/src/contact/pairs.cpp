@@ -64,7 +64,7 @@ Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
 }
 
 Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int free_nodes)
-    : near(std::move(surface), *std::max_element(settings.thickness.begin(), settings.thickness.end()), margin),
+    : near(std::move(surface), settings.farthest(), margin),
       settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
@@ -190,7 +190,7 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
   const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
-  const double mu = settings_.mu(a, b), thickness = 0.5 * (settings_.thickness[a] + settings_.thickness[b]);
+  const double mu = settings_.mu(a, b), thickness = settings_.apart(a, b);
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
   pairs_.push_back(

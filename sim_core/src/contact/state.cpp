@@ -64,6 +64,13 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
       const Gap one = gap_of(at_end[b], p);
       if (one.distance < gap.distance) gap = one, which = static_cast<int>(b);
     }
+    if (surfaces) {
+      const std::optional<SmoothTouch> one = surfaces->touch(i, p);
+      if (one && one->gap < gap.distance) {
+        gap = {one->gap, one->normal};
+        which = static_cast<int>(at_end.size()) + one->surface;
+      }
+    }
     const Vector3d r = at_node(residual, i);
     if (which < 0 || !(r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0)) {
       touched[i] = -1;
@@ -87,9 +94,15 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
   return norms;
 }
 
-void ContactState::keep(double dt) { kept_ = {mode, touched, direction, turning, dt}; }
+void ContactState::keep(double dt) {
+  kept_ = {mode, touched, direction, turning, dt};
+  if (surfaces) surfaces->keep(mode);
+}
 
-void ContactState::forget() { kept_.dt = 0.0; }
+void ContactState::forget() {
+  kept_.dt = 0.0;
+  if (surfaces) surfaces->restart();
+}
 
 bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
                           const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) {
@@ -97,7 +110,14 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, 
   for (std::size_t i = 0; i < mode.size(); ++i) {
     const int node = static_cast<int>(i), body = kept_.touched[i];
     if (kept_.mode[i] == contact_open || body < 0) continue;
-    const Gap gap = gap_of(at_end[body], at_node(x, node));
+    Gap gap{};
+    if (body < static_cast<int>(at_end.size())) {
+      gap = gap_of(at_end[body], at_node(x, node));
+    } else {
+      const std::optional<SmoothTouch> one = surfaces->touch(node, at_node(x, node));
+      if (!one) continue;
+      gap = {one->gap, one->normal};
+    }
     const ContactSight seen = sight(node, body, gap, x, start, residual, at_start, at_end);
     touched[i] = body;
     at_node(normal, node) = gap.normal.cast<float>();
@@ -113,9 +133,11 @@ ContactSight ContactState::sight(int node, int body, const Gap& gap, const Buffe
                                  const Buffer<double>& start, const Buffer<double>& residual,
                                  const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {
   const Vector3d before = at_node(start, node), p = at_node(x, node);
-  Vector3d u = p - carried(at_start[body], at_end[body], before);
+  const bool is_body = body < static_cast<int>(at_end.size());
+  Vector3d u = is_body ? Vector3d(p - carried(at_start[body], at_end[body], before)) : surfaces->slip(node, before, p);
   u -= u.dot(gap.normal) * gap.normal;
-  return {gap.distance, gap.normal, u, at_node(residual, node), at_end[body].mu, stiffness[node]};
+  const double mu_here = is_body ? at_end[body].mu : surfaces->mu(node);
+  return {gap.distance, gap.normal, u, at_node(residual, node), mu_here, stiffness[node]};
 }
 
 void ContactState::write(int node, const ContactRow& row) {

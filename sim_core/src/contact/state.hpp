@@ -1,12 +1,15 @@
-// Contacts of the nodes with bodies: modes, rows of Newton's system, and what is kept from step to step.
+// Contacts of the nodes with bodies and smooth surfaces: modes, rows of Newton's system, and what is kept from step to
+// step.
 #pragma once
 
 #include <Eigen/Core>
+#include <memory>
 #include <vector>
 
 #include "cloth/problem.hpp"
 #include "contact/bodies.hpp"
 #include "contact/law.hpp"
+#include "contact/smooth.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
@@ -21,10 +24,12 @@ class ContactState {
  public:
   explicit ContactState(int free_nodes);
 
-  std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body (-1: none)
+  std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
   std::vector<double> stiffness;   // (free nodes): k of the law, N/m
   Buffer<float> normal, direction, mu, turning;
   Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
+
+  std::unique_ptr<SmoothContact> surfaces;  // null where there are none
 
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method
   // may else go to and fro between the two ways of slipping, where the law has it that they stick.

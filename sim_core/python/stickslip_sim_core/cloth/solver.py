@@ -28,6 +28,9 @@ GRAVITY = 9.81
 THICKNESS = 5e-4
 """Of cloth that feels itself or a surface, unless another is given [m]."""
 
+CREASE = float(np.radians(40.0))
+"""Angle from which edges of a surface stay sharp, unless another is given [rad]."""
+
 BodyTuple = tuple[int, float, Floats, Floats, Floats]
 
 
@@ -139,7 +142,11 @@ class Surface:
     """Triangles that cloth touches, from either side, and whose vertices move as you say: a body of any shape.
 
     It may be open or closed, cross itself, and bend as it moves. Nothing tells its inside from its outside: cloth that
-    starts on one side stays there. It is felt as cloth is, by pairs of closest points (see `SelfContact`).
+    starts on one side stays there.
+
+    Vertices of the cloth touch a smooth surface through the vertices of the triangles, as they touch a body. Triangles
+    themselves are only felt where they come nearer to the cloth than a quarter of that, between its vertices: there the
+    cloth keeps this distance by pairs of closest points (see `SelfContact`). Nothing crosses the triangles.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -158,12 +165,18 @@ class Surface:
     """Of a skin around the triangles, half of it on each side [m]: cloth stays half of this and half of its own
     thickness away from them. May be 0."""
 
+    crease: float = CREASE
+    """Edges stay sharp where the normals of their triangles are further apart at time 0, 0 ... pi [rad]. Borders are
+    sharp."""
+
     def __post_init__(self) -> None:
         mu = np.asarray(self.mu, float)
         if mu.ndim > 1 or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
             raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
         if not (np.isfinite(self.thickness) and self.thickness >= 0.0):
             raise ValueError(f"thickness: must be finite and >= 0, got {self.thickness}")
+        if not 0.0 <= self.crease <= np.pi:
+            raise ValueError(f"crease: must be in [0, pi] rad, got {self.crease}")
         triangles = np.array(self.triangles, dtype=np.int32)
         if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
             raise ValueError(f"triangles: must be (T, 3) numbers of vertices, got shape {triangles.shape}")
@@ -261,7 +274,7 @@ class Cloth:
         self.self_contact = self_contact
         self.time = 0.0
         """[s]"""
-        sizes = [len(surface.at(self.time)) for surface in self.surfaces]
+        self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
         mu, thickness = self._touch(sheet_count(mesh.rest, mesh.triangles))
         patch_weight = min((fabric.density for fabric in self.fabrics), default=np.nan) * RESIDUAL_PATCH * GRAVITY
@@ -290,8 +303,9 @@ class Cloth:
                 [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))], dtype=np.int32
             ),
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
+            surface_positions=self._surfaces_at(self.time),
+            crease=[surface.crease for surface in self.surfaces],
         )
-        self._surface_sizes = sizes
         self.least_distance = np.inf
         """Of pieces of cloth that do not hang together, and of cloth and surfaces, at the ends of all steps [m]; inf
         where none came near."""
@@ -346,22 +360,24 @@ class Cloth:
 
     @property
     def reactions(self) -> Floats:
-        """(V, 3) [N]: force of bodies on a free vertex, of its holder on a held one, by M a = forces."""
+        """(V, 3) [N]: force of a body or a smooth surface on a free vertex, of its holder on a held one, by M a =
+        forces."""
         return np.asarray(self._solver.reactions())
 
     @property
     def contacts(self) -> NDArray[np.int32]:
-        """(V,): body that a vertex touches, -1 where none."""
+        """(V,): body that a vertex touches, or surface, which are counted after the bodies; -1 where none."""
         return np.asarray(self._solver.contacts(), dtype=np.int32)
 
     @property
     def sliding(self) -> NDArray[np.bool_]:
-        """(V,): whether a vertex slides on its body."""
+        """(V,): whether a vertex slides on its body or surface."""
         return np.asarray(self._solver.sliding(), dtype=bool)
 
     @property
     def pair_forces(self) -> PairForces:
-        """Forces of cloth on cloth and surfaces at the end of the last step."""
+        """Forces of pairs of closest points, of cloth and cloth and of cloth and triangles of surfaces, at the end of
+        the last step."""
         vertices, weights, forces, distance, sliding = self._solver.pair_forces()
         return PairForces(vertices, weights, forces, distance, np.asarray(sliding, dtype=bool))
 

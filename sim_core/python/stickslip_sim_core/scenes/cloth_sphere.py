@@ -11,7 +11,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, plane, sphere
+from stickslip_sim_core.cloth.solver import GRAVITY, THICKNESS, Body, Cloth, Surface, plane, sphere
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -103,6 +103,22 @@ def ball(mu: float, angle: float) -> Body:
     return sphere(mu, RADIUS, origin=(0.0, 0.0, RADIUS), rotation=[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def triangulated(mu: float, speed: float, subdivisions: int) -> Surface:
+    """Return the sphere as triangles that turn: an icosahedron whose triangles are cut into four, again and again.
+
+    Its corners lie half a thickness of the cloth inside: so the middle of the cloth touches at the sphere's radius.
+    """
+    corners, triangles = meshes.icosphere(subdivisions)
+    corners *= RADIUS - 0.5 * THICKNESS
+
+    def at(time: float) -> Floats:
+        turn = ball(mu, turned(time, speed))
+        placed: Floats = corners @ turn.rotation.T + turn.origin
+        return placed
+
+    return Surface(triangles, at, mu, thickness=0.0)
+
+
 def rotating_sphere(
     fabric: str | Fabric,
     mu: float,
@@ -114,6 +130,7 @@ def rotating_sphere(
     frames: int = FRAMES,
     frame_rate: float = FRAME_RATE,
     seed: int = 0,
+    subdivisions: int | None = None,
     kernel: str | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> RotatingSphere:
@@ -131,6 +148,7 @@ def rotating_sphere(
         frames: Frames to simulate, from time 0 on, 1 ... 3000.
         frame_rate: Frames a second.
         seed: Of the bias.
+        subdivisions: Of an icosahedron, 1 ... 7, for a sphere of triangles; None: the sphere is round.
         kernel: Level of the kernels, see `Cloth`.
         on_frame: Called with (frames done, frames) after every frame.
 
@@ -146,9 +164,12 @@ def rotating_sphere(
         raise ValueError(f"frame_rate: must be finite and > 0, got {frame_rate}")
     if not abs(speed) <= SPEED_MAX:
         raise ValueError(f"speed: must be in [-{SPEED_MAX:g}, {SPEED_MAX:g}] rad/s, got {speed}")
+    if subdivisions is not None and not 1 <= subdivisions <= 7:
+        raise ValueError(f"subdivisions: must be 1 ... 7, got {subdivisions}")
     floor = plane(mu if mu_floor is None else mu_floor)
     mesh = meshes.grid(SIDE, SIDE, vertices - 1, vertices - 1)
-    cloth = Cloth(mesh, fabric_of(fabric), settings, kernel=kernel)
+    surfaces = [] if subdivisions is None else [triangulated(mu, speed, subdivisions)]
+    cloth = Cloth(mesh, fabric_of(fabric), settings, surfaces=surfaces, kernel=kernel)
     cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), 2.0 * RADIUS + CLEARANCE)]))
     bias = np.random.default_rng(seed).uniform(-BIAS, BIAS, 2)
 
@@ -156,7 +177,8 @@ def rotating_sphere(
     tilted = down + GRAVITY * np.append(bias, 0.0)
 
     def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
-        return (tilted if time < SETTLING else down), np.empty((0, 3)), [floor, ball(mu, turned(time, speed))]
+        bodies = [floor, ball(mu, turned(time, speed))] if subdivisions is None else [floor]
+        return (tilted if time < SETTLING else down), np.empty((0, 3)), bodies
 
     positions, contacts, forces = [cloth.positions], [cloth.contacts], [np.zeros((3, 3))]
     for frame in range(1, frames):

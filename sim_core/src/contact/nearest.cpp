@@ -1,0 +1,105 @@
+#include "contact/nearest.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <utility>
+
+#include "contact/closest.hpp"
+
+namespace sim_core {
+namespace {
+
+using Eigen::Array3d;
+using Eigen::Vector3d;
+
+constexpr int leaf_max = 4;
+
+}  // namespace
+
+TriangleTree::TriangleTree(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x)
+    : triangles_(std::move(triangles)), order_(triangles_.size()), corners_(triangles_.size()) {
+  std::iota(order_.begin(), order_.end(), 0);
+  std::vector<Vector3d> middles;
+  for (const auto& c : triangles_) middles.push_back((at_node(x, c[0]) + at_node(x, c[1]) + at_node(x, c[2])) / 3.0);
+  if (!triangles_.empty()) build(0, static_cast<int>(triangles_.size()), middles);
+  fit(x);
+}
+
+int TriangleTree::build(int begin, int end, const std::vector<Vector3d>& middles) {
+  const int own = static_cast<int>(boxes_.size());
+  boxes_.push_back({Array3d::Zero(), Array3d::Zero(), begin, end, 0});
+  if (end - begin <= leaf_max) return own;
+  Array3d low = middles[order_[begin]].array(), high = low;
+  for (int i = begin; i < end; ++i) {
+    low = low.min(middles[order_[i]].array());
+    high = high.max(middles[order_[i]].array());
+  }
+  int axis = 0;
+  (high - low).maxCoeff(&axis);
+  const int middle = (begin + end) / 2;
+  std::nth_element(order_.begin() + begin, order_.begin() + middle, order_.begin() + end, [&](int a, int b) {
+    return middles[a][axis] != middles[b][axis] ? middles[a][axis] < middles[b][axis] : a < b;
+  });
+  build(begin, middle, middles);
+  boxes_[own].right = build(middle, end, middles);
+  return own;
+}
+
+void TriangleTree::fit(const Buffer<double>& x) {
+  for (std::size_t t = 0; t < triangles_.size(); ++t) {
+    for (int k = 0; k < 3; ++k) corners_[t][k] = at_node(x, triangles_[t][k]);
+  }
+  for (std::size_t b = boxes_.size(); b-- > 0;) {
+    Box& box = boxes_[b];
+    if (box.right != 0) {
+      box.low = boxes_[b + 1].low.min(boxes_[box.right].low);
+      box.high = boxes_[b + 1].high.max(boxes_[box.right].high);
+      continue;
+    }
+    box.low = box.high = corners_[order_[box.begin]][0].array();
+    for (int i = box.begin; i < box.end; ++i) {
+      for (const Vector3d& corner : corners_[order_[i]]) {
+        box.low = box.low.min(corner.array());
+        box.high = box.high.max(corner.array());
+      }
+    }
+  }
+}
+
+Nearest TriangleTree::nearest(const Vector3d& p, double reach, const std::function<bool(int)>& counts) const {
+  Nearest out;
+  double best = reach * reach;
+  const auto away = [&](int b) {
+    const Box& box = boxes_[b];
+    return (box.low - p.array()).max(p.array() - box.high).max(0.0).matrix().squaredNorm();
+  };
+  std::vector<std::pair<int, double>> open;
+  if (!boxes_.empty()) open.push_back({0, away(0)});
+  while (!open.empty()) {
+    const auto [b, far] = open.back();
+    open.pop_back();
+    if (far > best) continue;
+    const Box& box = boxes_[b];
+    if (box.right != 0) {
+      const double left = away(b + 1), right = away(box.right);
+      open.push_back(left < right ? std::pair(box.right, right) : std::pair(b + 1, left));
+      open.push_back(left < right ? std::pair(b + 1, left) : std::pair(box.right, right));
+      continue;
+    }
+    for (int i = box.begin; i < box.end; ++i) {
+      const int t = order_[i];
+      if (!counts(t)) continue;
+      const auto& [a, c, d] = corners_[t];
+      const Vector3d weights = closest_on_triangle(p, a, c, d);
+      const double squared = (p - weights[0] * a - weights[1] * c - weights[2] * d).squaredNorm();
+      if (squared < best || (squared == best && (out.triangle < 0 || t < out.triangle))) {
+        best = squared;
+        out = {t, weights, std::sqrt(squared)};
+      }
+    }
+  }
+  return out;
+}
+
+}  // namespace sim_core
