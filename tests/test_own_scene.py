@@ -140,7 +140,7 @@ def test_what_is_certified_says_so(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        ("origin", [0, 0, 0.05], "positions: must not cross a surface"),
+        ("turn", [0, 0.5, 0], "positions: must not cross a surface"),
         ("holders", {"hand": {"low": [5, 5], "high": [6, 6]}}, "sheets.cloth.holders.hand: must hold a vertex"),
         ("holders", {n: {"low": [0, 0], "high": [1, 1]} for n in "ab"}, "holders.b: must not hold what another"),
     ],
