@@ -108,8 +108,8 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     if (cell < 0) continue;
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
       const auto& corner = surface.triangles[*t];
-      if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any()) continue;
-      if (!surface.feel(vertex, corner[0]) || std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
+      if (!surface.feel(vertex, corner[0]) || (p < boxes[*t].low).any() || (p > boxes[*t].high).any()) continue;
+      if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
       add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}}, x, reach);
     }
   }
@@ -120,6 +120,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
   for (int cell = 0; cell < edges.cells(); ++cell) {
     for (const int* i = edges.begin(cell); i < edges.end(cell); ++i) {
       const auto& a = surface.edges[*i];
+      if (a[0] > surface.last_felt[surface.sheet_of_node[a[0]]]) continue;  // none of those to come is felt
       for (const int* j = i + 1; j < edges.end(cell); ++j) {
         const auto& b = surface.edges[*j];
         if (!surface.feel(a[0], b[0])) continue;

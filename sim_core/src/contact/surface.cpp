@@ -9,7 +9,14 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
     : triangles(std::move(triangles_in)),
       triangles_of_node(sheet_of_node_in.size(), 0),
       sheet_of_node(std::move(sheet_of_node_in)),
-      felt(std::move(felt_in)) {
+      felt(std::move(felt_in)),
+      last_felt(felt.rows(), -1) {
+  for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
+    if (sheet_of_node[i] < 0) continue;
+    for (Eigen::Index sheet = 0; sheet < felt.rows(); ++sheet) {
+      if (felt(sheet, sheet_of_node[i])) last_felt[sheet] = static_cast<int>(i);
+    }
+  }
   for (const auto& corners : triangles) {
     for (int c = 0; c < 3; ++c) {
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];

@@ -16,7 +16,8 @@ struct Surface {
   std::vector<int> vertices;                              // nodes that are corners, ascending
   std::vector<int> triangles_of_edge, triangles_of_node;  // counts
   std::vector<int> sheet_of_node;
-  Felt felt;  // whether each two sheets feel each other
+  Felt felt;                   // whether each two sheets feel each other
+  std::vector<int> last_felt;  // by sheet: the last node of those that it feels
 
   Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, Felt felt);
   bool feel(int node, int other) const { return felt(sheet_of_node[node], sheet_of_node[other]); }
