@@ -106,7 +106,8 @@ def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path)
     program = [sys.executable, "-m", "stickslip_services.cli", "simulate", "scene.yaml", "out"]
     ended = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert "sheets.cloth.mesh.cells.0: Input should be greater than or equal to 1, and it is 0" in ended.stderr.replace("\n", " ")
+    said = " ".join(ended.stderr.split())
+    assert "sheets.cloth.mesh.cells.0: Input should be greater than or equal to 1, and it is 0" in said
 
 
 @pytest.mark.parametrize(

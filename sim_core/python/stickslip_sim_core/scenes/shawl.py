@@ -33,6 +33,9 @@ BIAS = 1e-3
 UPRIGHT = 3.0
 """When it ends [s]."""
 
+LAYING, CALM = 2.0, 10.0
+"""The shawl is laid down gently: for so long [s] it is damped in proportion to its mass [1/s]."""
+
 FRAMES, FRAME_RATE = 150, 15.0
 """10 s, 15 a second."""
 
@@ -160,7 +163,7 @@ def shawl_on_figure(
 
     positions, forces = [cloth.positions], [np.zeros(3)]
     for frame in range(1, frames):
-        cloth.advance(frame / FRAME_RATE, motion)
+        cloth.advance(frame / FRAME_RATE, motion, damping=CALM if frame <= LAYING * FRAME_RATE else 0.0)
         positions.append(cloth.positions)
         forces.append(cloth.contact_force())
         if on_frame is not None:

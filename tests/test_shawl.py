@@ -1,0 +1,58 @@
+"""A shawl over the shoulders of a figure, on real parts: from its spec to a training batch."""
+
+from typing import Any
+
+import numpy as np
+from harness import Service, read_arrays
+from stickslip_sim_core import fabric
+from stickslip_sim_core.character import bones, figure
+from stickslip_training.kinds import open_samples
+
+SPEC: dict[str, Any] = {
+    "kind": "shawl",
+    "allow_uncertified": True,
+    "axes": {
+        "material": "gray-interlock",
+        "mu": 0.5,
+        "self_friction": 0.4,
+        "swing": 0.5,
+        "texture": ["checker", "dots"],
+        "viewpoint": "front",
+    },
+    "preset": "fast",
+    "mesh": 9,
+    "frames": 3,
+    "quality": "draft",
+    "ground_truth": ["segmentation"],
+    "splits": {"train": 1, "validation": 0, "test": 0},
+}
+
+
+def test_from_spec_to_training_batch(service: Service) -> None:
+    job = service.finished(service.submit(SPEC))
+    assert job["state"] == "succeeded"
+    directory = service.data / "store" / "datasets" / job["dataset"]["dataset"] / "v1"
+    arrays = read_arrays(directory)
+    assert arrays["valid"].all()
+    assert arrays["self_friction"].tolist() == [0.4, 0.4]
+    assert arrays["swing"].tolist() == [0.5, 0.5]
+    assert not arrays["self_intersections"].any()
+    # The figure in the dataset is the one that the cloth lay on, and it moved.
+    figure_there = (arrays[f"skin_{name}"][0] for name in ("rest", "weights", "triangles"))
+    figure_here = (figure().rest, figure().weights, figure().triangles)
+    for found, expected in zip(figure_there, figure_here, strict=True):
+        assert np.allclose(found, expected, atol=1e-6)
+    assert np.allclose(arrays["bones"][0, 120], bones(8.0, swing=0.5), atol=1e-6)
+    assert np.abs(arrays["bones"][0, 120] - arrays["bones"][0, 0]).max() > 0.02
+    # It still hangs on the shoulders, and the figure carries it.
+    assert arrays["positions"][0, -1, :, 2].max() > 0.4
+    weight = arrays["areal_density"][0] * AREA * 9.81
+    assert np.median(arrays["contact_force"][0, 60:, 2]) == pytest.approx(weight, rel=0.1)
+    # Pictures show floor, cloth and figure.
+    assert set(np.unique(arrays["segmentation"][0])) >= {1, 2, 3}
+    clip = arrays["video"][0].astype(float)
+    assert np.abs(clip[2] - clip[1]).mean() > 0.3
+    (batch,) = open_samples(directory, "train").loader(2)
+    assert batch["video"].shape == (2, 3, 224, 224, 3)
+    assert np.allclose(batch["self_friction"], 0.4)
+    assert batch.names("viewpoint") == ["front", "front"]
