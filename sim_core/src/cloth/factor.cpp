@@ -19,7 +19,7 @@ StaleFactor::StaleFactor(const Numbering& numbering)
 
 double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
                           const ClothSettings& settings) {
-  if (!made_ || excess_ > settings.refactor_after || last_ >= settings.krylov_max) {
+  if (!made_ || cost_.too_much(settings)) {
     make(assembly, x, contact, dt);
     return 1.0;
   }
@@ -36,7 +36,7 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
   refresh(assembly, contact);
   made_ = true;
   dt_ = dt;
-  excess_ = fresh_ = -1;
+  cost_.restart();
 }
 
 void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact) {
@@ -46,7 +46,7 @@ void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact)
   modes_ = contact.mode;
 }
 
-void StaleFactor::spent(int iterations) {
+void FactorCost::spent(int iterations) {
   last_ = iterations;
   if (fresh_ < 0) fresh_ = last_, excess_ = 0;
   excess_ += std::max(0, last_ - fresh_);

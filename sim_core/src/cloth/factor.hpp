@@ -11,6 +11,20 @@
 
 namespace sim_core {
 
+// GMRES iterations that a factor has cost since it was new.
+class FactorCost {
+ public:
+  void restart() { fresh_ = -1, last_ = excess_ = 0; }
+  void spent(int iterations);
+  // Whether a new one would have cost less, or may help.
+  bool too_much(const ClothSettings& settings) const {
+    return excess_ > settings.refactor_after || last_ >= settings.krylov_max;
+  }
+
+ private:
+  int last_ = 0, fresh_ = -1, excess_ = 0;  // of the last solve, of the first, and beyond that
+};
+
 class StaleFactor {
  public:
   explicit StaleFactor(const Numbering& numbering);
@@ -26,7 +40,7 @@ class StaleFactor {
   double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
                const ClothSettings& settings);
   void make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt);
-  void spent(int iterations);
+  void spent(int iterations) { cost_.spent(iterations); }
   void forget() { made_ = false; }
 
  private:
@@ -42,7 +56,7 @@ class StaleFactor {
   std::vector<char> touched_;  // nodes whose modes are others now
   bool made_ = false;
   double dt_ = 0.0;
-  int last_ = 0, fresh_ = -1, excess_ = 0;  // iterations of the last solve, of the first, and beyond that
+  FactorCost cost_;
 };
 
 // Factors for the lengths of step of late: one that is known again is not made again.

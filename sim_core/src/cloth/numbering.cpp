@@ -41,17 +41,6 @@ Graph coupled(const std::vector<Stencil>& stencils, const std::vector<int>& loca
   return graph;
 }
 
-Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place) {
-  Pattern out;
-  for (int i : order) {
-    std::vector<int> row;
-    for (int j : from[i]) row.push_back(place[j]);
-    std::sort(row.begin(), row.end());
-    out.add_row(row);
-  }
-  return out;
-}
-
 }  // namespace
 
 Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,

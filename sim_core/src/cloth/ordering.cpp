@@ -68,13 +68,24 @@ Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points) 
   dissector.out.pivot_begin.push_back(0);
   std::vector<int> all(graph.size());
   std::iota(all.begin(), all.end(), 0);
-  dissector.dissect(all);
+  if (!all.empty()) dissector.dissect(all);
   return dissector.out;
 }
 
 void Pattern::add_row(const std::vector<int>& nodes) {
   node.insert(node.end(), nodes.begin(), nodes.end());
   begin.push_back(static_cast<int>(node.size()));
+}
+
+Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place) {
+  Pattern out;
+  for (int i : order) {
+    std::vector<int> row;
+    for (int j : from[i]) row.push_back(place[j]);
+    std::sort(row.begin(), row.end());
+    out.add_row(row);
+  }
+  return out;
 }
 
 int Pattern::slot(int i, int j) const {

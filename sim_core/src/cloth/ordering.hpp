@@ -29,4 +29,7 @@ struct Pattern {
   int slot(int i, int j) const;
 };
 
+// The pattern of a graph in the order of elimination; `place`: of each node in it.
+Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place);
+
 }  // namespace sim_core

@@ -2,150 +2,263 @@
 
 #include <algorithm>
 #include <cmath>
-#include <set>
 
 namespace sim_core {
 namespace {
 
-// Share of the pairs and contacts that may be others than those the factor is of.
-constexpr double changed_share = 0.2;
+// Nodes that may be held otherwise than in the factor, over the pairs; and what may have no place in its pattern.
+constexpr double changed_share = 0.03, missing_share = 0.05;
+// A node is held otherwise if that has changed by more than this share, and by more than this share of its own
+// stiffness.
+constexpr float hold_change = 0.5f, hold_least = 0.1f;
+// Pinned nodes in a front.
+constexpr std::size_t pins_together = tile_columns / 3;
 
 }  // namespace
 
-bool PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const Pairs& pairs,
-                       double dt, const ClothSettings& settings) {
-  std::vector<Name> names;
-  for (const Pair& pair : pairs.list()) {
-    if (pair.bears()) names.push_back({pair.who.kind, pair.who.first, pair.feature, pair.row.mode, pair.insistence});
+double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const Pairs& pairs,
+                         double dt, const ClothSettings& settings) {
+  collect(pairs, assembly.numbering.free_nodes);
+  const int changed = compare(assembly, contact);
+  const double count = static_cast<double>(wanted_.size());
+  bool whole = !made_ || std::abs(dt - dt_) > 1e-9 * dt_ || cost_.too_much(settings);
+  if (!whole && !(changed > changed_share * count)) return 0.0;
+  if (!made_ || missing(contact) > missing_share * count) {
+    order(assembly, x, contact, pairs);
+    compare(assembly, contact);
+    whole = true;
   }
-  const bool stale = !made_ || std::abs(dt - dt_) > 1e-9 * dt_ || excess_ > settings.refactor_after ||
-                     last_ >= settings.krylov_max ||
-                     changed(contact, names) > changed_share * static_cast<double>(names.size());
-  if (!stale) return false;
-  if (!made_ || !has_place_for(pairs, assembly.numbering.free_nodes)) order(assembly, x, pairs);
-  fill(assembly, x, contact, pairs);
-  made_ = true;
-  dt_ = dt;
-  names_ = std::move(names);
-  modes_ = contact.mode;
-  excess_ = fresh_ = -1;
-  last_ = 0;
-  return true;
+  enter(whole);
+  double share = 1.0;
+  if (whole) {
+    read_matrix(assembly, x);
+    storage_->mark_all();
+    made_ = true;
+    dt_ = dt;
+    cost_.restart();
+  } else {
+    for (std::size_t i = 0; i < touched_.size(); ++i) due_[place_[i]] = touched_[i];
+    share = storage_->mark(due_);
+  }
+  make(assembly);
+  return share;
 }
 
-void PairFactor::spent(int iterations) {
-  last_ = iterations;
-  if (fresh_ < 0) fresh_ = last_, excess_ = 0;
-  excess_ += std::max(0, last_ - fresh_);
-}
-
-int PairFactor::changed(const ContactState& contact, const std::vector<Name>& names) const {
-  int count = 0;
-  for (std::size_t i = 0; i < modes_.size(); ++i) count += contact.mode[i] != modes_[i];
-  std::vector<Name> others;
-  std::set_symmetric_difference(names.begin(), names.end(), names_.begin(), names_.end(), std::back_inserter(others));
-  return count + static_cast<int>(others.size());
-}
-
-bool PairFactor::has_place_for(const Pairs& pairs, int free_nodes) const {
+void PairFactor::collect(const Pairs& pairs, int free_nodes) {
+  wanted_.clear();
   for (const Pair& pair : pairs.list()) {
     if (!pair.bears()) continue;
-    for (int a : pair.who.node) {
-      for (int b : pair.who.node) {
-        if (a < free_nodes && b < free_nodes && pattern_.slot(place_[a], place_[b]) < 0) return false;
-      }
+    Entry entry;
+    for (int c = 0; c < 4; ++c) {
+      const int node = pair.who.node[c];
+      entry.node[c] = node < free_nodes && !(made_ && pinned_[node]) ? node : -1;
+      entry.weight[c] = static_cast<float>(pair.weights[c]);
     }
+    entry.stiffness = pair.row.symmetric.cast<float>();
+    wanted_.push_back(entry);
   }
-  return true;
 }
 
-void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const Pairs& pairs) {
+// Marks the nodes that are held otherwise than in the factor, and returns how many there are.
+int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
+  const std::size_t free_nodes = contact.mode.size();
+  bodies_.resize(free_nodes);
+  held_.resize(free_nodes, Hold::Zero());
+  touched_.assign(free_nodes, 0);
+  due_.resize(free_nodes);
+  for (std::size_t i = 0; i < free_nodes; ++i) {
+    const int node = static_cast<int>(i);
+    contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
+  }
+  holds_ = bodies_;
+  for (const Entry& entry : wanted_) add_holds(entry, holds_);
+  int changed = 0;
+  for (std::size_t i = 0; i < free_nodes; ++i) {
+    const float difference = (holds_[i] - held_[i]).squaredNorm();
+    if (difference == 0.0f) continue;
+    const float least = hold_least * static_cast<float>(assembly.own_stiffness(static_cast<int>(i)));
+    const float most = std::max({hold_change * hold_change * holds_[i].squaredNorm(),
+                                 hold_change * hold_change * held_[i].squaredNorm(), least * least});
+    if (difference > most) touched_[i] = 1, ++changed;
+  }
+  return changed;
+}
+
+// Pairs that have no place in the pattern, and nodes that are pinned but stick no more.
+int PairFactor::missing(const ContactState& contact) const {
+  int count = 0;
+  for (const Entry& entry : wanted_) count += !has_place(entry);
+  for (std::size_t i = 0; i < pinned_.size(); ++i) count += pinned_[i] && contact.mode[i] != contact_stick;
+  return count;
+}
+
+void PairFactor::add_holds(const Entry& entry, std::vector<Hold>& holds) {
+  const Eigen::Matrix3f& k = entry.stiffness;
+  const Hold whole{k(0, 0), k(0, 1), k(0, 2), k(1, 1), k(1, 2), k(2, 2)};
+  for (int c = 0; c < 4; ++c) {
+    if (entry.node[c] >= 0) holds[entry.node[c]] += entry.weight[c] * entry.weight[c] * whole;
+  }
+}
+
+template <class Call>
+void PairFactor::visit(const Entry& entry, const Call& call) const {
+  for (int a = 0; a < 4; ++a) {
+    for (int b = 0; b < a; ++b) {
+      if (entry.node[a] < 0 || entry.node[b] < 0 || entry.weight[a] * entry.weight[b] == 0.0f) continue;
+      const auto [low, high] = std::minmax(place_[entry.node[a]], place_[entry.node[b]]);
+      call(membrane_.slot(high, low), entry.weight[a] * entry.weight[b]);
+    }
+  }
+}
+
+bool PairFactor::has_place(const Entry& entry) const {
+  bool all = true;
+  visit(entry, [&](int slot, float) { all = all && slot >= 0; });
+  return all;
+}
+
+void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
+                       const Pairs& pairs) {
   const Numbering& numbering = assembly.numbering;
   const int free_nodes = numbering.free_nodes;
-  const Pattern &bending = numbering.compact_bending, &membrane = numbering.membrane;
-  Graph graph(free_nodes);
-  Eigen::MatrixXd points(free_nodes, 3);
-  for (int i = 0; i < free_nodes; ++i) {
-    graph[i].assign(bending.node.begin() + bending.begin[i], bending.node.begin() + bending.begin[i + 1]);
-    points.row(i) = at_node(x, i).transpose();
-  }
-  for (const Pair& pair : pairs.list()) {
-    if (!pair.bears()) continue;
-    for (int a : pair.who.node) {
-      for (int b : pair.who.node) {
-        if (a < free_nodes && b < free_nodes) graph[a].push_back(b);
+  pinned_.resize(free_nodes);
+  for (int i = 0; i < free_nodes; ++i) pinned_[i] = contact.mode[i] == contact_stick;
+  made_ = true;
+  collect(pairs, free_nodes);
+  const auto graph_of = [&](const Pattern& pattern) {
+    Graph graph(free_nodes);
+    for (int i = 0; i < free_nodes; ++i) {
+      if (pinned_[i]) {
+        graph[i] = {i};
+        continue;
+      }
+      for (int e = pattern.begin[i]; e < pattern.begin[i + 1]; ++e) {
+        if (!pinned_[pattern.node[e]]) graph[i].push_back(pattern.node[e]);
       }
     }
+    for (const Entry& entry : wanted_) {
+      for (int a : entry.node) {
+        for (int b : entry.node) {
+          if (a >= 0 && b >= 0) graph[a].push_back(b);
+        }
+      }
+    }
+    for (std::vector<int>& row : graph) {
+      std::sort(row.begin(), row.end());
+      row.erase(std::unique(row.begin(), row.end()), row.end());
+    }
+    return graph;
+  };
+  const Graph bending = graph_of(numbering.compact_bending), membrane = graph_of(numbering.membrane);
+  // Pinned nodes come last, each for itself.
+  std::vector<int> loose, pins, number(free_nodes, -1);
+  for (int i = 0; i < free_nodes; ++i) {
+    number[i] = static_cast<int>(loose.size());
+    (pinned_[i] ? pins : loose).push_back(i);
   }
-  for (std::vector<int>& row : graph) {
-    std::sort(row.begin(), row.end());
-    row.erase(std::unique(row.begin(), row.end()), row.end());
+  Graph coupled(loose.size());
+  Eigen::MatrixXd points(loose.size(), 3);
+  for (std::size_t l = 0; l < loose.size(); ++l) {
+    for (int j : bending[loose[l]]) coupled[l].push_back(number[j]);
+    points.row(static_cast<Eigen::Index>(l)) = at_node(x, loose[l]).transpose();
   }
-  const Dissection dissection = nested_dissection(graph, points);
+  Dissection dissection = nested_dissection(coupled, points);
+  for (int& i : dissection.order) i = loose[i];
+  for (std::size_t p = 0; p < pins.size(); ++p) {
+    dissection.order.push_back(pins[p]);
+    if ((p + 1) % pins_together != 0 && p + 1 < pins.size()) continue;
+    dissection.pivot_begin.push_back(static_cast<int>(dissection.order.size()));
+    dissection.parent.push_back(-1);
+  }
   order_ = dissection.order;
-  place_.assign(free_nodes, 0);
+  place_.resize(free_nodes);
   for (int i = 0; i < free_nodes; ++i) place_[order_[i]] = i;
-  pattern_ = {};
-  for (int i : order_) {
-    std::vector<int> row;
-    for (int j : graph[i]) row.push_back(place_[j]);
-    std::sort(row.begin(), row.end());
-    pattern_.add_row(row);
-  }
-  const auto slots_of = [&](const Pattern& from) {
-    std::vector<int> slots;
+  bending_ = renumbered(bending, order_, place_);
+  membrane_ = renumbered(membrane, order_, place_);
+  // The factor reads a scalar in the row of the one that is eliminated first, and a block in that of the other.
+  scalar_slots_.clear();
+  block_slots_.clear();
+  const auto find_slots = [&](const Pattern& from, const Pattern& to, bool upper,
+                              std::vector<std::array<int, 2>>& slots) {
     for (int i = 0; i < free_nodes; ++i) {
       for (int e = from.begin[i]; e < from.begin[i + 1]; ++e) {
-        slots.push_back(pattern_.slot(place_[i], place_[from.node[e]]));
+        const int row = place_[i], column = place_[from.node[e]];
+        if (upper ? column < row : column > row) continue;
+        const int slot = to.slot(row, column);
+        if (slot >= 0) slots.push_back({e, slot});
       }
     }
-    return slots;
   };
-  scalar_slot_ = slots_of(bending);
-  block_slot_ = slots_of(membrane);
-  storage_ = std::make_unique<FactorStorage>(pattern_, pattern_, dissection);
+  find_slots(numbering.compact_bending, bending_, true, scalar_slots_);
+  find_slots(numbering.membrane, membrane_, false, block_slots_);
+  scalars_.assign(bending_.node.size(), 0.0f);
+  blocks_.assign(12 * membrane_.node.size(), 0.0f);
+  diagonal_.resize(free_nodes);
+  added_.resize(6L * free_nodes);
+  storage_ = std::make_unique<FactorStorage>(bending_, membrane_, dissection);
   ordered_.assign(4L * free_nodes + 64, 0.0f);
   view_ = storage_->view();
   view_.order = order_.data();
   view_.ordered = ordered_.data();
 }
 
-// The matrix's neighbour, bodies as penalties, and the symmetric part of the pairs.
-void PairFactor::fill(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const Pairs& pairs) {
-  const int free_nodes = assembly.numbering.free_nodes;
-  NeighbourNumbers numbers;
-  const ClothMatrix neighbour = assembly.neighbour(x, numbers);
-  scalars_.assign(pattern_.node.size(), 0.0f);
-  blocks_.assign(12 * pattern_.node.size(), 0.0f);
-  for (std::size_t e = 0; e < scalar_slot_.size(); ++e) scalars_[scalar_slot_[e]] = neighbour.bending[e];
-  for (std::size_t e = 0; e < block_slot_.size(); ++e) {
-    std::copy_n(neighbour.membrane + 12 * e, 12, &blocks_[12L * block_slot_[e]]);
+// Pairs at nodes that are held otherwise go, and those that are wanted there come, so that what is in the factor stays
+// that of some pairs, and positive.
+void PairFactor::enter(bool whole) {
+  if (whole) {
+    entries_.clear();
+    std::fill(touched_.begin(), touched_.end(), 1);
   }
-  for (const Pair& pair : pairs.list()) {
-    if (!pair.bears()) continue;
-    for (int a = 0; a < 4; ++a) {
-      for (int b = 0; b < 4; ++b) {
-        if (pair.who.node[a] >= free_nodes || pair.who.node[b] >= free_nodes) continue;
-        const int slot = pattern_.slot(place_[pair.who.node[a]], place_[pair.who.node[b]]);
-        const Eigen::Matrix3f block = (pair.weights[a] * pair.weights[b] * pair.row.symmetric).cast<float>();
-        for (int c = 0; c < 3; ++c) {
-          for (int r = 0; r < 3; ++r) blocks_[12L * slot + 4 * c + r] += block(r, c);
-        }
-      }
+  std::fill(due_.begin(), due_.end(), 0);
+  const auto meets = [&](const Entry& entry) {
+    if (std::none_of(entry.node.begin(), entry.node.end(), [&](int i) { return i >= 0 && touched_[i]; })) return false;
+    for (int i : entry.node) {
+      if (i >= 0) due_[i] = 1;
     }
+    return true;
+  };
+  entries_.erase(std::remove_if(entries_.begin(), entries_.end(), meets), entries_.end());
+  for (const Entry& entry : wanted_) {
+    if (has_place(entry) && meets(entry)) entries_.push_back(entry);
   }
-  diagonal_.resize(free_nodes);
-  added_.assign(6L * free_nodes, 0.0f);
-  for (int i = 0; i < free_nodes; ++i) {
-    diagonal_[place_[i]] = neighbour.diagonal[i];
-    contact.penalty(i, assembly.own_stiffness(i), &added_[6L * place_[i]]);
+  for (std::size_t i = 0; i < touched_.size(); ++i) {
+    touched_[i] = touched_[i] || due_[i];
+    if (touched_[i]) held_[i] = bodies_[i];
   }
-  ClothMatrix ordered = neighbour;
-  ordered.bending = scalars_.data();
-  ordered.membrane = blocks_.data();
-  ordered.diagonal = diagonal_.data();
-  storage_->mark_all();
-  assembly.kernel.factor(view_, ordered, {added_.data()});
+  holds_.assign(held_.size(), Hold::Zero());
+  for (const Entry& entry : entries_) add_holds(entry, holds_);
+  for (std::size_t i = 0; i < touched_.size(); ++i) {
+    if (touched_[i]) held_[i] += holds_[i];
+  }
+}
+
+// The matrix's neighbour, which parts are made anew of, too: of one that moved on they would not fit the others.
+void PairFactor::read_matrix(Assembly& assembly, const Buffer<double>& x) {
+  matrix_ = assembly.neighbour(x, numbers_);
+  for (const auto& [from, to] : scalar_slots_) scalars_[to] = matrix_.bending[from];
+  for (const auto& [from, to] : block_slots_) std::copy_n(matrix_.membrane + 12L * from, 12, &blocks_[12L * to]);
+  for (std::size_t i = 0; i < place_.size(); ++i) diagonal_[place_[i]] = matrix_.diagonal[i];
+  matrix_.bending = scalars_.data();
+  matrix_.membrane = blocks_.data();
+  matrix_.diagonal = diagonal_.data();
+}
+
+// With bodies as penalties, and the symmetric part of the pairs.
+void PairFactor::make(const Assembly& assembly) {
+  std::vector<std::pair<int, std::array<float, 12>>> before;
+  for (const Entry& entry : entries_) {
+    visit(entry, [&](int slot, float weight) {
+      float* block = &blocks_[12L * slot];
+      before.emplace_back(slot, std::array<float, 12>{});
+      std::copy_n(block, 12, before.back().second.data());
+      for (int c = 0; c < 3; ++c) {
+        for (int r = 0; r < 3; ++r) block[4 * c + r] += weight * entry.stiffness(r, c);
+      }
+    });
+  }
+  for (std::size_t i = 0; i < place_.size(); ++i) std::copy_n(held_[i].data(), 6, &added_[6L * place_[i]]);
+  assembly.kernel.factor(view_, matrix_, {added_.data()});
+  for (auto b = before.rbegin(); b != before.rend(); ++b) std::copy_n(b->second.data(), 12, &blocks_[12L * b->first]);
 }
 
 }  // namespace sim_core

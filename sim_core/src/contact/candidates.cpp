@@ -81,9 +81,10 @@ class Grid {
   std::vector<int> begin_, items_;
 };
 
-void add_if_near(std::vector<Candidate>& out, const Candidate& pair, const Buffer<double>& x, double reach) {
+void add_if_near(std::vector<Candidate>& out, Candidate pair, const Buffer<double>& x, double reach) {
   const FourPoints at = points_of(pair, x);
-  if (between_closest(closest_weights(pair.kind, at), at).squaredNorm() <= reach * reach) out.push_back(pair);
+  pair.distance = between_closest(closest_weights(pair.kind, at), at).norm();
+  if (pair.distance <= reach) out.push_back(pair);
 }
 
 }  // namespace
@@ -110,7 +111,8 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
       const auto& corner = surface.triangles[*t];
       if (!surface.feel(vertex, corner[0]) || (p < boxes[*t].low).any() || (p > boxes[*t].high).any()) continue;
       if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
-      add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}}, x, reach);
+      add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
+                  reach);
     }
   }
   const std::size_t vertex_pairs = out.size();
@@ -127,7 +129,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
         if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1] || !boxes[*i].meets(boxes[*j])) continue;
         // Boxes that meet in many cells count in the one with the lowest corner of what they share.
         if (edges.cell_at(boxes[*i].low.max(boxes[*j].low)) != cell) continue;
-        add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}}, x, reach);
+        add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}, 0.0}, x, reach);
       }
     }
   }

@@ -14,6 +14,7 @@ struct Candidate {
   PairKind kind;
   int first, second;        // a vertex (node) and a triangle, or two edges, the lower first
   std::array<int, 4> node;  // in the order of closest_weights
+  double distance;          // where they were looked for, m
 };
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x);

@@ -76,7 +76,7 @@ double crossing_squared(const FourPoints& x) {
   return u.cross(v).squaredNorm() / (u.squaredNorm() * v.squaredNorm());
 }
 
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep) {
+double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep, double most) {
   FourPoints at = x, motion;
   Vector3d mean = Vector3d::Zero();
   for (int i = 0; i < 4; ++i) mean += 0.25 * (to[i] - x[i]);
@@ -90,8 +90,8 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, doub
                              ? speed[0] + std::max({speed[1], speed[2], speed[3]})
                              : std::max(speed[0], speed[1]) + std::max(speed[2], speed[3]);
   double distance = between_closest(closest_weights(kind, x), x).norm();
-  const double least = keep * distance;
-  if (fastest <= (1.0 - keep) * distance) return 1.0;
+  const double least = keep * std::min(distance, most);
+  if (fastest <= distance - least) return 1.0;
   if (!(distance > 0.0) || !std::isfinite(fastest)) return 0.0;
   double share = 0.0;
   for (int k = 0; k < advances_max; ++k) {

@@ -32,8 +32,9 @@ inline Eigen::Vector3d between_closest(const Eigen::Vector4d& weights, const Fou
 // Squared sine of the angle of the two segments.
 double crossing_squared(const FourPoints& x);
 
-// A share of the straight motion from x to `to` up to which the distance stays above `keep` times that at x; 1 if it
-// does to the end. Never too large, and too small by little [Li et al. 2021, additive CCD, Algorithm 1].
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep);
+// A share of the straight motion from x to `to` up to which the distance stays above `keep` times that at x, or times
+// `most` where that is less; 1 if it does to the end. Never too large, and too small by little [Li et al. 2021,
+// additive CCD, Algorithm 1].
+double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep, double most);
 
 }  // namespace sim_core

@@ -30,6 +30,9 @@ constexpr double hand_on_cosine = 0.5;
 constexpr double insist_above = 0.5, insist_from = 2e-9, insist_up_to = 0.02, insist_more = 4.0, insist_max = 4096.0;
 // Pairs whose middles are nearer than so much of the thickness are one; forces are handed on up to so far.
 constexpr double merge_share = 0.2, hand_on_share = 0.5;
+// Pieces further apart than so many thicknesses, and what they may have come towards each other in this step, are no
+// pair.
+constexpr double near_share = 2.0;
 
 auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
 
@@ -113,7 +116,8 @@ void Pairs::select(const Buffer<double>& x) {
   };
   const Surface& surface = near.surface;
   const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
-  const std::vector<Candidate>& candidates = near.pairs(x);
+  std::vector<Candidate>& candidates = near.pairs(x);
+  const double reach = near_share * near.thickness + 2.0 * near.moved(*start_, x);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
   std::vector<Found> found;
@@ -123,8 +127,11 @@ void Pairs::select(const Buffer<double>& x) {
     found.clear();
     for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
          ++c) {
-      const Candidate& who = candidates[c];
-      const Vector4d weights = closest_weights(who.kind, points_of(who, x));
+      Candidate& who = candidates[c];
+      if (who.distance > reach) continue;
+      const FourPoints at = points_of(who, x);
+      const Vector4d weights = closest_weights(who.kind, at);
+      who.distance = between_closest(weights, at).norm();
       int corners = 0, corner = 0, opposite = 0;
       for (int i = 0; i < 3; ++i) {
         if (weights[1 + i] != 0.0) {
@@ -148,7 +155,7 @@ void Pairs::select(const Buffer<double>& x) {
       const int around = feature < triangles           ? 1
                          : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
                                                        : surface.triangles_of_node[feature - triangles - edges];
-      if (static_cast<int>(next - i) != around) continue;
+      if (static_cast<int>(next - i) != around || candidates[found[i].candidate].distance > reach) continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
         const auto first = std::lower_bound(pairs_.begin(), pairs_.end(), other,
@@ -163,10 +170,13 @@ void Pairs::select(const Buffer<double>& x) {
     }
   }
   for (; c < candidates.size(); ++c) {
-    const Candidate& who = candidates[c];
+    Candidate& who = candidates[c];
+    if (who.distance > reach) continue;
     const FourPoints at = points_of(who, x);
     const Vector4d weights = closest_weights(who.kind, at);
-    if (weights.cwiseAbs().minCoeff() < end_share || crossing_squared(at) < crossing_least) continue;
+    who.distance = between_closest(weights, at).norm();
+    if (who.distance > reach || weights.cwiseAbs().minCoeff() < end_share || crossing_squared(at) < crossing_least)
+      continue;
     add(who, who.second, weights, x);
   }
 }

@@ -271,7 +271,7 @@ std::optional<Foot> Patches::foot(const PatchShape& shape, const Vector3d& p, in
     int out = 0;
     const double least = root.b.minCoeff(&out);
     if (root.found && least >= inside) return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
-    if (!root.found && least > far_out) return std::nullopt;
+    if (!root.found && least >= inside) return std::nullopt;
     if (sharp_[t][out] && root.b[next(out)] < inside && !sharp_[t][next(out)]) out = next(out);
     if (sharp_[t][out] && root.b[after_next(out)] < inside && !sharp_[t][after_next(out)]) out = after_next(out);
     if (sharp_[t][out]) return foot_around(shape, p, t, side);

@@ -9,12 +9,32 @@ namespace {
 
 using Eigen::Array3d;
 
-// Of the distance of a pair, what a motion leaves.
+// Of the distance of a pair, or of the thickness where that is less, what a motion leaves: what slides past each other
+// comes from far to about the thickness.
 constexpr double keep = 0.2;
 // Rounds in which nodes are capped one by one; after them all are by the same share.
 constexpr int rounds_max = 8;
 // Ways longer than so many margins end there.
-constexpr int hops_max = 64;
+constexpr int hops_max = 16;
+
+std::pair<Array3d, Array3d> box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
+  Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
+  for (int i : surface.vertices) {
+    const Array3d way = (at_node(to, i) - at_node(from, i)).array();
+    low = low.min(way);
+    high = high.max(way);
+  }
+  return {low, high};
+}
+
+// No distance of a point of the first from one of the second changes by more, if nodes go `ways`.
+double fastest(const Candidate& pair, const std::vector<double>& ways) {
+  const auto& node = pair.node;
+  if (pair.kind == PairKind::vertex_triangle) {
+    return ways[node[0]] + std::max({ways[node[1]], ways[node[2]], ways[node[3]]});
+  }
+  return std::max(ways[node[0]], ways[node[1]]) + std::max(ways[node[2]], ways[node[3]]);
+}
 
 }  // namespace
 
@@ -22,56 +42,85 @@ Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double mar
     : surface(std::move(surface_in)),
       thickness(thickness_in),
       margin_(margin),
-      share_(surface.sheet_of_node.size(), 1.0) {}
+      share_(surface.sheet_of_node.size(), 1.0),
+      drift_(share_),
+      way_(share_) {}
 
-// Half of the largest side of the box of the motions, which bounds them but for a common one.
+// Half of the diagonal of the box of the motions, which bounds them but for a common one.
 double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to) const {
-  Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
-  for (int i : surface.vertices) {
-    const Array3d way = (at_node(to, i) - at_node(from, i)).array();
-    low = low.min(way);
-    high = high.max(way);
-  }
+  const auto [low, high] = box_of_ways(surface, from, to);
   return 0.5 * (high - low).matrix().norm();
 }
 
+// The same if each node goes to one of two places, or between them.
+double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const {
+  const auto [low, high] = box_of_ways(surface, from, to);
+  const auto [low_or, high_or] = box_of_ways(surface, from, or_to);
+  return 0.5 * (high.max(high_or) - low.min(low_or)).matrix().norm();
+}
+
+Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<double>& to,
+                                       std::vector<double>& ways) const {
+  const auto [low, high] = box_of_ways(surface, from, to);
+  const Eigen::Vector3d common = 0.5 * (low + high).matrix();
+  for (int i : surface.vertices) ways[i] = (at_node(to, i) - at_node(from, i) - common).norm();
+  return common;
+}
+
+double Neighbourhood::left(double distance) const { return keep * std::min(distance, thickness); }
+
 void Neighbourhood::rebuild(const Buffer<double>& x) {
-  reference_ = x;
+  reference_ = at_ = x;
   pairs_ = candidates(surface, x, thickness + 2.0 * margin_);
   ++rebuilds;
 }
 
-const std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {
+std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {
   if (reference_.empty() || !(moved(reference_, x) <= margin_)) rebuild(x);
+  measure(at_, x, way_);
+  for (Candidate& pair : pairs_) pair.distance -= fastest(pair, way_);
+  at_ = x;
   return pairs_;
 }
 
 bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
   if (!reference_.empty() && moved(reference_, from) <= margin_ && moved(reference_, to) <= margin_) {
-    return cap_near(from, to);
+    Buffer<double> capped = to;
+    if (cap_near(from, capped)) return true;
+    if (moved(reference_, from, to) <= margin_) {
+      to = std::move(capped);
+      return false;
+    }
   }
   Buffer<double> at = from;
   bool whole = true;
   for (int hop = 0; hop < hops_max; ++hop) {
-    // From the middle of a hop both of its ends are within the margin.
-    const double way = moved(at, to), share = way > 2.0 * margin_ ? 2.0 * margin_ / way : 1.0;
-    const auto part = [&](double of_way) {
+    const auto part = [&](double share) {
       Buffer<double> out = at;
-      for (int i : surface.vertices) at_node(out, i) += of_way * (at_node(to, i) - at_node(at, i));
+      for (int i : surface.vertices) at_node(out, i) += share * (at_node(to, i) - at_node(at, i));
       return out;
     };
+    // From the middle of a hop both of its ends are within the margin, but for a common way. Nodes that are stopped do
+    // not go that: so where there are any, the hop is shorter.
+    double share = std::min(1.0, 2.0 * margin_ / moved(at, to));
     rebuild(part(0.5 * share));
-    if (share == 1.0) return cap_near(at, to) && whole;
-    Buffer<double> next = part(share);
-    const Buffer<double> wanted = next;
-    if (!cap_near(at, next)) {
-      // Who is stopped has arrived.
+    Buffer<double> wanted = part(share), next = wanted;
+    bool stopped = !cap_near(at, next);
+    const double shorter = margin_ / moved(part(0.5), at, to);
+    if (stopped && shorter < share) {
+      share = shorter;
+      rebuild(part(0.5 * share));
+      wanted = next = part(share);
+      stopped = !cap_near(at, next);
+    }
+    if (stopped) {  // who is has arrived
       whole = false;
       for (int i : surface.vertices) {
         if (at_node(next, i) != at_node(wanted, i)) at_node(to, i) = at_node(next, i);
       }
     }
     at = std::move(next);
+    if (share == 1.0) return whole;
   }
   for (int i : surface.vertices) at_node(to, i) = at_node(at, i);
   return false;
@@ -79,29 +128,39 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
 
 double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<double>& to) {
   double least = 1.0;
-  for (const Candidate& pair : pairs(from)) {
-    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), keep));
+  const std::vector<Candidate>& near = pairs(from);
+  measure(from, to, way_);
+  for (const Candidate& pair : near) {
+    if (fastest(pair, way_) <= pair.distance - left(pair.distance)) continue;
+    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), keep, thickness));
   }
   return least;
 }
 
 bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
+  measure(at_, from, drift_);
+  const Eigen::Vector3d common = measure(from, to, way_);
   std::fill(share_.begin(), share_.end(), 1.0);
-  bool whole = true;
   const auto place = [&](int i) -> Eigen::Vector3d {
     if (share_[i] == 1.0) return at_node(to, i);
     return at_node(from, i) + share_[i] * (at_node(to, i) - at_node(from, i));
   };
-  double least = 1.0;
+  const auto shorten = [&](int i, double share) {
+    share_[i] *= share;
+    way_[i] = (place(i) - at_node(from, i) - common).norm();
+  };
+  bool whole = true;
   for (int round = 0; round <= rounds_max; ++round) {
-    least = 1.0;
+    double least = 1.0;
     for (const Candidate& pair : pairs_) {
+      const double distance = pair.distance - fastest(pair, drift_);
+      if (fastest(pair, way_) <= distance - left(distance)) continue;
       const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]), place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, keep);
+      const double safe = safe_share(pair.kind, points_of(pair, from), ends, keep, thickness);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == rounds_max) continue;
-      for (int i : pair.node) share_[i] *= safe;
+      for (int i : pair.node) shorten(i, safe);
     }
     if (least == 1.0) break;
     whole = false;

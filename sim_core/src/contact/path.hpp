@@ -16,28 +16,36 @@ class Neighbourhood {
   const Surface surface;
   const double thickness;
 
-  // The pairs, for positions x.
-  const std::vector<Candidate>& pairs(const Buffer<double>& x);
+  // The pairs, for positions x. Of each, `distance` is at most its distance there.
+  std::vector<Candidate>& pairs(const Buffer<double>& x);
 
-  // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance, so that nothing
-  // crosses on the straight ways between: each node by as much as its pairs demand. Returns whether nothing was moved.
+  // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance or of the thickness, so
+  // that nothing crosses on the straight ways between: each node by as much as its pairs demand. Returns whether
+  // nothing was moved.
   bool cap(const Buffer<double>& from, Buffer<double>& to);
 
   // The share of the straight way from `from` to `to` that all nodes can go together, so that every pair that is near
-  // at `from` keeps a fifth of its distance.
+  // at `from` keeps a fifth of its distance or of the thickness.
   double common_share(const Buffer<double>& from, const Buffer<double>& to);
 
   int rebuilds = 0;
 
- private:
+  // What bounds all ways from there, but for a common one, m.
   double moved(const Buffer<double>& from, const Buffer<double>& to) const;
+
+ private:
+  double moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const;
   void rebuild(const Buffer<double>& x);
+  // What a motion leaves of a distance, m.
+  double left(double distance) const;
   bool cap_near(const Buffer<double>& from, Buffer<double>& to);
+  // Of each vertex the length of its way but for a common one, which it returns: the middle of the box of all ways.
+  Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to, std::vector<double>& ways) const;
 
   double margin_;
   std::vector<Candidate> pairs_;
-  Buffer<double> reference_;
-  std::vector<double> share_;
+  Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
+  std::vector<double> share_, drift_, way_;
 };
 
 }  // namespace sim_core

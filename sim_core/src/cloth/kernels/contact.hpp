@@ -21,7 +21,7 @@ inline void admit(const ContactRows& contact, int nodes, float* v) {
 
 // y = J v for an admissible v: a slipping node's friction follows its normal force and turns with its motion.
 inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact, const float* v, float* y) {
-  apply(matrix, v, y);
+  apply_rows(matrix, contact.mode, v, y);
   for (int i = 0; i < matrix.nodes; ++i) {
     Node* at = reinterpret_cast<Node*>(y) + i;
     if (contact.mode[i] == contact_stick) {

@@ -40,10 +40,15 @@ inline void add_pairs(const PairData& pairs, const Node* in, Node* out) {
   }
 }
 
-void apply(const ClothMatrix& matrix, const float* x, float* y) {
+// y = K x, without the rows of nodes that stick where there is a `mode`.
+inline void apply_rows(const ClothMatrix& matrix, const int* mode, const float* x, float* y) {
   const Node* in = reinterpret_cast<const Node*>(x);
   Node* out = reinterpret_cast<Node*>(y);
   for (int i = 0; i < matrix.nodes; ++i) {
+    if (mode && mode[i] == contact_stick) {
+      out[i] = Node{};
+      continue;
+    }
     Node sum = spread(matrix.diagonal[i]) * in[i], other{};
     int e = matrix.bending_begin[i];
     const int end = matrix.bending_begin[i + 1];
@@ -63,6 +68,8 @@ void apply(const ClothMatrix& matrix, const float* x, float* y) {
   add_folds(*matrix.folds, in, out);
   if (matrix.pairs) add_pairs(*matrix.pairs, in, out);
 }
+
+void apply(const ClothMatrix& matrix, const float* x, float* y) { apply_rows(matrix, nullptr, x, y); }
 
 }  // namespace
 }  // namespace sim_core
