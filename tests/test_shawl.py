@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from harness import Service, read_arrays
-from stickslip_sim_core import fabric
 from stickslip_sim_core.character import bones, figure
 from stickslip_training.kinds import open_samples
 
@@ -46,7 +46,9 @@ def test_from_spec_to_training_batch(service: Service) -> None:
     assert np.abs(arrays["bones"][0, 120] - arrays["bones"][0, 0]).max() > 0.02
     # It still hangs on the shoulders, and the figure carries it.
     assert arrays["positions"][0, -1, :, 2].max() > 0.4
-    weight = arrays["areal_density"][0] * AREA * 9.81
+    a, b, c = np.moveaxis(arrays["rest"][0].astype(float)[arrays["triangles"][0]], 1, 0)
+    area = 0.5 * np.cross(b - a, c - a).sum()
+    weight = arrays["areal_density"][0] * area * 9.81
     assert np.median(arrays["contact_force"][0, 60:, 2]) == pytest.approx(weight, rel=0.1)
     # Pictures show floor, cloth and figure.
     assert set(np.unique(arrays["segmentation"][0])) >= {1, 2, 3}

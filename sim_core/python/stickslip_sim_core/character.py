@@ -80,7 +80,7 @@ def _union(distances: list[Floats], blend: float = BLEND) -> Floats:
     return found
 
 
-_LEFT_ARM = _limb((*SHOULDER, 0.052), (0.0, 0.29, 0.27, 0.04), (0.07, 0.32, 0.04, 0.035))
+_LEFT_ARM = _limb((*SHOULDER, 0.055), (0.0, 0.27, 0.31, 0.045))
 _LEFT_SLOPE = _limb((-0.01, 0.03, 0.585, 0.045), (0.0, 0.16, 0.53, 0.05))
 
 _PARTS: tuple[tuple[Field, ...], ...] = (

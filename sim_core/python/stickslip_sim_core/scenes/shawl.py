@@ -1,4 +1,4 @@
-"""A shawl: a rectangle of cloth is laid over the shoulders of a figure, which then moves [thesis, 4.6]."""
+"""A shawl: a cloth is laid over the shoulders of a figure, which then moves [thesis, 4.6]."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, SelfContact, Surface, plane
 
-LENGTH, WIDTH = 1.2, 0.6
-"""Of the shawl, along the warp and across [m]."""
+NECKLINE, HEM, ANGLE = 0.095, 0.5, 5.3
+"""The shawl is cut as a part of a ring: its radii inside and outside [m], and its angle [rad]."""
 
-APEX, STEEPNESS, NECKLINE = 0.83, 0.8, 0.14
-"""The shawl starts as part of a cone about the neck: how high its apex is [m], how steeply it slopes [rad], and how far
-from the apex the middle of the shawl's upper edge is [m]."""
+APEX, SLOPE = 0.70, 0.4
+"""It starts as part of a cone about the neck, open in front: how high the apex is [m], and how steep its sides are
+[rad]."""
 
 SELF_FRICTION = 0.5
 """Of the shawl with itself, unless another is asked for."""
@@ -93,16 +93,26 @@ class Shawl:
     """Why it is not valid, or empty."""
 
 
-def laid(rest: Floats) -> Floats:
-    """Return where a shawl starts (V, 3) [m] whose rest shape is (V, 2) [m]: bent to a cone, not stretched.
+def cut(cells: int) -> meshes.Mesh:
+    """Return the flat shawl of so many cells a side: along the ring, the warp, and outward.
 
-    A point at distance r from the apex, at an angle phi from the middle of the back, goes to azimuth phi / cos(s),
-    r cos(s) from the axis, r sin(s) below the apex; s is the slope.
+    Rings are so far apart that all cells are alike. The middle of the back is at x = 0, y < 0.
     """
-    along, down = rest[:, 0], NECKLINE + 0.5 * WIDTH - rest[:, 1]
-    far, azimuth = np.hypot(along, down), np.arctan2(along, down) / np.cos(STEEPNESS)
-    out = far * np.cos(STEEPNESS)
-    return np.stack([-out * np.cos(azimuth), out * np.sin(azimuth), APEX - far * np.sin(STEEPNESS)], axis=1)
+    square = meshes.grid(1.0, 1.0, cells, cells)
+    angle, share = ANGLE * square.rest[:, 0], 0.5 - square.rest[:, 1]
+    radius = NECKLINE * (HEM / NECKLINE) ** share
+    return meshes.Mesh(np.stack([radius * np.sin(angle), -radius * np.cos(angle)], axis=1), square.triangles)
+
+
+def laid(rest: Floats) -> Floats:
+    """Return where the shawl starts (V, 3) [m] whose flat shape is (V, 2) [m]: bent to a cone, not stretched.
+
+    A point at a distance r from the apex, at an angle phi from the middle of the back, goes to azimuth phi / cos(s),
+    r cos(s) from the axis and r sin(s) below the apex; s is the slope.
+    """
+    radius, azimuth = np.hypot(rest[:, 0], rest[:, 1]), np.arctan2(rest[:, 0], -rest[:, 1]) / np.cos(SLOPE)
+    out = radius * np.cos(SLOPE)
+    return np.stack([-out * np.cos(azimuth), out * np.sin(azimuth), APEX - radius * np.sin(SLOPE)], axis=1)
 
 
 def shawl_on_figure(
@@ -143,7 +153,7 @@ def shawl_on_figure(
     if not 0.0 <= swing <= SWING_MAX:
         raise ValueError(f"swing: must be in [0, {SWING_MAX:g}], got {swing}")
     body = figure()
-    mesh = meshes.grid(LENGTH, WIDTH, vertices - 1, vertices - 1)
+    mesh = cut(vertices - 1)
     cloth = Cloth(
         mesh,
         fabric_of(fabric),
