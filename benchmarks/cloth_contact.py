@@ -1,16 +1,21 @@
 """Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its protocols.
 
-    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [piles] [protocols]
+    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [drops] [momentum] [protocols]
+        [--only PREFIX] [--figures FOLDER]
 
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
 with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
-`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `piles`: five sheets fall
-onto each other, by seed. `protocols`: those of contact, with their settings. Without a name all of them run.
+`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `drops`: sheets fall,
+fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see what crosses.
+`momentum`: what forces of pairs and their moments add up to. `protocols`: those of contact, with their settings; the
+stacked incline is on four meshes. Without a name all of them run; `--only pile` leaves out the drops and protocols
+whose names begin otherwise. With --figures the pictures of the protocols are drawn, too (needs matplotlib).
 """
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,9 +35,15 @@ from stickslip_sim_core import (
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import THICKNESS
+from stickslip_sim_core.scenes import tumbles
 
-PROTOCOLS = ("capstan", "pull-out", "heavy-fold", "stacked-incline")
-PILES = (4, 5, 6)
+PROTOCOLS: dict[str, dict[str, int]] = {
+    "capstan": {},
+    "pull-out": {},
+    "heavy-fold": {},
+    "stacked-incline": {"structured": 2, "unstructured": 2},
+}
+UNCONVERGED_SHARE_MAX = 0.002
 
 
 def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tuple[float, Cloth, int]:
@@ -97,69 +108,85 @@ def stretch_all() -> None:
         stretched(vertices, 50)
 
 
-def pile_up() -> None:
-    for seed in PILES:
-        pile(seed)
+def tumble_all(only: str) -> None:
+    failed = []
+    for name in tumbles.TUMBLES:
+        if not name.startswith(only):
+            continue
+        seen = tumbles.watch(tumbles.tumble(name))
+        print(
+            f"{name:11} {seen.seconds:7.2f} CPU s, {seen.unconverged_steps:3d} of {seen.steps:3d} steps unconverged, "
+            f"{seen.crossing_steps:3d} cross, least distance {seen.least_distance:.4f} thicknesses, "
+            f"{seen.newton / seen.steps:6.1f} iterations a step",
+            flush=True,
+        )
+        if seen.crossing_steps or seen.unconverged_steps > UNCONVERGED_SHARE_MAX * seen.steps:
+            failed.append(name)
+    print(f"beyond a share of {UNCONVERGED_SHARE_MAX:g} unconverged, or crossing: {', '.join(failed) or 'none'}")
 
 
-def pile(seed: int, sheets: int = 5, steps: int = 60) -> None:
-    """Let sheets of 6 x 6 cm, turned and tilted, fall onto each other and a floor."""
-    rng = np.random.default_rng(seed)
-    parts = [
-        meshes.grid(0.06, 0.06, 5, 5) if i % 2 else meshes.unstructured(0.06, 0.06, 0.012, i) for i in range(sheets)
-    ]
-    places = []
-    for i, part in enumerate(parts):
-        angle, tilt = rng.uniform(0.0, 6.0), 0.1 * rng.normal(size=2)
-        c, s = np.cos(angle), np.sin(angle)
-        flat = part.rest @ np.array([[c, s], [-s, c]])
-        places.append(np.column_stack([flat, 0.01 + 0.012 * i + flat @ tilt]))
-    mesh = meshes.together(*parts)
-    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), self_contact=SelfContact(0.4))
-    cloth.set_state(np.concatenate(places))
-    begin, crossed = time.process_time(), 0
-    for _ in range(steps):
-        cloth.step(0.01, bodies=[plane(0.4)])
-        crossed += self_intersections(cloth.positions, mesh.triangles) > 0
+def momentum(name: str, steps: int) -> None:
+    seen = tumbles.tumble(name)
+    tumbles.watch(seen, steps)
+    sums = tumbles.balance(seen.cloth)
+    unit = THICKNESS * sums.size
     print(
-        f"pile of {sheets}, seed {seed}: {time.process_time() - begin:.1f} CPU s, {cloth.unconverged_steps} of "
-        f"{cloth.steps} steps unconverged, {crossed} cross, least distance {cloth.least_distance / THICKNESS:.4f}",
+        f"{name} after {steps} steps, {sums.pairs} pairs, over the sum of their sizes (times the thickness): force "
+        f"{np.abs(sums.force).max() / sums.size:.1e}, moment {np.linalg.norm(sums.moment) / unit:.3f}, less that of "
+        f"friction across the distance {np.linalg.norm(sums.moment - sums.moment_of_friction) / unit:.1e}",
         flush=True,
     )
 
 
-def measure_all() -> None:
-    for name in PROTOCOLS:
-        measure(name)
+def momentum_all() -> None:
+    for name, steps in (("folding-0", 100), ("drop-5", 60), ("pile-0", 15)):
+        momentum(name, steps)
 
 
-def measure(name: str) -> None:
+def measure_all(only: str, figures: Path | None) -> None:
+    for name, settings in PROTOCOLS.items():
+        if name.startswith(only):
+            measure(name, settings, figures)
+
+
+def measure(name: str, settings: Mapping[str, int], figures: Path | None) -> None:
     begin = time.process_time()
-    result = protocols.run(name, "certified")
+    result = protocols.run(name, "certified", **settings)
     print(f"{name}: error {result.error:.2g} of {result.tolerance:g}, {time.process_time() - begin:.0f} CPU s")
     for curve in result.curves:
         print("  ", dict(curve.parameters), [f"{error:+.2e}" for error in curve.errors])
     print("  ", dict(result.settings), flush=True)
+    if figures:
+        from stickslip_sim_core.protocols import plots
+
+        plots.plot(result).savefig(figures / f"{name}.png")
 
 
-PARTS: dict[str, Callable[[], None]] = {
-    "camel": lambda: compare("camel-ponte-roma", 21, 300),
-    "overhead": lambda: compare("gray-interlock", 41, 60),
-    "stretched": stretch_all,
-    "piles": pile_up,
-    "protocols": measure_all,
+PARTS: Mapping[str, Callable[[str], None]] = {
+    "camel": lambda _: compare("camel-ponte-roma", 21, 300),
+    "overhead": lambda _: compare("gray-interlock", 41, 60),
+    "stretched": lambda _: stretch_all(),
+    "drops": tumble_all,
+    "momentum": lambda _: momentum_all(),
 }
 
 
 def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; none: all")
-    asked = parser.parse_args().parts or list(PARTS)
-    for part in asked:
-        if part not in PARTS:
-            parser.error(f"parts: must be of {', '.join(PARTS)}, got {part}")
-        PARTS[part]()
+    parts = [*PARTS, "protocols"]
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(parts)}; none: all")
+    parser.add_argument("--only", default="", help="how names of drops and protocols begin")
+    parser.add_argument("--figures", type=Path, help="folder to draw the pictures of the documentation into")
+    given = parser.parse_args()
+    for part in given.parts:
+        if part not in parts:
+            parser.error(f"parts: must be of {', '.join(parts)}, got {part}")
+    for part in given.parts or parts:
+        if part == "protocols":
+            measure_all(given.only, given.figures)
+        else:
+            PARTS[part](given.only)
 
 
 if __name__ == "__main__":

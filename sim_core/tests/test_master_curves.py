@@ -227,6 +227,9 @@ class TestHeavyFold:
         assert fold.height == pytest.approx(fine[3].max(), rel=1e-7)
         assert fold.loop_length == pytest.approx(found.p[2], rel=1e-7)
         assert fold.nose_to_landing == pytest.approx(fine[2].max() - fine[2, -1], rel=1e-7)
+        assert fold.tension == pytest.approx(0.5 * gap, abs=1e-8)
+        assert fold.landing_force == pytest.approx(found.p[1] + found.p[2], rel=1e-6)
+        assert fold.pull(0.3, 2.0) == pytest.approx(0.3 * (2.0 + fold.landing_force) + 0.5 * gap, rel=1e-12)
 
     def test_arguments(self) -> None:
         with pytest.raises(ValueError, match=r"gap: must be in \(0, 0\.5\], got 0\.0"):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from stickslip_sim_core import cylinder
+from stickslip_sim_core import SelfContact, cylinder
 from stickslip_sim_core.protocols import capstan, heavy_fold, pull_out
 
 
@@ -29,6 +29,12 @@ class TestHeavyFold:
         assert result.settings["drift_mm"] < 1e-5  # type: ignore[operator]
         assert result.settings["unconverged_steps"] == 0
         assert result.settings["least_distance_over_thickness"] > 0.9  # type: ignore[operator]
+
+    def test_an_upper_layer_that_slips_too_soon_is_seen(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(heavy_fold, "SelfContact", lambda mu, thickness: SelfContact(0.97 * mu, thickness))
+        result = heavy_fold.run(friction=(0.5,), cells=80)
+        assert not result.passed
+        assert [max(map(abs, curve.errors)) < result.tolerance for curve in result.curves] == [True, True, False]
 
     def test_one_that_does_not_come_to_rest_has_no_shape(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(heavy_fold, "STEPS_MAX", 3)

@@ -12,6 +12,7 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import stacked_incline
 from stickslip_sim_core.protocols.inclined_plane import tilted
+from stickslip_sim_core.scenes import tumbles
 
 Floats = NDArray[np.float64]
 
@@ -288,6 +289,28 @@ class TestNothingCrosses:
         assert cloth.least_distance > 0.9 * THICKNESS
         assert unconverged <= 1
 
+    @pytest.mark.parametrize("name", ["drop-1", "drop-2", "folding-0", "folding-1"])
+    def test_tumbles(self, name: str) -> None:
+        seen = tumbles.watch(tumbles.tumble(name))
+        assert seen.crossing_steps == 0
+        assert 0.9 < seen.least_distance < 1.01  # they did touch themselves
+        assert seen.unconverged_steps == 0
+
+    def test_crossings_are_seen(self) -> None:
+        """Of a sheet whose corner is stuck through another one, and of one that lies in the same plane."""
+        one, two = meshes.grid(0.1, 0.1, 4, 4), meshes.unstructured(0.05, 0.05, 0.015, 1)
+        mesh = meshes.together(one, two)
+        both = np.concatenate([flat(one), flat(two)[:, [0, 2, 1]] + [0.003, 0.002, 0.01]])
+        triangles = np.asarray(mesh.triangles)
+        assert tumbles.crossings(both, triangles, both, triangles) > 0
+        assert self_intersections(both, triangles) > 0
+        both[len(one.rest) :] = flat(two) + np.array([0.003, 0.002, 0.0])
+        assert tumbles.crossings(both, triangles, both, triangles) == 0
+
+    def test_no_such_tumble(self) -> None:
+        with pytest.raises(ValueError, match=r"tumble: must be one of drop-0, .*, got 'fall'"):
+            tumbles.tumble("fall")
+
     def test_held_vertices_do_not_pass_through(self) -> None:
         """A sheet is pushed through another one, both of them held: the step is counted as unconverged."""
         a, b = meshes.grid(0.05, 0.05, 5, 5), meshes.grid(0.02, 0.02, 2, 2)
@@ -326,6 +349,16 @@ class TestNothingCrosses:
         assert np.abs(after - before).max() < tolerated
         assert tolerated < 1e-3 * size
         assert cloth.velocities[level == 1, 2].mean() > -0.05  # they did collide
+
+    def test_forces_of_pairs_are_equal_and_opposite(self) -> None:
+        """To rounding. Friction acts on both sides of the thickness, and so turns: by the thickness times friction."""
+        seen = tumbles.tumble("folding-0")
+        tumbles.watch(seen, 100)
+        sums = tumbles.balance(seen.cloth)
+        assert sums.pairs > 30
+        assert np.abs(sums.force).max() < 1e-15 * sums.size
+        assert sums.moment == pytest.approx(sums.moment_of_friction, abs=1e-12 * THICKNESS * sums.size)
+        assert np.linalg.norm(sums.moment) > 0.05 * THICKNESS * sums.size  # it is not nothing
 
     def test_rerun_is_bit_identical(self) -> None:
         def run() -> tuple[bytes, bytes]:

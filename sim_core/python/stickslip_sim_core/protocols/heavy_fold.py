@@ -1,4 +1,7 @@
-"""Heavy fold: a strip that is folded onto itself lies on a floor; its loop has one shape, whatever friction is."""
+"""Heavy fold: a strip that is folded onto itself lies on a floor; its loop has one shape, whatever friction is.
+
+The upper layer is then pulled away from the loop, until it slips.
+"""
 
 from collections.abc import Sequence
 
@@ -22,7 +25,13 @@ FRICTION = (0.3, 1.0)
 # Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing moves further [m].
 FIRST_SHARE, GROWTH, LONGEST, DAMPING, REST = 0.1, 1.1, 0.05, 8.0, 1e-9
 STEPS_MAX = 1500
-HOLD_TIME = 10.0  # s: over which drift is measured
+
+# The pull on the upper layer, over that of the master curve. It grows while the strip is damped, and is held [s] while
+# drift is measured; from the next share on it grows slowly [1/s].
+HOLD_SHARE, HOLD_TIME = 0.9, 10.0
+FROM, UP_TO, RATE = 0.98, 1.02, 0.004
+GROWING = 1.0  # s
+MOVED = 1e-6  # m: an upper layer whose vertices have all come so far slips
 
 # Of a node's weight: the force that residuals are measured in.
 FORCE_SHARE = 0.1
@@ -35,36 +44,43 @@ def run(
     cells: int = 120,
     tolerance: float = 0.005,
 ) -> ProtocolResult:
-    """Measure the height of the loop and how far its nose lies before the landing, over L_gb.
+    """Measure the height of the loop, how far its nose lies before the landing, and the pull at which it slips.
+
+    Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest says how long the tail is, whose weight and
+    that of the landing's force are the load on friction.
 
     Args:
         preset: Solver settings, or their name.
-        friction: Of the strip with itself and with the floor; the master curves do not depend on it.
+        friction: Of the strip with itself and with the floor; the shape does not depend on it.
         cells: Of the strip along its length, which is 11.7 L_gb.
         tolerance: Largest |relative error| that passes.
     """
     settings = preset_named(preset)
     exact = master_curves.heavy_fold(GAP)
-    measured, drift, least, steps, unconverged = [], 0.0, np.inf, 0, 0
+    shapes, pulls, pulls_exact = [], [], []
+    drift, least, steps, unconverged = 0.0, np.inf, 0, 0
     for mu in friction:
         fold = Fold(mu, settings, cells)
-        measured.append(fold.settle())
+        shapes.append(fold.settle())
         drift = max(drift, fold.drift())
+        pulls.append(fold.slip_pull())
+        pulls_exact.append(fold.expected)
         least = min(least, fold.cloth.least_distance)
         steps, unconverged = steps + fold.cloth.steps, unconverged + fold.cloth.unconverged_steps
     x = tuple(float(mu) for mu in friction)
     return ProtocolResult(
         "heavy-fold",
         "mu",
-        "length/L_gb",
-        tuple(
-            Curve({"what": float(row)}, x, tuple(one[row] for one in measured), (master,) * len(x))
-            for row, master in enumerate((exact.height, exact.nose_to_landing))
+        "length/L_gb, pull/(rho g L_gb)",
+        (
+            Curve({"what": 0.0}, x, tuple(shape[0] for shape in shapes), (exact.height,) * len(x)),
+            Curve({"what": 1.0}, x, tuple(shape[1] for shape in shapes), (exact.nose_to_landing,) * len(x)),
+            Curve({"what": 2.0}, x, tuple(pulls), tuple(pulls_exact)),
         ),
         tolerance,
         {
             "preset": settings.name,
-            "what": "0 height, 1 nose to landing",
+            "what": "0 height, 1 nose to landing, 2 pull at slip",
             "cells": cells,
             "gap_over_bending_length": GAP,
             "stretching_over_weight": STRETCHING,
@@ -72,6 +88,7 @@ def run(
             "last_time_step_at_most": LONGEST,
             "drift_mm": 1e3 * drift,
             "drift_seconds": HOLD_TIME,
+            "drift_share_of_slip_pull": HOLD_SHARE,
             "least_distance_over_thickness": least / (GAP * BENDING_LENGTH),
             "steps": steps,
             "unconverged_steps": unconverged,
@@ -90,6 +107,7 @@ class Fold:
     """
 
     def __init__(self, mu: float, preset: SolverSettings, cells: int) -> None:
+        self.mu, self.preset = mu, preset
         loop = master_curves.heavy_fold(GAP).loop_length
         length = (LOWER + loop + UPPER) * BENDING_LENGTH
         cell = length / cells
@@ -104,6 +122,11 @@ class Fold:
         )
         self.along = mesh.rest[:, 1]
         self.middle = np.flatnonzero(np.abs(mesh.rest[:, 0]) < 1e-3 * cell)
+        self.end = np.flatnonzero(self.along > length - 0.1 * cell)
+        self.unit = weight * 2.0 * np.sqrt(0.75) * cell  # N: rho g L_gb times the width
+        self.straight_end = length - 0.25 * cell  # of a strip as heavy: the ends of this one are notched
+        self.expected = self.tail = np.nan
+        """Pull at which the upper layer slips by the master curve, and its length, once it has come to rest."""
         self.landing_from = (LOWER + 0.7 * loop) * BENDING_LENGTH
         self.floor = [plane(mu)]
         self.step = FIRST_SHARE * preset.time_step
@@ -117,24 +140,63 @@ class Fold:
 
     def settle(self) -> tuple[float, float]:
         """Return height and distance of nose and landing over L_gb; NaN if it does not come to rest."""
+        if not self.rests():
+            return np.nan, np.nan
+        height, nose_to_landing, self.tail = self.measure()
+        self.expected = float(master_curves.heavy_fold(GAP).pull(self.mu, self.tail))
+        return height, nose_to_landing
+
+    def rests(self) -> bool:
+        """Let it come to rest, and return whether it did."""
         for _ in range(STEPS_MAX):
             before = self.cloth.positions
             self.cloth.step(self.step, bodies=self.floor, damping=DAMPING)
             moved = np.abs(self.cloth.positions - before).max()
             if self.step == LONGEST and moved < REST:
-                return self.measure()
+                return True
             self.step = min(GROWTH * self.step, LONGEST)
-        return np.nan, np.nan
+        return False
+
+    def pulled(self, share: float) -> None:
+        """Pull at the end of the upper layer by a share of the master's pull."""
+        self.cloth.gravity[self.end, 0] = -share * self.expected * self.unit / self.cloth.masses[self.end].sum()
 
     def drift(self) -> float:
-        """Return how far any vertex comes in `HOLD_TIME` without damping [m]."""
+        """Return how far any vertex comes in `HOLD_TIME` without damping [m], pulled by `HOLD_SHARE`."""
+        if np.isnan(self.expected):
+            return np.inf
+        growing = round(GROWING / self.preset.time_step)
+        for step in range(1, growing + 1):
+            self.pulled(HOLD_SHARE * step / growing)
+            self.cloth.step(self.preset.time_step, bodies=self.floor, damping=DAMPING)
+        if not self.rests():
+            return np.inf
         before = self.cloth.positions
         for _ in range(round(HOLD_TIME / LONGEST)):
             self.cloth.step(LONGEST, bodies=self.floor)
         return float(np.abs(self.cloth.positions - before).max())
 
-    def measure(self) -> tuple[float, float]:
-        """Return height and distance of nose and landing over L_gb.
+    def slip_pull(self) -> float:
+        """Return the pull over rho g L_gb at which all of the upper layer slips, or NaN; `drift` comes before."""
+        if np.isnan(self.expected):
+            return np.nan
+        dt = self.preset.time_step
+        growing = round(GROWING / dt)
+        for step in range(1, growing + 1):
+            self.pulled(HOLD_SHARE + (FROM - HOLD_SHARE) * step / growing)
+            self.cloth.step(dt, bodies=self.floor, damping=DAMPING)
+        start = self.cloth.positions
+        upper = self.along > self.straight_end - self.tail * BENDING_LENGTH
+        for step in range(1, round((UP_TO - FROM) / (RATE * dt)) + 1):
+            share = FROM + RATE * step * dt
+            self.pulled(share)
+            self.cloth.step(dt, bodies=self.floor)
+            if np.abs(self.cloth.positions - start).max(axis=1)[upper].min() > MOVED:
+                return float(share * self.expected)
+        return np.nan
+
+    def measure(self) -> tuple[float, float, float]:
+        """Return height, distance of nose and landing, and length of the strip beyond the landing, over L_gb.
 
         Beyond the landing the layer below bears the weight of each vertex, and there a force besides. It is where the
         surplus over the weights has its centre, since the layer bears no moment.
@@ -148,7 +210,10 @@ class Fold:
         lies = (self.along > self.landing_from) & (lift > 0.0)
         surplus = lift[lies] - self.cloth.masses[lies] * GRAVITY
         landing = surplus @ at[lies, 0] / surplus.sum()
-        return height / BENDING_LENGTH, float(nose - landing) / BENDING_LENGTH
+        inwards = np.argsort(at[lies, 0])
+        landed = np.interp(landing, at[lies, 0][inwards], self.along[lies][inwards])
+        lengths = (height, nose - landing, self.straight_end - landed)
+        return tuple(float(length) / BENDING_LENGTH for length in lengths)  # type: ignore[return-value]
 
 
 def strip_of(cell: float, cells: int) -> meshes.Mesh:

@@ -46,7 +46,7 @@ def plot(result: ProtocolResult) -> "Figure":
     errors = [abs(e) for curve in result.curves for e in curve.errors if 0.0 < abs(e) < np.inf]
     floor = 0.3 * min([0.01 * result.tolerance, *errors])
     for curve in result.curves:
-        label = ", ".join(f"{name} = {value:g}" for name, value in curve.parameters.items() if name != "mesh")
+        label = ", ".join(_label(result, name, value) for name, value in curve.parameters.items() if name != "mesh")
         if first := label not in drawn:
             drawn[label] = next(colours)
             above.plot(*dense_master(result.protocol, curve), color=drawn[label], label=f"master curve {label}".strip())
@@ -68,6 +68,12 @@ def plot(result: ProtocolResult) -> "Figure":
         below.xaxis.set_major_formatter(ScalarFormatter())
         below.xaxis.set_minor_formatter(ScalarFormatter())
     return figure
+
+
+def _label(result: ProtocolResult, name: str, value: float) -> str:
+    """Return what a parameter of a curve is: settings may have texts for its numbers, such as "0 height, 1 length"."""
+    texts = dict(part.split(" ", 1) for part in str(result.settings.get(name, "")).split(", ") if " " in part)
+    return texts.get(f"{value:g}", f"{name} = {value:g}")
 
 
 def _verdict(result: ProtocolResult) -> str:

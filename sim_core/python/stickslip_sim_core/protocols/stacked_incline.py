@@ -8,18 +8,17 @@ from stickslip_sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.meshes import Diagonals
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, SelfContact, plane
 from stickslip_sim_core.protocols.inclined_plane import (
     DRIFT_MAX,
-    FROM,
     HOLD_SHARE,
     HOLD_TIME,
-    RATE,
-    UP_TO,
     tilted,
 )
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.strip import DIAGONALS
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 SHEETS = (2, 4)
@@ -28,6 +27,8 @@ THICKNESS = 5e-4  # m
 FABRIC = "gray-interlock"
 
 ROUGHER = 1.5  # friction of all other interfaces, over the least
+RATE = 0.002  # 1/s: of tan(alpha) over mu
+FROM, UP_TO = 0.99, 1.01  # tan(alpha) over mu
 MOVED = 1e-6  # m: sheets whose vertices have all come so far over what is below slide
 
 # Of a node's weight: the force that residuals are measured in.
@@ -55,23 +56,23 @@ def run(
         friction: Of the middle interface.
         sheets: Numbers of sheets, at least 2 each.
         cells: Of the mesh of the sheet on top along a side; the others have cells of about that size.
-        structured: Number of structured meshes, 0 or 1.
+        structured: Number of structured meshes, 0 to 4: their cells are cut along alternating, random, left or right
+            diagonals.
         unstructured: Number of unstructured ones.
         tolerance: Largest |relative error| that passes.
     """
     settings = preset_named(preset)
     curves, furthest, least, unconverged = [], 0.0, np.inf, 0
-    names = ["grid"] * structured + [f"unstructured {seed}" for seed in range(unstructured)]
+    kinds: list[Diagonals | int] = [*DIAGONALS[:structured], *range(unstructured)]
     for count in sheets:
-        for number, name in enumerate(names):
-            seed = None if name == "grid" else number - structured
+        for number, kind in enumerate(kinds):
             measured = []
             for mu in friction:
-                stack = Stack(count, mu, settings, cells, seed)
+                stack = Stack(count, mu, settings, cells, kind)
                 moved = stack.drift()
                 furthest, unconverged = max(furthest, moved), unconverged + stack.cloth.unconverged_steps
                 least = min(least, stack.cloth.least_distance)
-                stack = Stack(count, mu, settings, cells, seed)
+                stack = Stack(count, mu, settings, cells, kind)
                 slope = stack.slip_slope()
                 unconverged += stack.cloth.unconverged_steps
                 least = min(least, stack.cloth.least_distance)
@@ -88,7 +89,9 @@ def run(
             "preset": settings.name,
             "time_step": settings.time_step,
             "cells": cells,
-            "meshes": ", ".join(f"{i} {name}" for i, name in enumerate(names)),
+            "meshes": ", ".join(
+                f"{i} {'unstructured' if isinstance(kind, int) else 'grid'} {kind}" for i, kind in enumerate(kinds)
+            ),
             "force_scale_over_node_weight": FORCE_SHARE,
             "drift_mm": 1e3 * furthest,
             "drift_seconds": HOLD_TIME,
@@ -108,21 +111,23 @@ class Stack:
         mu: Least friction.
         preset: Solver settings.
         cells: Of the sheet on top along a side.
-        seed: Of unstructured meshes; None: grids.
+        kind: Diagonals of grids, or the seed of unstructured meshes.
     """
 
-    def __init__(self, sheets: int, mu: float, preset: SolverSettings, cells: int, seed: int | None = None) -> None:
+    def __init__(
+        self, sheets: int, mu: float, preset: SolverSettings, cells: int, kind: Diagonals | int = "alternating"
+    ) -> None:
         if sheets < 2:
             raise ValueError(f"sheets: must be at least 2, got {sheets}")
         self.mu, self.loose, self.preset = mu, sheets // 2, preset
         parts = []
         for level in range(sheets):
             side = TOP + 2.0 * WIDER * (sheets - 1 - level)
-            if seed is None:
-                count = round(side / TOP * cells)
-                parts.append(meshes.grid(side, side, count, count))
+            if isinstance(kind, int):
+                parts.append(meshes.unstructured(side, side, TOP / cells, kind + level))
             else:
-                parts.append(meshes.unstructured(side, side, TOP / cells, seed + level))
+                count = round(side / TOP * cells)
+                parts.append(meshes.grid(side, side, count, count, kind, seed=level))
         friction = np.full((sheets, sheets), ROUGHER * mu)
         friction[self.loose - 1, self.loose] = friction[self.loose, self.loose - 1] = mu
         laid = fabric(FABRIC)
@@ -154,7 +159,7 @@ class Stack:
         return float(self.moved().max())
 
     def slip_slope(self) -> float:
-        """Return tan(alpha) of the slope, growing by 1 % of mu a second, at which the upper sheets slide, or NaN.
+        """Return tan(alpha) of the slope, growing by 0.2 % of mu a second, at which the upper sheets slide, or NaN.
 
         NaN, too, where the sheets below have moved.
         """

@@ -13,7 +13,7 @@ from stickslip_sim_core.cloth.meshes import Diagonals, Mesh
 LENGTH = 0.1
 """Of every strip [m]."""
 
-_DIAGONALS: tuple[Diagonals, ...] = ("alternating", "random", "left", "right")
+DIAGONALS: tuple[Diagonals, ...] = ("alternating", "random", "left", "right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ def strips(width: float, cells: int, structured: int, unstructured: int) -> Iter
     """Yield so many strips of `width` [m] with `cells` cells along them, structured ones first."""
     spacing = LENGTH / cells
     columns = max(1, round(width / spacing))
-    for diagonals in _DIAGONALS[:structured]:
+    for diagonals in DIAGONALS[:structured]:
         yield _clamped(f"grid {diagonals}", meshes.grid(width, LENGTH, columns, cells, diagonals, seed=1))
     for seed in range(unstructured):
         yield _clamped(f"unstructured {seed}", meshes.unstructured(width, LENGTH, spacing, seed))

@@ -451,6 +451,23 @@ class HeavyFold:
     nose_to_landing: float
     """Horizontal distance."""
 
+    landing_force: float
+    """Of the layer below on the strip where it lands, over rho g L_gb."""
+
+    tension: float
+    """Of the strip where it lands, likewise: what holds the upper layer back besides friction."""
+
+    def pull(self, mu: ArrayLike, tail: ArrayLike) -> Floats:
+        """Return the horizontal force over rho g L_gb, away from the loop, at which the upper layer slips.
+
+        Friction bears mu (weight of the tail + landing force), and the loop holds back by its tension.
+
+        Args:
+            mu: Friction of the strip with itself.
+            tail: Length of the strip beyond the landing, over L_gb.
+        """
+        return np.asarray(mu) * (np.asarray(tail) + self.landing_force) + self.tension
+
 
 @lru_cache
 def heavy_fold(gap: float) -> HeavyFold:
@@ -510,6 +527,8 @@ def heavy_fold(gap: float) -> HeavyFold:
         height=float(found.y[7, -1]),
         loop_length=float(found.parameters[2:].sum()),
         nose_to_landing=float(found.y[2, -1] - found.y[10, -1]),
+        landing_force=float(found.parameters[1:].sum()),
+        tension=-float(found.parameters[0]),
     )
 
 

@@ -1,0 +1,162 @@
+"""Moving pictures of the kinds of cloth that touches itself, other cloth, and a body that turns.
+
+    .venv/bin/python tools/cloth_animations.py simulate DIR [NAME ...]
+    .venv-blender/bin/python tools/cloth_animations.py render DIR OUT [NAME ...]
+
+The first command writes trajectories to DIR. The second renders them as a worker does, but 320 pixels wide, and writes
+them to OUT. It made docs/figures/cloth-drag.webp, cloth-on-cloth.webp and cloth-sphere.webp.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SIDE = 320
+"""Of the pictures [px]."""
+
+FRAMES = 75
+"""Of each, evenly spread over the instants of the motion."""
+
+QUALITY = 55
+"""Of the WebP, 1 to 100."""
+
+VERTICES = 31
+"""Of a mesh along a side."""
+
+LOOKS: Mapping[str, Mapping[str, Any]] = {
+    "cloth-drag": {
+        "kind": "cloth_drag",
+        "rig": "drag",
+        "material": "camel-ponte-roma",
+        "texture": "plaid",
+        "viewpoint": "left",
+    },
+    "cloth-on-cloth": {
+        "kind": "cloth_on_cloth",
+        "rig": "drag",
+        "material": "gray-interlock",
+        "texture": "stripes",
+        "viewpoint": "left",
+        "substrate": "cloth",
+    },
+    "cloth-sphere": {
+        "kind": "cloth_sphere",
+        "rig": "sphere-3",
+        "material": "gray-interlock",
+        "texture": "checker",
+        "viewpoint": "front",
+        "angular_speed": 1.5,
+    },
+}
+
+
+def simulate(folder: Path, names: list[str]) -> None:
+    """Simulate, and write what renderers take."""
+    from stickslip_sim_core import drop_and_drag, drop_on_cloth, rotating_sphere
+
+    made: Mapping[str, Callable[[str], Any]] = {
+        "cloth-drag": lambda material: drop_and_drag(material, 0.5, vertices=VERTICES, self_friction=0.5, seed=1),
+        "cloth-on-cloth": lambda material: drop_on_cloth(material, material, 0.4, vertices=VERTICES, seed=1),
+        "cloth-sphere": lambda material: rotating_sphere(
+            material, 0.4, speed=LOOKS["cloth-sphere"]["angular_speed"], vertices=VERTICES
+        ),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        begin = time.process_time()
+        run = made[name](LOOKS[name]["material"])
+        sys.stdout.write(
+            f"{name}: {time.process_time() - begin:.0f} CPU s, {run.unconverged_steps} of {run.steps} steps "
+            f"unconverged, {(run.self_intersections > 0).sum()} of {len(run.positions)} frames cross\n"
+        )
+        if not run.valid:
+            raise SystemExit(f"{name} is not valid: {run.reason}")
+        np.savez(
+            folder / f"{name}.npz",
+            positions=run.positions[None].astype(np.float32),
+            rest=run.rest[None],
+            triangles=run.triangles[None],
+        )
+
+
+def render(folder: Path, out: Path, names: list[str]) -> None:
+    """Render what was simulated, by the worker's actor, and write moving pictures."""
+    from stickslip_blender.actor import RenderActor
+    from stickslip_blender.preview import moving
+    from stickslip_schemas.cameras import load_rig, rig_digest
+    from stickslip_schemas.clips import shown_frames
+    from stickslip_schemas.codecs import decode_clip
+    from stickslip_schemas.kinds import kind_named
+    from stickslip_schemas.store import DirectoryStore
+    from stickslip_schemas.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
+
+    with tempfile.TemporaryDirectory() as store_folder:
+        store = DirectoryStore(store_folder)
+        actor = RenderActor(store_folder)
+        for name in names:
+            look = dict(LOOKS[name])
+            record = (folder / f"{name}.npz").read_bytes()
+            with np.load(folder / f"{name}.npz") as file:
+                instants = file["positions"].shape[1]
+            camera = next(camera for camera in load_rig(look["rig"]) if camera.name == look["viewpoint"])
+            scale = SIDE / camera.width
+            larger = camera.model_copy(
+                update={
+                    "width": SIDE,
+                    "height": round(scale * camera.height),
+                    "fx": scale * camera.fx,
+                    "fy": scale * camera.fy,
+                    "cx": scale * (camera.cx + 0.5) - 0.5,
+                    "cy": scale * (camera.cy + 0.5) - 0.5,
+                }
+            )
+            document = kind_named(look["kind"]).render_type(
+                **look,
+                rig_digest=rig_digest(look["rig"]),
+                camera=larger,
+                quality="standard",
+                instants=shown_frames(FRAMES, instants),
+                light_seed=3,
+                crease_seed=1,
+            )
+            task = RenderTask(render=document, record=RecordRef(digest=store.publish(record), row=0))
+            result = TaskResult.model_validate(actor.render(task.model_dump(mode="json")))
+            if not isinstance(result.output, RenderOutput):
+                raise SystemExit(f"{name}: {result}")
+            clip = np.empty((FRAMES, larger.height, larger.width, 3), dtype=np.uint8)
+            where = result.output.chunks["video"]
+            decode_clip(store.read(where.digest, offset=where.offset, length=where.length), clip)
+            data = moving(clip, side=SIDE, quality=QUALITY)
+            (out / f"{name}.webp").write_bytes(data)
+            sys.stdout.write(f"{name}: {len(data) / 1e3:.0f} kB\n")
+
+
+def main() -> None:
+    """Do one of both."""
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    commands = arguments.add_subparsers(dest="command", required=True)
+    for command in ("simulate", "render"):
+        parser = commands.add_parser(command)
+        parser.add_argument("folder", type=Path)
+        if command == "render":
+            parser.add_argument("out", type=Path)
+        parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(LOOKS)}; none: all")
+    options = arguments.parse_args()
+    names = options.names or list(LOOKS)
+    for name in names:
+        if name not in LOOKS:
+            arguments.error(f"NAME: must be of {', '.join(LOOKS)}, got {name}")
+    if options.command == "simulate":
+        simulate(options.folder, names)
+    else:
+        render(options.folder, options.out, names)
+
+
+if __name__ == "__main__":
+    main()
