@@ -19,7 +19,7 @@ class TestSkin:
         assert directed == {(b, a) for a, b in directed}  # each has a triangle on both sides
         assert len(figure().rest) - len(sides) // 2 + len(figure().triangles) == 2  # a sphere [Euler]
         a, b, c = (figure().rest[figure().triangles[:, k]] for k in range(3))
-        assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(0.0443, rel=0.02)  # [m^3]
+        assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(0.0427, rel=0.01)  # [m^3]
 
     def test_it_lies_where_the_distance_is_0(self) -> None:
         assert np.abs(distance(figure().rest)).max() < 1e-7
@@ -56,7 +56,7 @@ class TestBones:
 
     def test_a_bone_moves_its_skin_as_a_rigid_body(self) -> None:
         head = figure().weights[:, BONES.index("head")] > 1.0 - 1e-5
-        assert head.sum() > 100
+        assert head.sum() > 50
         moved = figure().moved(bones(8.3))[head]
         at = figure().rest[head]
         assert np.linalg.norm(moved - at, axis=1).max() > 0.01
