@@ -56,6 +56,7 @@ def test_the_figure_of_the_shawl_is_the_cores() -> None:
     assert character.figure().rest.shape == (SKIN_VERTICES, 3)
     assert character.figure().triangles.shape == (SKIN_TRIANGLES, 3)
     assert character.bones(0.0).shape == (BONES, 3, 4) == (len(character.BONES), 3, 4)
+    assert ShawlSpec.model_json_schema()["properties"]["mesh"]["minimum"] == shawl.VERTICES_MIN
     TypeAdapter(Swing).validate_python(shawl.SWING_MAX)
     with pytest.raises(ValidationError, match=f"less than or equal to {shawl.SWING_MAX:g}"):
         TypeAdapter(Swing).validate_python(shawl.SWING_MAX + 1e-9)

@@ -272,7 +272,7 @@ class TestShawl:
             ({"self_friction": 11.0}, r"mu: must be in \[0, 10\], got 11.0"),
             ({"frames": 151}, r"frames: must be 1 \.\.\. 150, got 151"),
             ({"swing": 2.5}, r"swing: must be in \[0, 2\], got 2.5"),
-            ({"vertices": 3}, "vertices: must be at least 5, got 3"),
+            ({"vertices": 8}, "vertices: must be at least 9, got 8"),
         ):
             good = {"fabric": "gray-interlock", "mu": 0.5}
             with pytest.raises(ValueError, match=message):

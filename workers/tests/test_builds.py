@@ -30,7 +30,7 @@ SIMULATIONS = {
         "frames": 2,
     }
     | {"seed": 1, "substrate_material": "11oz-black-denim", "substrate_fabric": None, "self_friction": 0.5},
-    "shawl": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
+    "shawl": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 9, "frames": 2}
     | {"seed": 1, "self_friction": 0.5, "swing": 1.0},
 }
 

@@ -102,9 +102,9 @@ class ShawlSpec(ClothSpec):
     axes: ShawlAxes
     mesh: Int = Field(
         default=61,
-        ge=5,
+        ge=9,
         le=161,
-        description="vertices along a side of the mesh",
+        description="vertices along a side of the mesh; 31 or more show folds",
     )
 
     def arrays(self) -> tuple[ArrayLayout, ...]:

@@ -27,6 +27,9 @@ SELF_FRICTION = 0.5
 SWING_MAX = 2.0
 """Largest size of the figure's motion; 1 is usual."""
 
+VERTICES_MIN = 9
+"""Along a side of the mesh: a coarser shawl cannot follow the shoulders."""
+
 BIAS = 1e-3
 """Horizontal over vertical gravity at most, drawn from the seed, until the figure moves: it breaks the symmetry."""
 
@@ -136,7 +139,7 @@ def shawl_on_figure(
         self_friction: Of the cloth with itself, 0 ... 10.
         swing: Size of the figure's motion, 0 ... 2; see `character.bones`.
         preset: Solver settings, or their name.
-        vertices: Vertices a side of the mesh, at least 5.
+        vertices: Vertices a side of the mesh, at least 9; 31 or more show folds.
         frames: Frames to simulate, 15 a second from 0 on; 150 are the whole motion.
         seed: Of the bias.
         kernel: Level of the kernels, see `Cloth`.
@@ -148,8 +151,8 @@ def shawl_on_figure(
     settings = preset_named(preset)
     if not 1 <= frames <= FRAMES:
         raise ValueError(f"frames: must be 1 ... {FRAMES}, got {frames}")
-    if vertices < 5:
-        raise ValueError(f"vertices: must be at least 5, got {vertices}")
+    if vertices < VERTICES_MIN:
+        raise ValueError(f"vertices: must be at least {VERTICES_MIN}, got {vertices}")
     if not 0.0 <= swing <= SWING_MAX:
         raise ValueError(f"swing: must be in [0, {SWING_MAX:g}], got {swing}")
     body = figure()
