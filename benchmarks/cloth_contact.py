@@ -16,6 +16,7 @@ import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,10 +38,10 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import THICKNESS
 from stickslip_sim_core.scenes import tumbles
 
-PROTOCOLS: dict[str, dict[str, int]] = {
+PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "capstan": {},
     "pull-out": {},
-    "heavy-fold": {},
+    "heavy-fold": {"friction": (0.1, 0.3, 1.0)},
     "stacked-incline": {"structured": 2, "unstructured": 2},
 }
 UNCONVERGED_SHARE_MAX = 0.002
@@ -149,7 +150,7 @@ def measure_all(only: str, figures: Path | None) -> None:
             measure(name, settings, figures)
 
 
-def measure(name: str, settings: Mapping[str, int], figures: Path | None) -> None:
+def measure(name: str, settings: Mapping[str, Any], figures: Path | None) -> None:
     begin = time.process_time()
     result = protocols.run(name, "certified", **settings)
     print(f"{name}: error {result.error:.2g} of {result.tolerance:g}, {time.process_time() - begin:.0f} CPU s")

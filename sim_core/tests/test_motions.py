@@ -46,7 +46,7 @@ class TestKeyframes:
         assert np.abs(speed[[0, -1]]).max() < 0.05  # at rest at both ends
 
     def test_turns_are_about_a_point(self) -> None:
-        keys = Keyframes([0.0, 1.0], np.zeros((2, 3)), [[0, 0, 0], [0, 0, np.pi]], about=[1.0, 0.0, 0.0])
+        keys = Keyframes([0.0, 1.0], np.zeros((2, 3)), np.array([[0, 0, 0], [0, 0, np.pi]]), about=[1.0, 0.0, 0.0])
         turn, move = keys.at(1.0)
         assert turn @ [1.0, 0.0, 0.0] + move == pytest.approx([1.0, 0.0, 0.0])
         assert turn @ [2.0, 0.0, 0.0] + move == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)

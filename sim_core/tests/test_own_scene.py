@@ -43,7 +43,7 @@ class TestRunScene:
     def test_a_floor_that_tilts_lets_go_at_mu(self, tilt: float, slips: bool) -> None:
         mu = 0.3
         angle = float(np.arctan(tilt * mu))
-        keys = Keyframes([0.0, 2.0], np.zeros((2, 3)), [[0, 0, 0], [0, angle, 0]])
+        keys = Keyframes([0.0, 2.0], np.zeros((2, 3)), np.array([[0, 0, 0], [0, angle, 0]]))
 
         def floor(time: float) -> list[Any]:
             turn, _ = keys.at(time)
@@ -58,7 +58,7 @@ class TestRunScene:
     def test_holders_take_a_sheet_along(self) -> None:
         corner = np.flatnonzero((MESH.rest > 0.029).all(axis=1))
         start = flat(0.1)[corner]
-        lifted = Keyframes([0.0, 1.0], [[0, 0, 0], [0, 0, 0.05]], np.zeros((2, 3)))
+        lifted = Keyframes([0.0, 1.0], np.array([[0, 0, 0], [0, 0, 0.05]]), np.zeros((2, 3)))
         held = sheet(0.1, held=corner, held_at=lambda time: start + lifted.at(time)[1])
         run = run_scene([held], [[0.5]], duration=4.0, frame_rate=2.0, preset="fast")
         assert run.valid, run.reason

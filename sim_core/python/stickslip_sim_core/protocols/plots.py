@@ -63,10 +63,14 @@ def plot(result: ProtocolResult) -> "Figure":
         0.01, result.tolerance, "tolerance", transform=below.get_yaxis_transform(), va="bottom", fontsize="small"
     )
     below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(0.3 * floor, 50 * result.tolerance))
-    if scale == "log" and max(result.curves[0].x) < 100.0 * min(result.curves[0].x):
-        below.xaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
-        below.xaxis.set_major_formatter(ScalarFormatter())
-        below.xaxis.set_minor_formatter(ScalarFormatter())
+    for axis, values in (
+        (below.xaxis, result.curves[0].x),
+        (above.yaxis, [y for curve in result.curves for y in (*curve.measured, *curve.master) if np.isfinite(y)]),
+    ):
+        if scale == "log" and values and max(values) < 100.0 * min(values):
+            axis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
+            axis.set_major_formatter(ScalarFormatter())
+            axis.set_minor_formatter(ScalarFormatter())
     return figure
 
 

@@ -45,7 +45,7 @@ class Figure:
         self._weights, self._bones = weights, bones
         inner = skin - SUNK * _normals(skin, triangles)
         faces = [tuple(face) for face in triangles.tolist()]
-        self.props = (Prop("figure", inner, faces, _COLOR, 0.6, is_smooth=True),)
+        self.props: tuple[Prop, ...] = (Prop("figure", inner, faces, _COLOR, 0.6, is_smooth=True),)
 
     def placed(self, instant: int, _vertices: Array) -> list[Array]:
         """Move the skin with the bones."""
@@ -63,4 +63,5 @@ def _normals(points: Array, triangles: npt.NDArray[np.int32]) -> Array:
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normals = np.zeros_like(points)
     np.add.at(normals, triangles.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    unit: Array = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return unit
