@@ -99,11 +99,11 @@ class Shawl:
 def cut(cells: int) -> meshes.Mesh:
     """Return the flat shawl of so many cells a side: along the ring, the warp, and outward.
 
-    Rings are further apart outside, where cells are longer. The middle of the back is at x = 0, y < 0.
+    Rings are so far apart that all cells are alike. The middle of the back is at x = 0, y < 0.
     """
     square = meshes.grid(1.0, 1.0, cells, cells)
     angle, share = ANGLE * square.rest[:, 0], 0.5 - square.rest[:, 1]
-    radius = (np.sqrt(NECKLINE) + share * (np.sqrt(HEM) - np.sqrt(NECKLINE))) ** 2
+    radius = NECKLINE * (HEM / NECKLINE) ** share
     return meshes.Mesh(np.stack([radius * np.sin(angle), -radius * np.cos(angle)], axis=1), square.triangles)
 
 

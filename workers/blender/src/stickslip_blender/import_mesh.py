@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from stickslip_blender.blender import import_bpy
 
-READERS = {
+READERS: dict[str, tuple[str, dict[str, Any]]] = {
     ".abc": ("wm.alembic_import", {"as_background_job": False}),
     ".usd": ("wm.usd_import", {}),
     ".usda": ("wm.usd_import", {}),
@@ -40,8 +40,8 @@ class ImportMeshError(ValueError):
 
 def read(
     path: Path, *, frame_rate: int = 24, name: str | None = None, scale: float = 1.0
-) -> dict[str, npt.NDArray[Any]]:
-    """Read all meshes of a file, or the one of a name, as one, at all frames.
+) -> dict[str, Any]:
+    """Read all meshes of a file, or the one of a name, as one, at all frames: what the NPZ file holds.
 
     Args:
         path: A file with one of the suffixes of `READERS`.
