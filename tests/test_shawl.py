@@ -20,7 +20,7 @@ SPEC: dict[str, Any] = {
         "viewpoint": "front",
     },
     "preset": "fast",
-    "mesh": 17,
+    "mesh": 13,
     "frames": 3,
     "quality": "draft",
     "ground_truth": ["segmentation"],
@@ -29,7 +29,7 @@ SPEC: dict[str, Any] = {
 
 
 def test_from_spec_to_training_batch(service: Service) -> None:
-    job = service.finished(service.submit(SPEC))
+    job = service.finished(service.submit(SPEC), timeout=900.0)
     assert job["state"] == "succeeded"
     directory = service.data / "store" / "datasets" / job["dataset"]["dataset"] / "v1"
     arrays = read_arrays(directory)
