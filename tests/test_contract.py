@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import stickslip_sim_core
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.certificate import Certificate
 from stickslip_schemas.cloth import KERNELS, ClothSpec, PresetName
 from stickslip_schemas.fabrics import FabricNumbers, Material
@@ -14,17 +14,18 @@ from stickslip_schemas.kinds import KINDS, UnknownKindError
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
+from stickslip_schemas.kinds.shawl import BONES, SKIN_TRIANGLES, SKIN_VERTICES, ShawlSpec, Swing
 from stickslip_schemas.layout import layout
 from stickslip_schemas.samples import keyed_points, samples
 from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
 from stickslip_services.queue.terms import terms_for
 from stickslip_services.testing import BUILDS
-from stickslip_sim_core import stage
+from stickslip_sim_core import character, stage
 from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth.solver import MU_MAX
 from stickslip_sim_core.protocols import CERTIFICATION
-from stickslip_sim_core.scenes import cloth_sphere
+from stickslip_sim_core.scenes import cloth_sphere, shawl
 from stickslip_training.kinds import dataset_class
 from stickslip_workers.kinds import kind
 
@@ -48,6 +49,17 @@ def test_instants_are_those_of_the_scenes() -> None:
     source = (ROOT / "workers/blender/src/stickslip_blender/scenes/cloth_sphere.py").read_text()
     assert f"RADIUS = {cloth_sphere.RADIUS}\n" in source
     assert f"SETTLING, FRAMES_PER_SECOND = {cloth_sphere.SETTLING}, {cloth_sphere.FRAME_RATE}\n" in source
+
+
+def test_the_figure_of_the_shawl_is_the_cores() -> None:
+    assert (ShawlSpec.instants, ShawlSpec.instants_per_second) == (shawl.FRAMES, shawl.FRAME_RATE)
+    assert character.figure().rest.shape == (SKIN_VERTICES, 3)
+    assert character.figure().triangles.shape == (SKIN_TRIANGLES, 3)
+    assert character.bones(0.0).shape == (BONES, 3, 4) == (len(character.BONES), 3, 4)
+    assert ShawlSpec.model_json_schema()["properties"]["mesh"]["minimum"] == shawl.VERTICES_MIN
+    TypeAdapter(Swing).validate_python(shawl.SWING_MAX)
+    with pytest.raises(ValidationError, match=f"less than or equal to {shawl.SWING_MAX:g}"):
+        TypeAdapter(Swing).validate_python(shawl.SWING_MAX + 1e-9)
 
 
 def test_friction_has_one_range() -> None:

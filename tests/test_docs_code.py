@@ -1,9 +1,9 @@
 """Every code block of README.md and of the documentation site runs as it is printed.
 
 Python blocks of a page run one after the other in one namespace, and so do shell blocks, whose variables live on;
-all in a directory of their own with `examples/`. YAML blocks are specs: they are checked, and written to the file that
-their first line names. What a comment after `print(...)` promises must be printed. The service is a real one. A block
-after `<!-- skip: REASON -->` is not run.
+all in a directory of their own with `examples/`. YAML blocks are specs or scenes: they are checked, and written to the
+file that their first line names. What a comment after `print(...)` promises must be printed. The service is a real one.
+A block after `<!-- skip: REASON -->` is not run.
 """
 
 import io
@@ -22,6 +22,7 @@ import pytest
 import yaml
 from harness import STICKSLIP, Service
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.scene_file import SceneFile
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -106,7 +107,11 @@ def test_every_block_runs(
             done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=500)
             assert done.returncode == 0, f"{where}:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
         elif block.language == "yaml":
-            job_spec_adapter.validate_python(yaml.safe_load(block.code))
+            document = yaml.safe_load(block.code)
+            if "format" in document:
+                SceneFile.model_validate(document)
+            else:
+                job_spec_adapter.validate_python(document)
             if name := re.match(r"# (\S+\.yaml)\n", block.code):
                 (place / name[1]).write_text(block.code)
 

@@ -4,7 +4,7 @@
     .venv-blender/bin/python tools/cloth_animations.py render DIR OUT [NAME ...]
 
 The first command writes trajectories to DIR. The second renders them as a worker does, but 320 pixels wide, and writes
-them to OUT. It made docs/figures/cloth-drag.webp, cloth-on-cloth.webp and cloth-sphere.webp.
+them to OUT. It made docs/figures/cloth-drag.webp, cloth-on-cloth.webp, cloth-sphere.webp and shawl.webp.
 """
 
 import argparse
@@ -58,7 +58,17 @@ LOOKS: Mapping[str, Mapping[str, Any]] = {
         "viewpoint": "front",
         "angular_speed": 1.5,
     },
+    "shawl": {
+        "kind": "shawl",
+        "rig": "shawl-3",
+        "material": "gray-interlock",
+        "texture": "plaid",
+        "viewpoint": "side",
+    },
 }
+
+FIGURE = ("skin_rest", "skin_weights", "skin_triangles", "bones")
+"""What a run of a shawl has besides the cloth."""
 
 ZOOM: Mapping[str, float] = {"cloth-drag": 1.3, "cloth-on-cloth": 1.1, "cloth-sphere": 1.6}
 """How many times larger the middle of the picture is than the rig's camera shows it, where that is not once."""
@@ -66,7 +76,7 @@ ZOOM: Mapping[str, float] = {"cloth-drag": 1.3, "cloth-on-cloth": 1.1, "cloth-sp
 
 def simulate(folder: Path, names: list[str]) -> None:
     """Simulate, and write what renderers take."""
-    from stickslip_sim_core import drop_and_drag, drop_on_cloth, rotating_sphere
+    from stickslip_sim_core import drop_and_drag, drop_on_cloth, rotating_sphere, shawl_on_figure
 
     made: Mapping[str, Callable[[str], Any]] = {
         "cloth-drag": lambda material: drop_and_drag(material, 0.9, vertices=VERTICES, self_friction=0.5, seed=1),
@@ -76,6 +86,7 @@ def simulate(folder: Path, names: list[str]) -> None:
         "cloth-sphere": lambda material: rotating_sphere(
             material, 0.4, speed=LOOKS["cloth-sphere"]["angular_speed"], vertices=VERTICES
         ),
+        "shawl": lambda material: shawl_on_figure(material, 0.5, vertices=VERTICES),
     }
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -92,6 +103,7 @@ def simulate(folder: Path, names: list[str]) -> None:
             positions=run.positions[None].astype(np.float32),
             rest=run.rest[None],
             triangles=run.triangles[None],
+            **{part: getattr(run, part)[None] for part in FIGURE if hasattr(run, part)},
         )
 
 

@@ -12,6 +12,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
+from stickslip_schemas.kinds.shawl import ShawlViewpoint
 from stickslip_schemas.samples import (
     SPLITS,
     Sample,
@@ -221,6 +222,7 @@ def test_codes_of_labels_are_pinned() -> None:
     assert list(Texture)[:8] == textures
     assert list(Viewpoint)[:3] == ["calibrated", "left", "right"]
     assert list(SphereViewpoint) == ["front", "side", "high"]
+    assert list(ShawlViewpoint) == ["front", "side", "high"]
     assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
     assert SPLITS == ("train", "validation", "test")
 
@@ -246,6 +248,12 @@ def test_documents_of_samples_are_those_that_are_keyed() -> None:
             "materials": {"mine": own},
             "axes": cloth | {"viewpoint": "left", "substrate_material": ["mine", "camel-ponte-roma"]},
         },
+        {
+            "kind": "shawl",
+            "materials": {"mine": own},
+            "axes": cloth | {"viewpoint": "front", "self_friction": [0.2, 0.4], "swing": [0.5, 1]},
+        },
+        {"kind": "shawl", "axes": cloth | {"material": "royal-target", "viewpoint": "side", "self_friction": 0.2}},
     ]
     for document in documents:
         spec = job_spec_adapter.validate_python(document)

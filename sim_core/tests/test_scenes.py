@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stickslip_sim_core import DropAndDrag, drop_and_drag, drop_on_cloth, fabric, fabric_names
+from stickslip_sim_core import DropAndDrag, drop_and_drag, drop_on_cloth, fabric, fabric_names, shawl_on_figure
 from stickslip_sim_core import stage as scenes
+from stickslip_sim_core.character import STILL, bones, distance, figure
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
+from stickslip_sim_core.scenes import shawl
 from stickslip_sim_core.scenes.cloth_sphere import RADIUS, SETTLING, SPEED, rotating_sphere, turned
 
 
@@ -235,3 +237,43 @@ class TestRotatingSphere:
             good = {"fabric": "gray-interlock", "mu": 0.5}
             with pytest.raises(ValueError, match=message):
                 rotating_sphere(**{**good, **settings})  # type: ignore[arg-type]
+
+
+class TestShawl:
+    def test_it_starts_bent_but_not_stretched_and_clear_of_the_figure(self) -> None:
+        mesh = shawl.cut(60)
+        start = shawl.laid(mesh.rest)
+        assert 0.01 < distance(start).min() < 0.02
+        a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
+        area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        assert area.min() > 0.0
+        assert area.sum() == pytest.approx(0.5 * shawl.ANGLE * (shawl.HEM**2 - shawl.NECKLINE**2), rel=1e-3)
+        sides = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]])
+        flat, bent = (np.linalg.norm(p[sides[:, 0]] - p[sides[:, 1]], axis=1) for p in (mesh.rest, start))
+        assert np.abs(bent / flat - 1.0).max() < 1e-3
+
+    def test_it_comes_to_lie_on_the_shoulders(self) -> None:
+        scene = shawl_on_figure("gray-interlock", 0.5, preset="fast", vertices=13, frames=46)
+        assert scene.valid, scene.reason
+        assert scene.times[-1] == pytest.approx(STILL)
+        assert not scene.self_intersections.any()
+        assert scene.least_distance > 0.0
+        assert distance(scene.positions).min() > -2e-3  # between frames of the figure at rest
+        assert scene.positions[-1, :, 2].max() > 0.5
+        weight = fabric("gray-interlock").density * 0.5 * shawl.ANGLE * (shawl.HEM**2 - shawl.NECKLINE**2) * GRAVITY
+        assert scene.contact_force[-10:, 2].mean() == pytest.approx(weight, rel=0.15)
+        assert np.array_equal(scene.bones[-1], bones(STILL))
+        assert scene.skin_rest.shape == figure().rest.shape
+        assert 0.0 < np.hypot(*scene.bias) < 2.0 * shawl.BIAS
+
+    def test_refusals(self) -> None:
+        for settings, message in (
+            ({"mu": -1.0}, r"mu: must be in \[0, 10\], one or one a sheet, got -1.0"),
+            ({"self_friction": 11.0}, r"mu: must be in \[0, 10\], got 11.0"),
+            ({"frames": 151}, r"frames: must be 1 \.\.\. 150, got 151"),
+            ({"swing": 2.5}, r"swing: must be in \[0, 2\], got 2.5"),
+            ({"vertices": 8}, "vertices: must be at least 9, got 8"),
+        ):
+            good = {"fabric": "gray-interlock", "mu": 0.5}
+            with pytest.raises(ValueError, match=message):
+                shawl_on_figure(**{**good, **settings})  # type: ignore[arg-type]

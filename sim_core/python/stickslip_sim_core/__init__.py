@@ -4,6 +4,7 @@ from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersectio
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, Surface, box, cylinder, plane, sphere
+from stickslip_sim_core.motions import Keyframes, MovingMesh, read_moving_mesh
 from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
 from stickslip_sim_core.rods.general import solve_general_rods
 from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
@@ -13,6 +14,8 @@ from stickslip_sim_core.rods.solve import RodSolution, solve_rods
 from stickslip_sim_core.scenes.cloth_drag import drop_and_drag
 from stickslip_sim_core.scenes.cloth_on_cloth import drop_on_cloth
 from stickslip_sim_core.scenes.cloth_sphere import RotatingSphere, rotating_sphere
+from stickslip_sim_core.scenes.own import SceneRun, Sheet, run_scene
+from stickslip_sim_core.scenes.shawl import Shawl, shawl_on_figure
 from stickslip_sim_core.stage import DropAndDrag
 
 __all__ = [
@@ -22,6 +25,8 @@ __all__ = [
     "Cloth",
     "DropAndDrag",
     "Fabric",
+    "Keyframes",
+    "MovingMesh",
     "NaturalCurvature",
     "NaturalFit",
     "OtherMinima",
@@ -29,7 +34,10 @@ __all__ = [
     "ParameterFit",
     "RodSolution",
     "RotatingSphere",
+    "SceneRun",
     "SelfContact",
+    "Shawl",
+    "Sheet",
     "SolverSettings",
     "Surface",
     "box",
@@ -48,9 +56,12 @@ __all__ = [
     "plane",
     "preset_named",
     "reach",
+    "read_moving_mesh",
     "rotating_sphere",
+    "run_scene",
     "self_contact_distance",
     "self_intersections",
+    "shawl_on_figure",
     "solve_general_rods",
     "solve_rods",
     "sphere",

@@ -1,4 +1,4 @@
-"""Command line: `python -m stickslip_workers dispatch | replay | certify | describe`."""
+"""Command line: `python -m stickslip_workers dispatch | replay | certify | scene | describe`."""
 
 import argparse
 import ctypes
@@ -53,6 +53,14 @@ def main(arguments: list[str] | None = None) -> int:
         "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
     )
 
+    scene = commands.add_parser("scene", help="run a scene of your own, as `stickslip simulate` hands it over")
+    scene.add_argument("scene", type=Path, help="the scene as JSON")
+    scene.add_argument("--folder", type=Path, required=True, help="where the files are that the scene names")
+    scene.add_argument("--out", type=Path, required=True, help="a new directory for the trajectories")
+    scene.add_argument("--certificate", type=Path, help="certificate.json of the scene's preset")
+    scene.add_argument("--allow-uncertified", action="store_true", help="run it even without a certificate")
+    scene.add_argument("--obj", action="store_true", help="write an OBJ file for each sheet and frame, too")
+
     commands.add_parser("describe", help="print the builds of this environment")
 
     options = parser.parse_args(arguments)
@@ -65,6 +73,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _replay(options)
     if options.command == "certify":
         return _certify(options)
+    if options.command == "scene":
+        return _scene(options)
     from stickslip_workers.stages.actor import StageActor
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
@@ -211,6 +221,35 @@ def _certify(options: argparse.Namespace) -> int:
         return 2
     sys.stdout.write(certificate.digest + "\n")
     return 0 if certificate.passed else 1
+
+
+def _scene(options: argparse.Namespace) -> int:
+    """Return 0 if the trajectories are valid, 1 if not, 2 if there was nothing to run."""
+    from stickslip_schemas.certificate import Certificate
+    from stickslip_schemas.scene_file import SceneFile
+
+    from stickslip_workers.own_scene import simulate_scene
+
+    def show(done: int, frames: int) -> None:
+        if done == frames or done % max(frames // 20, 1) == 0:
+            sys.stderr.write(f"{done} of {frames} frames\n")
+
+    try:
+        path = options.certificate
+        result = simulate_scene(
+            SceneFile.model_validate_json(options.scene.read_bytes()),
+            options.folder,
+            options.out,
+            certificate=None if path is None else Certificate.model_validate_json(path.read_bytes()),
+            allow_uncertified=options.allow_uncertified,
+            obj=options.obj,
+            on_frame=show,
+        )
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    sys.stdout.write(json.dumps(result) + "\n")
+    return 0 if result["valid"] else 1
 
 
 if __name__ == "__main__":

@@ -12,25 +12,27 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulat
 from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothRender, ClothOnClothSimulation, ClothOnClothSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender, ClothSphereSimulation, ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation, RodHangSpec
+from stickslip_schemas.kinds.shawl import ShawlRender, ShawlSimulation, ShawlSpec
 
 KINDS: dict[str, type[JobSpec]] = {
     "rod_hang": RodHangSpec,
     "cloth_drag": ClothDragSpec,
     "cloth_sphere": ClothSphereSpec,
     "cloth_on_cloth": ClothOnClothSpec,
+    "shawl": ShawlSpec,
 }
 """The class of the specs of each kind, by name."""
 
 AnyJobSpec = Annotated[
-    RodHangSpec | ClothDragSpec | ClothSphereSpec | ClothOnClothSpec,
+    RodHangSpec | ClothDragSpec | ClothSphereSpec | ClothOnClothSpec | ShawlSpec,
     Field(discriminator="kind"),
 ]
 AnySimulation = Annotated[
-    RodHangSimulation | ClothDragSimulation | ClothSphereSimulation | ClothOnClothSimulation,
+    RodHangSimulation | ClothDragSimulation | ClothSphereSimulation | ClothOnClothSimulation | ShawlSimulation,
     Field(discriminator="kind"),
 ]
 AnyRender = Annotated[
-    RodHangRender | ClothDragRender | ClothSphereRender | ClothOnClothRender,
+    RodHangRender | ClothDragRender | ClothSphereRender | ClothOnClothRender | ShawlRender,
     Field(discriminator="kind"),
 ]
 

@@ -18,6 +18,7 @@ from stickslip_services.errors import (
     SupervisorError,
 )
 from stickslip_services.local.certifying import CertifyError
+from stickslip_services.local.simulating import SimulateError
 
 _SHOWN = (
     CertifyError,
@@ -26,6 +27,7 @@ _SHOWN = (
     NotFoundError,
     ServerNotInstalledError,
     SettingsError,
+    SimulateError,
     SpecFileError,
     SupervisorError,
 )

@@ -14,6 +14,7 @@ from stickslip_services.cli.journal import journal
 from stickslip_services.cli.keys import app as keys
 from stickslip_services.cli.projects import app as projects
 from stickslip_services.cli.reindex import reindex
+from stickslip_services.cli.scenes import simulate
 from stickslip_services.cli.textures import upload
 from stickslip_services.cli.up import up
 from stickslip_services.cli.upkeep import gc, rm
@@ -55,6 +56,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "rm": rm,
     "gc": gc,
     "reindex": reindex,
+    "simulate": simulate,
     "certify": certify,
     "register": register,
     "certificates": certificates,

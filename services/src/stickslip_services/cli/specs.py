@@ -1,4 +1,4 @@
-"""JobSpec files: YAML or JSON."""
+"""Files of specs and of scenes: YAML or JSON."""
 
 import json
 import math
@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.problems import field_errors
+from stickslip_schemas.scene_file import SceneFile
 
 
 class SpecFileError(Exception):
@@ -52,7 +53,7 @@ def read_spec(path: Path) -> dict[str, Any]:
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise SpecFileError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
     if not isinstance(document, dict):
-        raise SpecFileError(f"{path} must hold a mapping (kind: ..., axes: ...), and it holds {document!r:.100}")
+        raise SpecFileError(f"{path} must hold a mapping (key: value), and it holds {document!r:.100}")
     _check(document, "", path)
     return document
 
@@ -62,12 +63,24 @@ def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
     try:
         return job_spec_adapter.validate_python(document)
     except ValidationError as error:
-        lines = [
-            f"  {field.pointer.lstrip('/').replace('/', '.') or 'the document'}: {field.rule}"
-            + (f", and it is {field.value}" if field.value else "")
-            for field in field_errors(error, document, AnyJobSpec)
-        ]
-        raise SpecFileError("\n".join([f"{path} is not valid", *lines])) from error
+        raise _not_valid(error, document, AnyJobSpec, path) from error
+
+
+def check_scene(document: dict[str, Any], path: Path) -> SceneFile:
+    """Return the scene that a document describes; raise SpecFileError with everything that is wrong with it."""
+    try:
+        return SceneFile.model_validate(document)
+    except ValidationError as error:
+        raise _not_valid(error, document, SceneFile, path) from error
+
+
+def _not_valid(error: ValidationError, document: dict[str, Any], model: Any, path: Path) -> SpecFileError:
+    lines = [
+        f"  {field.pointer.lstrip('/').replace('/', '.') or 'the document'}: {field.rule}"
+        + (f", and it is {field.value}" if field.value else "")
+        for field in field_errors(error, document, model)
+    ]
+    return SpecFileError("\n".join([f"{path} is not valid", *lines]))
 
 
 def _check(value: Any, place: str, path: Path) -> None:

@@ -17,7 +17,7 @@ from stickslip_sim_core.protocols import (
     stacked_incline,
     stick_slip,
 )
-from stickslip_sim_core.protocols.certification import CERTIFICATION, Certification
+from stickslip_sim_core.protocols.certification import CERTIFICATION, SCENE_PROTOCOLS, Certification
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 
 PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
@@ -59,4 +59,13 @@ def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult
     return PROTOCOLS[name](**settings)
 
 
-__all__ = ["CERTIFICATION", "PROTOCOLS", "ROD_PROTOCOLS", "Certification", "Curve", "ProtocolResult", "run"]
+__all__ = [
+    "CERTIFICATION",
+    "PROTOCOLS",
+    "ROD_PROTOCOLS",
+    "SCENE_PROTOCOLS",
+    "Certification",
+    "Curve",
+    "ProtocolResult",
+    "run",
+]

@@ -38,6 +38,9 @@ _CLOTH_QUICK: Mapping[str, Mapping[str, Any]] = {
     "cantilever": {"gamma": (1.0, 100.0), "unstructured": 1},
 }
 _CONTACT = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
+SCENE_PROTOCOLS = _CLOTH + _CONTACT
+"""What a certificate has to have for a scene in which cloth feels itself."""
+
 _CONTACT_QUICK: Mapping[str, Mapping[str, Any]] = {
     "capstan": {"friction": (0.3,), "bending": (0.05,)},
     "heavy-fold": {"friction": (0.3,), "cells": 80},
@@ -50,7 +53,7 @@ def _of_cloth(preset: SolverSettings) -> Certification:
     # The thesis's steps of 0.5 ms would take hours on the protocols of contact.
     touches = not preset.name.startswith("thesis-")
     return Certification(
-        _CLOTH + _CONTACT if touches else _CLOTH,
+        SCENE_PROTOCOLS if touches else _CLOTH,
         "stickslip_sim_core.cloth",
         asdict(preset),
         {**_CLOTH_QUICK, **_CONTACT_QUICK} if touches else _CLOTH_QUICK,

@@ -24,7 +24,7 @@ Faces = list[tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Prop:
-    """A rigid thing on the stage."""
+    """A thing on the stage."""
 
     name: str
     vertices: Array
@@ -34,6 +34,8 @@ class Prop:
     color: tuple[float, float, float]
     """Linear."""
     roughness: float
+    is_smooth: bool = False
+    """Whether its faces are shaded as one smooth skin."""
 
 
 class Set(Protocol):
@@ -41,8 +43,8 @@ class Set(Protocol):
 
     props: tuple[Prop, ...]
 
-    def poses(self, instant: int, vertices: Array) -> Array:
-        """Return where the props are, (props, 4, 4), at an instant, with the cloth at vertices (V, 3) [m]."""
+    def placed(self, instant: int, vertices: Array) -> list[Array]:
+        """Return the vertices of each prop (n, 3) [m] at an instant, with the cloth at vertices (V, 3) [m]."""
 
     def aim(self, instant: int, vertices: Array) -> Array:
         """Return the point that the lamp follows (3,) [m]."""
@@ -75,11 +77,12 @@ class Geometry:
     def points(self, positions: npt.ArrayLike, instant: int) -> Array:
         """Return all vertices, shape (V, 3) [m], of the solver's positions (V', 3) [m] at an instant."""
         given = np.asarray(positions, dtype=np.float64)
-        poses = self.stage.poses(instant, given)
-        props = [
-            prop.vertices @ pose[:3, :3].T + pose[:3, 3] for prop, pose in zip(self.stage.props, poses, strict=True)
-        ]
-        return np.concatenate([self.surface(given), *props])
+        return np.concatenate([self.surface(given), *self.stage.placed(instant, given)])
+
+    def of_props(self, points: Array) -> list[Array]:
+        """Return the part of all vertices (V, 3) that is each prop's (n, 3)."""
+        ends = np.cumsum([self.cloth_vertices, *(len(prop.vertices) for prop in self.stage.props)])
+        return [points[begin:end] for begin, end in pairwise(ends)]
 
     def checked(self, positions: npt.ArrayLike) -> Array:
         """Return positions (frames, V', 3) [m], or say why they are not this cloth's."""

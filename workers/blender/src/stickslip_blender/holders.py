@@ -30,11 +30,9 @@ class Holders:
         vertices, faces = _holder()
         self.props = tuple(Prop(f"holder-{n}", vertices, faces, (0.05, 0.05, 0.052), 0.45) for n in (1, 2))
 
-    def poses(self, _instant: int, vertices: Array) -> Array:
+    def placed(self, _instant: int, vertices: Array) -> list[Array]:
         """Let the holders follow the corners that they hold."""
-        poses = np.tile(np.eye(4), (2, 1, 1))
-        poses[:, :3, 3] = vertices[self._held] + self._grips
-        return poses
+        return [prop.vertices + at for prop, at in zip(self.props, vertices[self._held] + self._grips, strict=True)]
 
     def aim(self, _instant: int, vertices: Array) -> Array:
         """Return a point below the middle of the holders."""

@@ -36,6 +36,7 @@ TOLERANCE: int = _raster.TOLERANCE
 """How far the pixels of a clip may be from their exact values [8-bit levels]; raster/composition.hpp chooses them."""
 
 _MIRROR_GRID = 8
+_PROP_GRID = 3
 _LOBE = 1.9  # radius of a box, twice applied, over the width of the lobe that it stands for; compared with Cycles
 _PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
 _DIELECTRIC = 0.06  # what a floor that is no metal reflects, at the angles of our cameras
@@ -117,7 +118,7 @@ class Composer:
             seen.window.place,
             reflected,
             around.place,
-            floor,
+            self._uncovered(floor, points, camera),
             _reflectance(substrate),
             pictures,
         )
@@ -133,8 +134,24 @@ class Composer:
         seen = see(projected(camera, points), self._geometry.triangles, window)
         cover = np.zeros(light.shape[:2], dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * (floor - 1.0), dtype=np.float32)
+        marks = self._uncovered(floor, points, camera) - 1.0
+        factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
         return light * factor
+
+    def _uncovered(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
+        """Return the factor of the floor where no prop hides it, and 1 where one does."""
+        geometry = self._geometry
+        if not geometry.stage.props:
+            return floor
+        projections = projected(camera, points)
+        window = window_about(projections[geometry.cloth_vertices :], camera)
+        if window.is_empty:
+            return floor
+        props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
+        hidden = see(projections, props, window, _PROP_GRID).share_below(len(props))
+        factor = floor.copy()
+        factor[window.slices] += hidden[..., None] * (np.float32(1.0) - factor[window.slices])
+        return factor
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
         return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)

@@ -44,8 +44,6 @@ class Shot:
 
     points: npt.NDArray[np.float64]
     """All vertices, shape (V, 3) [m]."""
-    poses: npt.NDArray[np.float64]
-    """Of the props, shape (props, 4, 4)."""
     aim: npt.NDArray[np.float64]
     """What the lamp points to, shape (3,) [m]."""
 
@@ -125,20 +123,16 @@ class ClothStage:
 
     def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
         """Return where everything is at an instant of the motion, the solver's vertices at positions (V', 3) [m]."""
-        stage = self.geometry.stage
-        return Shot(
-            self.geometry.points(positions, instant), stage.poses(instant, positions), stage.aim(instant, positions)
-        )
+        return Shot(self.geometry.points(positions, instant), self.geometry.stage.aim(instant, positions))
 
     def _place(self, shot: Shot) -> None:
         """Move everything to where it is."""
-        from mathutils import Matrix, Vector
+        from mathutils import Vector
 
-        for prop, pose in zip(self._props, shot.poses, strict=True):
-            prop.matrix_world = Matrix(pose.tolist())
         cloth = shot.points[: self.geometry.cloth_vertices]
-        self._mesh.attributes["position"].data.foreach_set("vector", cloth.astype(np.float32).ravel())
-        self._mesh.update()
+        for mesh, points in zip((self._mesh, *self._props), (cloth, *self.geometry.of_props(shot.points)), strict=True):
+            mesh.attributes["position"].data.foreach_set("vector", points.astype(np.float32).ravel())
+            mesh.update()
         a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         self._lamp.location = shot.aim + _LAMP_DISTANCE * outward
@@ -278,4 +272,6 @@ class _Fabric:
 def _add_prop(scene: Any, prop: Prop) -> Any:
     made = _add_mesh(scene, prop.name, prop.vertices, prop.faces)
     made.data.materials.append(_new_material(prop.name, Base_Color=(*prop.color, 1.0), Roughness=prop.roughness))
-    return made
+    if prop.is_smooth:
+        made.data.shade_smooth()
+    return made.data

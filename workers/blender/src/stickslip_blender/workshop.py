@@ -103,9 +103,10 @@ class Workshop:
     def record(self, record: RecordRef, *names: str) -> list[Array]:
         """Return one row of arrays of an artifact."""
         digest, arrays = self._records
-        if digest != record.digest:
+        arrays = arrays if digest == record.digest else {}
+        if missing := [name for name in names if name not in arrays]:
             with np.load(io.BytesIO(self.store.read(record.digest)), allow_pickle=False) as file:
-                arrays = {name: file[name] for name in names}
+                arrays = arrays | {name: file[name] for name in missing}
             self._records = record.digest, arrays
         rows = len(arrays[names[0]])
         if record.row >= rows:

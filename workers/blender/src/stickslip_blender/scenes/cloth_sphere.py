@@ -51,13 +51,12 @@ class Ball:
         parts = zip(_gores(), _COLORS, strict=True)
         self.props = tuple(Prop(f"ball-{n}", *part, color, 0.5) for n, (part, color) in enumerate(parts, 1))
 
-    def poses(self, instant: int, _vertices: Array) -> Array:
+    def placed(self, instant: int, _vertices: Array) -> list[Array]:
         """Turn the ball to where it is at an instant."""
         angle = turned(instant, self._speed)
-        pose = np.eye(4)
-        pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        pose[2, 3] = RADIUS
-        return np.stack([pose, pose])
+        c, s = np.cos(angle), np.sin(angle)
+        turn, center = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 0.0, RADIUS])
+        return [prop.vertices @ turn.T + center for prop in self.props]
 
     def aim(self, _instant: int, _vertices: Array) -> Array:
         """Return the middle of the ball."""

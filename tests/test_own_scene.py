@@ -1,0 +1,161 @@
+"""A scene of a user's own, from its file to trajectories: the command line, the workers' program and the core."""
+
+import json
+import subprocess
+import sys
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from stickslip_schemas.certificate import Certificate, CurveReport, ProtocolReport
+from stickslip_schemas.scene_file import SceneFile
+from stickslip_sim_core import fabric
+from stickslip_sim_core.protocols import SCENE_PROTOCOLS
+from stickslip_workers.builds import solver_build
+from stickslip_workers.own_scene import NotCertifiedError, SceneError, simulate_scene, why_uncertified
+
+SCENE: dict[str, Any] = {
+    "format": "stickslip-scene/1",
+    "duration": 0.6,
+    "frame_rate": 5.0,
+    "preset": "fast",
+    "sheets": {
+        "cloth": {
+            "material": "gray-interlock",
+            "mesh": {"type": "grid", "size": [0.08, 0.06], "cells": [4, 3]},
+            "origin": [0, 0, 0.052],
+        }
+    },
+    "bodies": {
+        "table": {
+            "type": "mesh",
+            "file": "table.obj",
+            "motion": {"keys": [{"time": 0}, {"time": 0.4, "move": [0, 0, 0.02]}]},
+        }
+    },
+    "default_friction": 0.5,
+}
+TABLE = "v -1 -1 0.05\nv 1 -1 0.05\nv 1 1 0.05\nv -1 1 0.05\nf 1 2 3 4\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "table.obj").write_text(TABLE)
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(SCENE))
+    return tmp_path
+
+
+def certificate(**change: Any) -> Certificate:
+    """Return a certificate that vouches for the preset of the scene with this build, but for what is changed."""
+    curve = CurveReport(parameters={}, x=(1.0,), measured=(1.0,), master=(1.0,), errors=(0.0,))
+    protocols = tuple(
+        ProtocolReport(
+            protocol=name,
+            x="x",
+            y="y",
+            tolerance=0.01,
+            error=0.0,
+            passed=True,
+            settings={},
+            build_hash="a" * 64,
+            curves=(curve,),
+        )
+        for name in change.pop("names", SCENE_PROTOCOLS)
+    )
+    given = {"preset": "fast", "sim_core": solver_build("stickslip_sim_core.cloth"), "extent": "full"} | change
+    return Certificate(numbers={}, protocol_sources="b" * 64, protocols=protocols, passed=True, environment={}, **given)
+
+
+def test_from_the_file_to_trajectories(folder: Path) -> None:
+    program = [sys.executable, "-m", "stickslip_services.cli", "simulate", "scene.yaml", "out"]
+    refused = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
+    assert refused.returncode == 1
+    assert "there is no certificate of preset fast; `stickslip certify --preset fast` makes one" in refused.stderr
+    assert not (folder / "out").exists()
+    ended = subprocess.run(
+        [*program, "--allow-uncertified", "--obj"], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "NOT certified: there is no certificate" in ended.stdout + ended.stderr
+    said = json.loads((folder / "out" / "scene.json").read_text())
+    assert said["valid"]
+    assert not said["certified"]
+    assert said["self_intersections"] == 0
+    with np.load(folder / "out" / "trajectory.npz") as found:
+        path, forces = found["cloth/positions"], found["contact_force"]
+        assert found["cloth/rest"].shape == (20, 2)
+    assert path.shape == (4, 20, 3)
+    # The table has lifted it by 2 cm, and carries its weight.
+    assert path[-1, :, 2] == pytest.approx(np.full(20, 0.07), abs=1e-3)
+    weight = fabric("gray-interlock").density * 0.08 * 0.06 * 9.81
+    assert forces[-1, 0, 2] == pytest.approx(weight, rel=0.02)
+    lines = (folder / "out" / "cloth" / "0003.obj").read_text().splitlines()
+    assert [float(word) for word in lines[0].split()[1:]] == pytest.approx(path[3, 0])
+    again = subprocess.run([*program, "--allow-uncertified"], cwd=folder, capture_output=True, text=True, check=False)
+    assert again.returncode == 1
+    assert "out: must not exist, and out does" in again.stderr
+
+
+def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path) -> None:
+    scene = deepcopy(SCENE)
+    scene["sheets"]["cloth"]["mesh"]["cells"] = [0, 3]
+    (folder / "scene.yaml").write_text(yaml.safe_dump(scene))
+    program = [sys.executable, "-m", "stickslip_services.cli", "simulate", "scene.yaml", "out"]
+    ended = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    said = " ".join(ended.stderr.split())
+    assert "sheets.cloth.mesh.cells.0: Input should be greater than or equal to 1, and it is 0" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({}, ""),
+        ({"preset": "certified"}, "the certificate is of preset certified, and the scene has fast"),
+        ({"extent": "quick"}, "the certificate is a quick one"),
+        ({"sim_core": "c" * 64}, "the certificate is of another build of the solver"),
+        (
+            {"names": SCENE_PROTOCOLS[:4]},
+            "the certificate lacks what a scene needs in which cloth touches cloth: capstan",
+        ),
+    ],
+)
+def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: str) -> None:
+    found = why_uncertified(SceneFile.model_validate(SCENE), certificate(**change))
+    assert found.startswith(why)
+    assert bool(found) == bool(why)
+
+
+def test_what_is_certified_says_so(folder: Path) -> None:
+    scene = SceneFile.model_validate(SCENE | {"duration": 0.2})
+    with pytest.raises(NotCertifiedError, match="there is no certificate of preset fast"):
+        simulate_scene(scene, folder, folder / "out")
+    said = simulate_scene(scene, folder, folder / "out", certificate=certificate())
+    assert said["certified"]
+    assert said["certificate"] == certificate().digest
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ("turn", [0, 0.5, 0], "positions: must not cross a surface"),
+        ("holders", {"hand": {"low": [5, 5], "high": [6, 6]}}, "sheets.cloth.holders.hand: must hold a vertex"),
+        ("holders", {n: {"low": [0, 0], "high": [1, 1]} for n in "ab"}, "holders.b: must not hold what another"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused(place: str, value: Any, message: str, folder: Path) -> None:
+    scene = deepcopy(SCENE)
+    scene["sheets"]["cloth"][place] = value
+    with pytest.raises(SceneError, match=message):
+        simulate_scene(SceneFile.model_validate(scene), folder, folder / "out", allow_uncertified=True)
+    assert list(folder.glob("*out*")) == []
+
+
+def test_a_body_without_its_file_is_refused(folder: Path) -> None:
+    scene = deepcopy(SCENE)
+    scene["bodies"]["table"]["file"] = "chair.obj"
+    with pytest.raises(SceneError, match=r"bodies.table: .*chair.obj"):
+        simulate_scene(SceneFile.model_validate(scene), folder, folder / "out", allow_uncertified=True)
