@@ -22,6 +22,8 @@ constexpr double length_tolerance = 2e-9;
 // Nodes that are stopped one by one strain the cloth: so all go less far together, down to this share, before any one
 // is stopped by itself.
 constexpr double common_least = 0.1;
+// A correction that leads further than so many hops of its search for pairs is no guide.
+constexpr int hops_max = 1;
 // Iterations in a row that are stopped short, or take all rounds, after which an attempt is given up.
 constexpr int strained_max = 4;
 
@@ -133,11 +135,11 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
         const Stopwatch watch(phases.contact);
         std::copy(ends_.begin() + 4L * free_nodes, ends_.end(), trial_.begin() + 4L * free_nodes);
         wanted_ = trial_;
-        if (!pairs->near.cap(x, trial_)) {
+        if (!pairs->near.cap(x, trial_, hops_max)) {
           strained_ = true;
           const double common = std::max(pairs->near.common_share(x, wanted_), common_least);
           for (std::size_t i = 0; i < trial_.size(); ++i) trial_[i] = x[i] + common * (wanted_[i] - x[i]);
-          pairs->near.cap(x, trial_);
+          pairs->near.cap(x, trial_, hops_max);
         }
       }
       evaluate(trial_, true);

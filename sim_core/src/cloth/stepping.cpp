@@ -83,7 +83,7 @@ void Stepper::advance(double begin, double end, int depth, double dt, const Driv
     outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
                            settings_.krylov_tolerance);
     // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
-    if (!outcome.converged && (deepest || !newton.pairs || !newton.pairs->matter())) {
+    if (!outcome.converged && (deepest || !newton.pairs || newton.pairs->list().empty())) {
       x = driven;
       outcome =
           newton.solve(problem, x, deepest, settings_.newton_max, report, std::max(loose, settings_.krylov_tolerance));

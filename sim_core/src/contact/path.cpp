@@ -14,8 +14,6 @@ using Eigen::Array3d;
 constexpr double keep = 0.2;
 // Rounds in which nodes are capped one by one; after them all are by the same share.
 constexpr int rounds_max = 8;
-// Ways longer than so many margins end there.
-constexpr int hops_max = 8;
 
 std::pair<Array3d, Array3d> box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
   Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
@@ -83,7 +81,7 @@ std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {
   return pairs_;
 }
 
-bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to) {
+bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops_max) {
   if (!reference_.empty() && moved(reference_, from) <= margin_ && moved(reference_, to) <= margin_) {
     Buffer<double> capped = to;
     if (cap_near(from, capped)) return true;

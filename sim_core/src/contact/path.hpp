@@ -21,8 +21,8 @@ class Neighbourhood {
 
   // Moves `to` back towards `from` where a pair would come nearer than a fifth of its distance or of the thickness, so
   // that nothing crosses on the straight ways between: each node by as much as its pairs demand. Returns whether
-  // nothing was moved.
-  bool cap(const Buffer<double>& from, Buffer<double>& to);
+  // nothing was moved. Ways of more than `hops_max` times two margins end there: pairs are looked for anew on each hop.
+  bool cap(const Buffer<double>& from, Buffer<double>& to, int hops_max = 64);
 
   // The share of the straight way from `from` to `to` that all nodes can go together, so that every pair that is near
   // at `from` keeps a fifth of its distance or of the thickness.
