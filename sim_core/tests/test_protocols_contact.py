@@ -1,9 +1,11 @@
 """Protocols of cloth with cloth and of friction around a cylinder, small."""
 
+import numpy as np
 import pytest
 
-from stickslip_sim_core import SelfContact, cylinder
+from stickslip_sim_core import SelfContact, cylinder, preset_named
 from stickslip_sim_core.protocols import capstan, heavy_fold, pull_out
+from stickslip_sim_core.reference import master_curves
 
 
 class TestCapstan:
@@ -16,6 +18,16 @@ class TestCapstan:
     def test_a_smoother_cylinder_is_seen(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(capstan, "cylinder", lambda mu, *a, **k: cylinder(0.99 * mu, *a, **k))
         assert not capstan.run(friction=(0.3,), bending=(0.05,)).passed
+
+    @pytest.mark.parametrize("facets", [36, 60])
+    def test_facets_are_not_felt(self, facets: int) -> None:
+        strip = capstan.Strip(0.3, 0.05, preset_named("certified"), facets)
+        heavy, wrap = strip.draw()
+        measured, expected = np.log(heavy.mean() / capstan.LIGHT), np.log(master_curves.capstan(0.3, wrap, 0.05))
+        assert measured == pytest.approx(expected, rel=3e-3)
+        assert np.ptp(heavy) < 0.01 * heavy.mean()
+        assert strip.cloth.newton <= 10 * strip.cloth.steps
+        assert strip.cloth.unconverged_steps == 0
 
     def test_radius(self) -> None:
         with pytest.raises(ValueError, match="radius: must be finite and > 0"):

@@ -220,6 +220,23 @@ class TestRotatingSphere:
         )
         assert scene.self_intersections.shape == (76,)
 
+    def test_sphere_of_triangles(self) -> None:
+        """Bears what a round one does, and takes the cloth along as well; nothing pokes through."""
+        round_one, other = (
+            rotating_sphere("11oz-black-denim", 0.5, vertices=17, frames=61, subdivisions=n) for n in (None, 2)
+        )
+        assert other.valid, other.reason
+        weight = fabric("11oz-black-denim").density * 0.04 * GRAVITY
+        assert other.sphere_force[-1, 2] == pytest.approx(round_one.sphere_force[-1, 2], abs=0.03 * weight)
+        assert (other.floor_force + other.sphere_force)[30:] == pytest.approx(
+            other.contact_force[30:], abs=2e-3 * weight
+        )
+        assert set(other.contacts.ravel()) == {-1, 0, 1}
+        # Of this coarse cloth vertices keep away from the sphere what its triangles sink.
+        high = np.linalg.norm(other.positions - [0.0, 0.0, RADIUS], axis=2)[other.contacts == 1] - RADIUS
+        assert high.min() > 0.0
+        assert high.max() < 1e-3
+
     def test_smooth_sphere_does_not(self) -> None:
         scene = rotating_sphere("gray-interlock", 0.0, mu_floor=0.2, vertices=9, frames=76)
         corner = np.unwrap(np.arctan2(scene.positions[:, -1, 1], scene.positions[:, -1, 0]))
@@ -232,6 +249,7 @@ class TestRotatingSphere:
             ({"frames": 0}, r"frames: must be 1 \.\.\. 3000, got 0"),
             ({"speed": 21.0}, r"speed: must be in \[-20, 20\] rad/s, got 21.0"),
             ({"vertices": 3}, "vertices: must be at least 5, got 3"),
+            ({"subdivisions": 8}, r"subdivisions: must be 1 \.\.\. 7, got 8"),
             ({"frame_rate": 0.0}, "frame_rate: must be finite and > 0, got 0.0"),
         ):
             good = {"fabric": "gray-interlock", "mu": 0.5}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import Cloth, Surface, isotropic, preset_named, self_intersections, sphere
+from stickslip_sim_core import Cloth, Surface, isotropic, plane, preset_named, self_intersections, sphere
 from stickslip_sim_core import _sim_core as core
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import CREASE, GRAVITY, THICKNESS
@@ -263,6 +263,19 @@ class TestCloth:
         sinks = 0.5 * 0.015**2 / 2.0 / 0.04
         assert height == pytest.approx(sinks + 0.25 * THICKNESS, rel=0.02)
         assert not len(cloth.pair_forces.forces)
+
+    def test_corner_of_a_floor_and_a_surface(self) -> None:
+        """A wall that pushes a sheet over the floor: vertices bear on both."""
+        wall = np.array([[0.0, -0.1, -0.01], [0.0, 0.1, -0.01], [0.0, 0.1, 0.1], [0.0, -0.1, 0.1]])
+        pushing = Surface([[0, 1, 2], [0, 2, 3]], lambda time: wall - [0.032 - 0.02 * time, 0.0, 0.0], 0.5)
+        cloth = over(pushing, 1e-4)
+        for _ in range(40):
+            cloth.step(0.02, bodies=[plane(0.3)])
+            assert crossings(cloth) == 0
+        assert cloth.unconverged_steps == 0
+        assert cloth.positions[:, 0].min() > -0.032 + 0.02 * cloth.time
+        assert cloth.positions[:, 2].min() > -1e-8
+        assert (cloth.contacts == 0).any()
 
     def test_what_pokes_through_between_vertices_is_felt(self) -> None:
         """A spike below the middle of a triangle, and the edge of a thin plate along a column of cells."""

@@ -64,15 +64,17 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
       const Gap one = gap_of(at_end[b], p);
       if (one.distance < gap.distance) gap = one, which = static_cast<int>(b);
     }
-    if (surfaces) {
+    const Vector3d r = at_node(residual, i);
+    const auto bears = [&] { return which >= 0 && r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0; };
+    // A body comes first: pairs keep the node from the triangles of a surface meanwhile.
+    if (surfaces && !bears()) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
-      if (one && one->gap < gap.distance) {
+      if (one) {
         gap = {one->gap, one->normal};
         which = static_cast<int>(at_end.size()) + one->surface;
       }
     }
-    const Vector3d r = at_node(residual, i);
-    if (which < 0 || !(r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0)) {
+    if (!bears()) {
       touched[i] = -1;
       const ContactRow row = open_row(r);
       mode[i] = contact_open;
