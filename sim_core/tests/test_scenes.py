@@ -265,13 +265,13 @@ class TestShawl:
         a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
         area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
         assert area.min() > 0.0
-        assert area.sum() == pytest.approx(0.5 * shawl.ANGLE * (shawl.HEM**2 - shawl.NECKLINE**2), rel=1e-3)
+        assert area.sum() == pytest.approx(0.5 * shawl.ANGLE * (shawl.HEM**2 - shawl.NECKLINE**2), rel=2e-3)
         sides = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]])
         flat, bent = (np.linalg.norm(p[sides[:, 0]] - p[sides[:, 1]], axis=1) for p in (mesh.rest, start))
         assert np.abs(bent / flat - 1.0).max() < 1e-3
 
     def test_it_comes_to_lie_on_the_shoulders(self) -> None:
-        scene = shawl_on_figure("gray-interlock", 0.5, preset="fast", vertices=13, frames=46)
+        scene = shawl_on_figure("gray-interlock", 1.0, preset="fast", vertices=13, frames=46)
         assert scene.valid, scene.reason
         assert scene.times[-1] == pytest.approx(STILL)
         assert not scene.self_intersections.any()
