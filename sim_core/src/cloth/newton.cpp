@@ -19,10 +19,12 @@ constexpr int reversals_from = 4;
 constexpr int rounds_max = 6;
 constexpr double pairs_tolerance = 1e-4;
 // The smoothed law begins with this share of the thickness, and gets sharper by this factor once forces miss it by no
-// more than so many times those that it smooths over. GMRES then solves to this tolerance, and no node goes further in an
-// iteration than so many margins of what is known to be near.
+// more than so many times those that it smooths over. GMRES then solves to this tolerance, and no node goes further in
+// an iteration than so many margins of what is known to be near.
 constexpr double smooth_from = 0.1, smooth_less = 0.1, smooth_near = 5.0;
 constexpr double smooth_tolerance = 1e-6, smooth_reach = 4.0;
+// Such an attempt is given up where the squares of forces have grown by so much.
+constexpr double diverged = 1e8;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
 constexpr double length_tolerance = 2e-9;
 // Nodes that are stopped one by one strain the cloth: so all go less far together, down to this share, before any one
@@ -118,6 +120,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   std::vector<int> modes = contact.mode;
   double window[4];
   std::fill(window, window + 4, norms.squared);
+  const double first = norms.squared;
   trial_ = best_ = x;
   double least = norms.squared;
   int strained = 0;
@@ -129,6 +132,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && !smoothly && norms.largest <= settings_.tolerance && arrived(x)) break;
     if (!std::isfinite(norms.squared)) break;
+    if (smoothly && norms.squared > diverged * first) break;
     strained = strained_ ? strained + 1 : 0;
     if (strained > strained_max && iterations < settings_.newton_max) break;
     ++report.newton;
@@ -244,7 +248,9 @@ void Newton::correct_with_pairs(const StepProblem& problem, const Buffer<double>
   contact.force = force_;
   pair_rows_ = pairs->rows();
   assembly_.matrix.pairs = &pair_rows_;
-  const KrylovResult solved = solve_linear(pair_factor_.view(), pairs->smoothing > 0.0 ? smooth_tolerance : std::min(settings_.krylov_tolerance, pairs_tolerance));
+  const KrylovResult solved =
+      solve_linear(pair_factor_.view(),
+                   pairs->smoothing > 0.0 ? smooth_tolerance : std::min(settings_.krylov_tolerance, pairs_tolerance));
   assembly_.matrix.pairs = nullptr;
   pair_factor_.spent(solved.iterations);
   report.krylov += solved.iterations;

@@ -60,9 +60,7 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
   }
 }
 
-int Stepper::patience() const {
-  return static_cast<int>((near() ? near_pairs : 1.0) * settings_.patience);
-}
+int Stepper::patience() const { return static_cast<int>((near() ? near_pairs : 1.0) * settings_.patience); }
 
 bool Stepper::near() const { return newton.pairs && newton.pairs->matter(); }
 

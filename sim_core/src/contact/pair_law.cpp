@@ -42,20 +42,24 @@ PairRow slip_row(const PairSight& sight) {
 
 // The smoothed law at a pair: what it asks of the force, and its derivatives.
 struct Smoothed {
-  double pressing;             // R_N, N
-  double share;                // dR_N/d(r_N - k g)
-  Vector3d direction;          // t
-  double friction;             // rho, N
-  double along, across;        // drho/d|tau|, rho/|tau|
-  double by_bound;             // drho/d(mu R_N)
+  double pressing;       // R_N, N
+  double share;          // dR_N/d(r_N - k g)
+  Vector3d direction;    // t
+  double friction;       // rho, N
+  double along, across;  // drho/d|tau|, rho/|tau|
+  double by_bound;       // drho/d(mu R_N)
 };
+
+constexpr int bisections_max = 100;
 
 // y >= 0 with y (f^2 (1 + y)^2 - a^2) = 2 q (1 + y)^2: then rho = a/(1 + y).
 double multiplier(double f, double a, double q) {
-  const auto value = [&](double y) { return y * (f * (1.0 + y) - a) * (f * (1.0 + y) + a) - 2.0 * q * (1.0 + y) * (1.0 + y); };
+  const auto value = [&](double y) {
+    return y * (f * (1.0 + y) - a) * (f * (1.0 + y) + a) - 2.0 * q * (1.0 + y) * (1.0 + y);
+  };
   double low = std::max(0.0, a / f - 1.0), high = low + std::sqrt(q) / f + q / (f * f);
-  while (value(high) < 0.0) high = low + 2.0 * (high - low);
-  for (int i = 0; i < 100; ++i) {
+  for (int i = 0; i < bisections_max && value(high) < 0.0; ++i) high = low + 2.0 * (high - low);
+  for (int i = 0; i < bisections_max; ++i) {
     const double y = 0.5 * (low + high);
     if (y <= low || y >= high) break;
     (value(y) < 0.0 ? low : high) = y;
@@ -99,9 +103,12 @@ PairRow smoothed_row(const PairSight& sight) {
   row.mode = law.share < 1e-4 ? contact_open : law.along > 0.5 ? contact_stick : contact_slip;
   row.symmetric = symmetric;
   row.stiffness = symmetric + coupling * press * t * n.transpose();
-  row.force = pull * n + (coupling * (pressing + pull - law.pressing) - (t.dot(tangential) - law.friction) / (k * soft_along)) * t -
-              side * tangential / (k * soft_across);
-  row.turning = pressing * ((1.0 - law.along) / (k * soft_along) * t * t.transpose() + (1.0 - law.across) / (k * soft_across) * side) +
+  row.force =
+      pull * n +
+      (coupling * (pressing + pull - law.pressing) - (t.dot(tangential) - law.friction) / (k * soft_along)) * t -
+      side * tangential / (k * soft_across);
+  row.turning = pressing * ((1.0 - law.along) / (k * soft_along) * t * t.transpose() +
+                            (1.0 - law.across) / (k * soft_across) * side) +
                 coupling * t * tangential.transpose();
   if (row.mode == contact_open) row.turning.setZero();
   if (row.mode == contact_open) row.stiffness.setZero(), row.symmetric.setZero();

@@ -278,17 +278,17 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   const double mu = settings_.mu(a, b), thickness = settings_.apart(a, b);
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
-  pairs_.push_back(
-      {who,
-       feature,
-       weights,
-       {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness, (smoothing > 0.0 ? smooth_proximal_share : proximal_share) / softness,
-        law_share / softness * smoothing * smoothing},
-       first - 0.5 * rho,
-       thickness,
-       along_first,
-       along_second,
-       given});
+  pairs_.push_back({who,
+                    feature,
+                    weights,
+                    {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness,
+                     (smoothing > 0.0 ? smooth_proximal_share : proximal_share) / softness,
+                     law_share / softness * smoothing * smoothing},
+                    first - 0.5 * rho,
+                    thickness,
+                    along_first,
+                    along_second,
+                    given});
 }
 
 // Pairs take the forces they had. The force of one that is gone goes to the most alike of those that are new and have
@@ -304,8 +304,8 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
       pairs_[i].insistence = before[o].insistence;
       const int mode = before[o].row.mode;
       const double last = missed(before[o].sight, mode), now = missed(pairs_[i].sight, mode);
-      if (smoothing == 0.0 && share == 1.0 && mode != contact_open && last > insist_from && last < insist_up_to * pairs_[i].thickness &&
-          now > insist_above * last) {
+      if (smoothing == 0.0 && share == 1.0 && mode != contact_open && last > insist_from &&
+          last < insist_up_to * pairs_[i].thickness && now > insist_above * last) {
         pairs_[i].insistence = std::min(insist_more * before[o].insistence, insist_max);
       }
       pairs_[i].sight.proximal *= pairs_[i].insistence;
@@ -486,7 +486,10 @@ void Pairs::subtract_right_side(Buffer<float>& force) const {
     if (change.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {
       if (pair.who.node[c] >= free_nodes_) continue;
-      at_node(force, pair.who.node[c]) -= (pair.weights[c] * change.segment<3>(0) + pair.along_first[c] * change.segment<3>(3) + pair.along_second[c] * change.segment<3>(6)).cast<float>();
+      at_node(force, pair.who.node[c]) -=
+          (pair.weights[c] * change.segment<3>(0) + pair.along_first[c] * change.segment<3>(3) +
+           pair.along_second[c] * change.segment<3>(6))
+              .cast<float>();
     }
   }
 }

@@ -41,7 +41,8 @@ inline void add_pairs(const PairData& pairs, const Node* in, Node* out) {
     }
     for (int c = 0; c < 4; ++c) {
       if (nodes[c] < 0) continue;
-      out[nodes[c]] += spread(weights[c]) * force[0] + spread(weights[4 + c]) * force[1] + spread(weights[8 + c]) * force[2];
+      out[nodes[c]] +=
+          spread(weights[c]) * force[0] + spread(weights[4 + c]) * force[1] + spread(weights[8 + c]) * force[2];
     }
   }
 }
