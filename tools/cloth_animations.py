@@ -4,7 +4,7 @@
     .venv-blender/bin/python tools/cloth_animations.py render DIR OUT [NAME ...]
 
 The first command writes trajectories to DIR. The second renders them as a worker does, but 320 pixels wide, and writes
-them to OUT. It made docs/figures/cloth-drag.webp, cloth-on-cloth.webp, cloth-sphere.webp and shawl.webp.
+them to OUT. It made docs/figures/cloth-drag.webp, cloth-on-cloth.webp and cloth-sphere.webp; it makes shawl.webp, too.
 """
 
 import argparse
