@@ -163,8 +163,8 @@ def test_smoothed_row_is_newtons(seed: int) -> None:
     assert error == pytest.approx(at @ at)
     v = 0.01 * rng.normal(size=3)
     dr, across, step = rhs - stiffness @ v, v - (v @ n) * n, 1e-7
-    plus = smoothed_missed(gap + step * (v @ n), n, slip + step * across, force + step * dr, mu, epsilon)
-    minus = smoothed_missed(gap - step * (v @ n), n, slip - step * across, force - step * dr, mu, epsilon)
+    plus = smoothed_missed(gap + step * float(v @ n), n, slip + step * across, force + step * dr, mu, epsilon)
+    minus = smoothed_missed(gap - step * float(v @ n), n, slip - step * across, force - step * dr, mu, epsilon)
     assert at + (plus - minus) / (2.0 * step) == pytest.approx(np.zeros(3), abs=1e-6)
     assert symmetric == pytest.approx(symmetric.T)
     assert np.linalg.eigvalsh(symmetric).min() >= 0.0
