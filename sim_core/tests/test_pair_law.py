@@ -18,8 +18,10 @@ def frame(seed: int) -> tuple[Floats, Floats, Floats]:
     return q[0], q[1], q[2]
 
 
-def law(gap: float, n: Floats, slip: Floats, force: Floats, mu: float) -> tuple[int, Floats, Floats, Floats, float]:
-    found: tuple[int, Floats, Floats, Floats, float] = core.pair_law(gap, n, slip, force, mu, K, KAPPA)
+def law(
+    gap: float, n: Floats, slip: Floats, force: Floats, mu: float, kappa: float = KAPPA, smoothing: float = 0.0
+) -> tuple[int, Floats, Floats, Floats, float]:
+    found: tuple[int, Floats, Floats, Floats, float] = core.pair_law(gap, n, slip, force, mu, K, kappa, smoothing)
     return found
 
 
@@ -116,3 +118,61 @@ def test_slipping_row_is_newtons(seed: int) -> None:
     assert unsymmetric @ n == pytest.approx(
         mu * KAPPA * (across @ (force - K * slip)) @ across / np.linalg.norm(across @ (force - K * slip))
     )
+
+
+def smoothed_missed(gap: float, n: Floats, slip: Floats, force: Floats, mu: float, epsilon: float) -> Floats:
+    """By what a force misses the smoothed law, with rho by bisection."""
+    pressing = force @ n
+    z = pressing - K * gap
+    wanted = 0.5 * (z + np.hypot(z, 2.0 * np.sqrt(K * epsilon)))
+    tau = force - pressing * n - K * slip
+    size, bound = np.linalg.norm(tau), mu * wanted
+    low, high = 0.0, min(size, bound)
+    for _ in range(200):
+        rho = 0.5 * (low + high)
+        if rho + 2.0 * K * epsilon * rho / (bound**2 - rho**2) < size:
+            low = rho
+        else:
+            high = rho
+    return np.asarray(force - wanted * n - low * tau / size)
+
+
+@pytest.mark.parametrize("epsilon", [1e-2, 1e-5, 1e-12])
+def test_smoothed_roots(epsilon: float) -> None:
+    """r_N g = epsilon, and the slip of a force within the cone, -2 epsilon r_T/((mu r_N)^2 - |r_T|^2)."""
+    n, t, _ = frame(5)
+    mu, pressing = 0.5, 2.0
+    for friction in (0.0, 0.3, 0.99):
+        force = pressing * n + friction * t
+        slip = -2.0 * epsilon * friction / (mu**2 * pressing**2 - friction**2) * t
+        found = law(epsilon / pressing, n, slip, force, mu, smoothing=epsilon)
+        assert found[4] == pytest.approx(0.0, abs=1e-24)
+        assert found[3] == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_smoothed_row_is_newtons(seed: int) -> None:
+    """Without the proximal term, dr = force - stiffness v solves the linearised smoothed law, by finite differences."""
+    rng = np.random.default_rng(seed)
+    n, t, s = frame(seed)
+    mu, epsilon, gap = 0.4, 10.0 ** rng.uniform(-4.0, -1.0), 0.1 * rng.normal()
+    force = 2.0 * rng.uniform() * n + 0.3 * t + 0.2 * s
+    slip = 0.2 * rng.normal() * t + 0.2 * rng.normal() * s
+    _, stiffness, symmetric, rhs, error = law(gap, n, slip, force, mu, 1e12, epsilon)
+    at = smoothed_missed(gap, n, slip, force, mu, epsilon)
+    assert error == pytest.approx(at @ at)
+    v = 0.01 * rng.normal(size=3)
+    dr, across, step = rhs - stiffness @ v, v - (v @ n) * n, 1e-7
+    plus = smoothed_missed(gap + step * float(v @ n), n, slip + step * across, force + step * dr, mu, epsilon)
+    minus = smoothed_missed(gap - step * float(v @ n), n, slip - step * across, force - step * dr, mu, epsilon)
+    assert at + (plus - minus) / (2.0 * step) == pytest.approx(np.zeros(3), abs=1e-6)
+    assert symmetric == pytest.approx(symmetric.T)
+    assert np.linalg.eigvalsh(symmetric).min() >= 0.0
+
+
+def test_smoothing_tends_to_the_law() -> None:
+    n, t, s = frame(6)
+    force, slip = 2.0 * n + 0.3 * t + 0.5 * s, -0.9 * t + 0.4 * s
+    exact = law(0.0, n, slip, force, 0.4)
+    off = [abs(law(0.0, n, slip, force, 0.4, smoothing=epsilon)[4] - exact[4]) for epsilon in (1e-4, 1e-6, 1e-8)]
+    assert off[0] > 10.0 * off[1] > 100.0 * off[2] > 0.0

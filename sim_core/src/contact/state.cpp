@@ -12,6 +12,13 @@ namespace {
 
 // Contact stiffness in a factor over a node's own.
 constexpr float factor_share = 100.0f;
+// What begins a step nearer to a body than this feels surfaces by pairs only, m.
+constexpr double body_first = 1e-3;
+
+bool began_near(const std::vector<Body>& bodies, const Vector3d& p) {
+  return std::any_of(bodies.begin(), bodies.end(),
+                     [&](const Body& body) { return gap_of(body, p).distance < body_first; });
+}
 
 }  // namespace
 
@@ -67,7 +74,8 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     const Vector3d r = at_node(residual, i);
     const auto bears = [&] { return which >= 0 && r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0; };
     // A body comes first: pairs keep the node from the triangles of a surface meanwhile.
-    if (surfaces && !bears()) {
+    // So it is for a whole step where it began near one, lest it should change between them.
+    if (surfaces && !bears() && !began_near(at_start, at_node(start, i))) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
       if (one) {
         gap = {one->gap, one->normal};

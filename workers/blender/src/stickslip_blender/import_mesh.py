@@ -38,9 +38,7 @@ class ImportMeshError(ValueError):
     """A file that holds no mesh whose vertices move."""
 
 
-def read(
-    path: Path, *, frame_rate: int = 24, name: str | None = None, scale: float = 1.0
-) -> dict[str, Any]:
+def read(path: Path, *, frame_rate: int = 24, name: str | None = None, scale: float = 1.0) -> dict[str, Any]:
     """Read all meshes of a file, or the one of a name, as one, at all frames: what the NPZ file holds.
 
     Args:
