@@ -13,7 +13,7 @@ SPEC: dict[str, Any] = {
     "allow_uncertified": True,
     "axes": {
         "material": "felt",
-        "mu": 0.5,
+        "mu": 0.9,
         "self_friction": 0.4,
         "swing": 0.3,
         "texture": ["checker", "dots"],
