@@ -29,6 +29,7 @@ SPEC: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_from_spec_to_training_batch(service: Service) -> None:
     job = service.finished(service.submit(SPEC), timeout=900.0)
     assert job["state"] == "succeeded"
