@@ -51,6 +51,8 @@ struct Smoothed {
 };
 
 constexpr int bisections_max = 100;
+// Pairs that give way by less than this share of k are left out of the matrix.
+constexpr double share_least = 1e-4;
 
 // y >= 0 with y (f^2 (1 + y)^2 - a^2) = 2 q (1 + y)^2: then rho = a/(1 + y).
 double multiplier(double f, double a, double q) {
@@ -99,20 +101,16 @@ PairRow smoothed_row(const PairSight& sight) {
   const double coupling = law.by_bound * sight.mu / (k * soft_along);
   const Matrix3d side = Matrix3d::Identity() - n * n.transpose() - t * t.transpose();
   const Matrix3d symmetric = press * n * n.transpose() + along * t * t.transpose() + across * side;
-  PairRow row;
-  row.mode = law.share < 1e-4 ? contact_open : law.along > 0.5 ? contact_stick : contact_slip;
-  row.symmetric = symmetric;
-  row.stiffness = symmetric + coupling * press * t * n.transpose();
-  row.force =
+  const Vector3d force =
       pull * n +
       (coupling * (pressing + pull - law.pressing) - (t.dot(tangential) - law.friction) / (k * soft_along)) * t -
       side * tangential / (k * soft_across);
-  row.turning = pressing * ((1.0 - law.along) / (k * soft_along) * t * t.transpose() +
-                            (1.0 - law.across) / (k * soft_across) * side) +
-                coupling * t * tangential.transpose();
-  if (row.mode == contact_open) row.turning.setZero();
-  if (row.mode == contact_open) row.stiffness.setZero(), row.symmetric.setZero();
-  return row;
+  if (law.share < share_least) return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), force};
+  return {law.along > 0.5 ? contact_stick : contact_slip, symmetric + coupling * press * t * n.transpose(), symmetric,
+          force,
+          pressing * ((1.0 - law.along) / (k * soft_along) * t * t.transpose() +
+                      (1.0 - law.across) / (k * soft_across) * side) +
+              coupling * t * tangential.transpose()};
 }
 
 double smoothed_error_squared(const PairSight& sight) {
