@@ -37,17 +37,6 @@ constexpr double near_share = 2.0;
 
 auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
 
-// Axes that turn with a pair's triangle, or with its edges.
-Matrix3d axes(PairKind kind, const FourPoints& x) {
-  const Vector3d a = kind == PairKind::vertex_triangle ? Vector3d(x[2] - x[1]) : Vector3d(x[1] - x[0]);
-  const Vector3d b = kind == PairKind::vertex_triangle ? Vector3d(x[3] - x[1]) : Vector3d(x[3] - x[2]);
-  Matrix3d out;
-  out.col(0) = a.normalized();
-  out.col(2) = a.cross(b).normalized();
-  out.col(1) = out.col(2).cross(out.col(0));
-  return out;
-}
-
 // How the closest points move over their pieces, and how the normal turns, by a pair's motions m, m_1, m_2: they lie
 // where rho is across the directions a_k = sum w_ki x_i, so that
 //
@@ -135,6 +124,7 @@ void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const
                   double share) {
   start_ = &start;
   ends_ = &ends;
+  turns_.begin(start);
   for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
   base_ = kept_;
 }
@@ -170,8 +160,10 @@ void Pairs::select(const Buffer<double>& x) {
   };
   const Surface& surface = near.surface;
   const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
+  const auto around_node = [&](int node) { return surface.around_begin[node + 1] - surface.around_begin[node]; };
   std::vector<Candidate>& candidates = near.pairs(x);
   const double reach = near_share * near.thickness + 2.0 * near.moved(*start_, x);
+  turns_.move_to(x);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
   std::vector<Found> found;
@@ -208,7 +200,7 @@ void Pairs::select(const Buffer<double>& x) {
       while (next < found.size() && found[next].feature == feature) ++next;
       const int around = feature < triangles           ? 1
                          : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
-                                                       : surface.triangles_of_node[feature - triangles - edges];
+                                                       : around_node(feature - triangles - edges);
       if (static_cast<int>(next - i) != around || candidates[found[i].candidate].distance > reach) continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
@@ -270,8 +262,11 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   }
   if (!(softness > 0.0) || !(distance > 0.0)) return;
   const Vector3d n = rho / distance;
-  // The way of the first over the second, less that by which rho turns with them.
-  const Matrix3d turn = axes(who.kind, at) * axes(who.kind, before).transpose();
+  // The way of the first over the second, less that by which rho turns with them: half with each.
+  Matrix3d turn = Matrix3d::Zero();
+  for (int c = 0; c < 4; ++c) {
+    if (weights[c] != 0.0) turn += 0.5 * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+  }
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
   const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];

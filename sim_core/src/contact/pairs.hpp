@@ -10,6 +10,7 @@
 #include "contact/pair_settings.hpp"
 #include "contact/path.hpp"
 #include "contact/state.hpp"
+#include "contact/turns.hpp"
 
 namespace sim_core {
 
@@ -99,6 +100,7 @@ class Pairs {
   double least_distance_;
   std::vector<Pair> pairs_, base_, kept_, best_;  // sorted by kind, first, feature
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
+  Turns turns_;
   std::vector<double> softness_;  // of all nodes, m/N: 0 where held
   std::vector<int> nodes_;
   Buffer<float> weights_, stiffness_;

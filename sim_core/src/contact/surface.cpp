@@ -7,7 +7,7 @@ namespace sim_core {
 
 Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in, Felt felt_in)
     : triangles(std::move(triangles_in)),
-      triangles_of_node(sheet_of_node_in.size(), 0),
+      around_begin(sheet_of_node_in.size() + 1, 0),
       sheet_of_node(std::move(sheet_of_node_in)),
       felt(std::move(felt_in)),
       last_felt(felt.rows(), -1) {
@@ -21,7 +21,7 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
     for (int c = 0; c < 3; ++c) {
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
       edges.push_back({std::min(i, j), std::max(i, j)});
-      ++triangles_of_node[corners[c]];
+      ++around_begin[corners[c] + 1];
     }
   }
   std::sort(edges.begin(), edges.end());
@@ -37,8 +37,14 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
     }
     triangle_edges.push_back(own);
   }
-  for (std::size_t i = 0; i < triangles_of_node.size(); ++i) {
-    if (triangles_of_node[i] > 0) vertices.push_back(static_cast<int>(i));
+  for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
+    if (around_begin[i + 1] > 0) vertices.push_back(static_cast<int>(i));
+    around_begin[i + 1] += around_begin[i];
+  }
+  around.resize(around_begin.back());
+  std::vector<int> next(around_begin.begin(), around_begin.end() - 1);
+  for (std::size_t t = 0; t < triangles.size(); ++t) {
+    for (int node : triangles[t]) around[next[node]++] = static_cast<int>(t);
   }
 }
 

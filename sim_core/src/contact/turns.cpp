@@ -1,0 +1,58 @@
+#include "contact/turns.hpp"
+
+#include <Eigen/Geometry>
+
+namespace sim_core {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+namespace {
+
+Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
+  const Vector3d a = at_node(x, corner[1]) - at_node(x, corner[0]), b = at_node(x, corner[2]) - at_node(x, corner[0]);
+  Matrix3d out;
+  out.col(0) = a.normalized();
+  out.col(2) = a.cross(b).normalized();
+  out.col(1) = out.col(2).cross(out.col(0));
+  return out;
+}
+
+}  // namespace
+
+void Turns::begin(const Buffer<double>& start) {
+  start_ = &start;
+  ++starts_;
+}
+
+void Turns::move_to(const Buffer<double>& x) {
+  x_ = &x;
+  ++moves_;
+}
+
+const Matrix3d& Turns::of(const Surface& surface, int node) {
+  nodes_.resize(surface.sheet_of_node.size());
+  Turn& here = nodes_[node];
+  if (here.at == moves_) return here.turn;
+  here.at = moves_;
+  here.turn.setZero();
+  const int begin = surface.around_begin[node], end = surface.around_begin[node + 1];
+  for (int t = begin; t < end; ++t) here.turn += turn_of(surface, surface.around[t]);
+  here.turn /= end - begin;
+  return here.turn;
+}
+
+const Matrix3d& Turns::turn_of(const Surface& surface, int triangle) {
+  triangles_.resize(surface.triangles.size());
+  Turn& here = triangles_[triangle];
+  if (here.at == moves_) return here.turn;
+  if (here.start_at != starts_) {
+    here.start_at = starts_;
+    here.start = axes(surface.triangles[triangle], *start_);
+  }
+  here.at = moves_;
+  here.turn = axes(surface.triangles[triangle], *x_) * here.start.transpose();
+  return here.turn;
+}
+
+}  // namespace sim_core
