@@ -113,7 +113,13 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
   if (pairs) pairs->smoothing = smoothly ? smooth_from * pairs->near.thickness : 0.0;
-  if (pairs) pairs->begin(problem.start, ends_, contact.stiffness, contact_share);
+  if (pairs) {
+    Buffer<double> expected = ends_;
+    for (int i = 0; i < free_nodes; ++i) {
+      at_node(expected, i) = at_node(problem.start, i) + problem.dt * at_node(problem.velocity, i);
+    }
+    pairs->begin(problem.start, ends_, expected, contact.stiffness, contact_share);
+  }
   Norms norms = look(problem, x);
   if (pairs) pairs->mark_best();
   const bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);

@@ -120,11 +120,11 @@ void Pairs::restart() {
   pairs_.clear();
 }
 
-void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const std::vector<double>& stiffness,
-                  double share) {
+void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
+                  const std::vector<double>& stiffness, double share) {
   start_ = &start;
   ends_ = &ends;
-  turns_.begin(start);
+  turns_.begin(start, expected);
   for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
   base_ = kept_;
 }
@@ -163,7 +163,6 @@ void Pairs::select(const Buffer<double>& x) {
   const auto around_node = [&](int node) { return surface.around_begin[node + 1] - surface.around_begin[node]; };
   std::vector<Candidate>& candidates = near.pairs(x);
   const double reach = near_share * near.thickness + 2.0 * near.moved(*start_, x);
-  turns_.move_to(x);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
   std::vector<Found> found;

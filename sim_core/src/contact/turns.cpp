@@ -20,21 +20,17 @@ Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
 
 }  // namespace
 
-void Turns::begin(const Buffer<double>& start) {
-  start_ = &start;
-  ++starts_;
-}
-
-void Turns::move_to(const Buffer<double>& x) {
-  x_ = &x;
-  ++moves_;
+void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected) {
+  start_ = start;
+  expected_ = expected;
+  ++step_;
 }
 
 const Matrix3d& Turns::of(const Surface& surface, int node) {
   nodes_.resize(surface.sheet_of_node.size());
   Turn& here = nodes_[node];
-  if (here.at == moves_) return here.turn;
-  here.at = moves_;
+  if (here.step == step_) return here.turn;
+  here.step = step_;
   here.turn.setZero();
   const int begin = surface.around_begin[node], end = surface.around_begin[node + 1];
   for (int t = begin; t < end; ++t) here.turn += turn_of(surface, surface.around[t]);
@@ -45,13 +41,10 @@ const Matrix3d& Turns::of(const Surface& surface, int node) {
 const Matrix3d& Turns::turn_of(const Surface& surface, int triangle) {
   triangles_.resize(surface.triangles.size());
   Turn& here = triangles_[triangle];
-  if (here.at == moves_) return here.turn;
-  if (here.start_at != starts_) {
-    here.start_at = starts_;
-    here.start = axes(surface.triangles[triangle], *start_);
-  }
-  here.at = moves_;
-  here.turn = axes(surface.triangles[triangle], *x_) * here.start.transpose();
+  if (here.step == step_) return here.turn;
+  here.step = step_;
+  const auto& corner = surface.triangles[triangle];
+  here.turn = axes(corner, expected_) * axes(corner, start_).transpose();
   return here.turn;
 }
 
