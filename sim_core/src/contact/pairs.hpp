@@ -53,8 +53,9 @@ class Pairs {
 
   // Forgets all forces.
   void restart();
-  // An attempt at a step begins at `start`, with the forces that were kept last, and takes held nodes to `ends`, and the
-  // others to where they are `expected` if nothing stops them; `stiffness`: of the free nodes, `share` of their own.
+  // An attempt at a step begins at `start`, with the forces that were kept last, and takes held nodes to `ends`, and
+  // the others to where they are `expected` if nothing stops them; `stiffness`: of the free nodes, `share` of their
+  // own.
   void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
              const std::vector<double>& stiffness, double share);
   // A step ended.
