@@ -23,6 +23,9 @@ constexpr double pairs_tolerance = 1e-4;
 // an iteration than so many margins of what is known to be near.
 constexpr double smooth_from = 0.1, smooth_less = 0.1, smooth_near = 5.0;
 constexpr double smooth_tolerance = 1e-6, smooth_reach = 4.0;
+// Where the matrix of a convex energy brings the squares of forces down by less than this factor in a whole
+// correction, the exact one takes its place until they grow.
+constexpr double slow = 0.25;
 // Such an attempt is given up where the squares of forces have grown by so much.
 constexpr double diverged = 1e8;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
@@ -64,7 +67,11 @@ Norms Newton::look(const StepProblem& problem, const Buffer<double>& x, double s
                                                 viscous * (at_node(x, i) - at_node(problem.start, i))) +
                            at_node(assembly_.gradient, i);
   }
-  if (pairs) pairs->look(x, share, residual);
+  if (pairs) {
+    pairs->look(x, share, residual);
+    contact.stiffness = own_stiffness_;
+    pairs->add_stiffness(contact_share, contact.stiffness);
+  }
   Norms norms = contact.sort(x, problem.start, residual, problem.at_start, problem.at_end);
   if (pairs) pairs->count_errors(settings_.tolerance / length_tolerance, norms);
   return norms;
@@ -113,6 +120,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
   if (pairs) pairs->smoothing = smoothly ? smooth_from * pairs->near.thickness : 0.0;
+  own_stiffness_ = contact.stiffness;
   if (pairs) {
     Buffer<double> expected = ends_;
     for (int i = 0; i < free_nodes; ++i) {
@@ -130,6 +138,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   trial_ = best_ = x;
   double least = norms.squared;
   int strained = 0;
+  const bool convex = pairs && assembly_.definite;
   const int hops = smoothly ? smooth_hops_max : hops_max;
   double last_share = 0.0;
   strained_ = false;
@@ -172,7 +181,15 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     modes = contact.mode;
     std::swap(x, trial_);
     last_share = share;
+    const double before = norms.squared;
     norms = next;
+    if (convex) {
+      const bool grew = norms.squared > before;
+      if (assembly_.definite ? !grew && share == 1.0 && norms.squared > slow * before : grew) {
+        assembly_.definite = !assembly_.definite;
+        evaluate(x, true);
+      }
+    }
     if (iteration == 0 && resumed) std::fill(window, window + 4, norms.squared);
     window[iteration % 4] = norms.squared;
     if (pairs && pairs->smoothing > 0.0 && sharpen(problem, x, share, norms)) {

@@ -69,48 +69,40 @@ StepOutcome Stepper::solve_smoothly(const StepProblem& problem, StepReport& repo
   return newton.solve(problem, x, false, smooth_iterations, report, settings_.krylov_tolerance, true);
 }
 
-void Stepper::advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report) {
+// Solves for the state at the end of a part of a step. Where that fails it does nothing, unless no part is shorter:
+// then the best is kept.
+bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive, StepReport& report) {
   const double part = (end - begin) * dt;
   std::vector<Body> at_start, at_end;
   for (std::size_t b = 0; b < drive.bodies.size(); ++b) {
     at_start.push_back(between(bodies_before_[b], drive.bodies[b], begin));
     at_end.push_back(between(bodies_before_[b], drive.bodies[b], end));
   }
-  const Buffer<double> from = x;
   drive_nodes(begin, end, part, drive);
   const Buffer<double> driven = x;
   assembly_.read_table(start_);
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
-  const bool deepest = depth == settings_.halvings_max;
-  const int iterations = report.newton;
-  StepOutcome outcome{false, 0.0};
-  if (depth >= depth_hint_) {
-    assembly_.definite = depth > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
-    outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
-                           settings_.krylov_tolerance, false);
-    // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
-    if (!outcome.converged && near()) {
-      x = driven;
-      outcome = solve_smoothly(problem, report);
-    }
-    if (!outcome.converged && (deepest || !near())) {
-      x = driven;
-      outcome = newton.solve(problem, x, deepest, settings_.newton_max, report,
-                             std::max(loose, settings_.krylov_tolerance), false);
-    }
+  const bool deepest = halvings_ == settings_.halvings_max;
+  assembly_.definite = halvings_ > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
+  StepOutcome outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
+                                     settings_.krylov_tolerance, false);
+  // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
+  if (!outcome.converged && near()) {
+    x = driven;
+    outcome = solve_smoothly(problem, report);
+  }
+  if (!outcome.converged && (deepest || !near())) {
+    x = driven;
+    outcome = newton.solve(problem, x, deepest, settings_.newton_max, report,
+                           std::max(loose, settings_.krylov_tolerance), false);
   }
   if (!outcome.converged && !deepest) {
-    if (depth >= depth_hint_) depth_hint_ = depth + 1;
-    x = from;
-    ++report.halvings;
-    const double middle = 0.5 * (begin + end);
-    advance(begin, middle, depth + 1, dt, drive, report);
-    advance(middle, end, depth + 1, dt, drive, report);
-    return;
+    x = start_;
+    return false;
   }
-  hardest_ = std::max(hardest_, report.newton - iterations);
   report.converged = report.converged && outcome.converged;
   take(part, outcome.residual, report);
+  return true;
 }
 
 // Makes the state that was solved for that of the cloth.
@@ -191,13 +183,27 @@ void Stepper::check(double dt, const Drive& drive) {
   if (bodies_before_.size() != drive.bodies.size()) refuse("bodies: must keep their number");
 }
 
+// In parts, each of which is a step halved some times: once more where it does not converge, once less after one that
+// was easy.
 StepReport Stepper::step(double dt, const Drive& drive) {
   check(dt, drive);
   StepReport report;
-  hardest_ = 0;
-  advance(0.0, 1.0, 0, dt, drive, report);
+  const int all = 1 << settings_.halvings_max;
+  const auto size = [&] { return all >> halvings_; };
+  for (int tick = 0; tick < all;) {
+    while (tick % size() != 0) ++halvings_;
+    const int iterations = report.newton;
+    const double begin = static_cast<double>(tick) / all, end = static_cast<double>(tick + size()) / all;
+    if (!solve_part(begin, end, dt, drive, report)) {
+      ++halvings_;
+      ++report.halvings;
+      continue;
+    }
+    tick += size();
+    const bool was_easy = report.newton - iterations <= easy * patience();
+    if (was_easy && halvings_ > 0 && tick % (2 * size()) == 0) --halvings_;
+  }
   bodies_before_ = drive.bodies;
-  if (hardest_ <= easy * patience() && depth_hint_ > 0) --depth_hint_;
   ++report.steps;
   report.unconverged += !report.converged;
   count_contacts(report);

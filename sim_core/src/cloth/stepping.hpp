@@ -50,7 +50,7 @@ class Stepper {
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);
   void count_contacts(StepReport& report) const;
-  void advance(double begin, double end, int depth, double dt, const Drive& drive, StepReport& report);
+  bool solve_part(double begin, double end, double dt, const Drive& drive, StepReport& report);
   void drive_nodes(double begin, double end, double part, const Drive& drive);
 
   Assembly& assembly_;
@@ -61,7 +61,7 @@ class Stepper {
   Eigen::Vector3d momentum_rate_ = Eigen::Vector3d::Zero();
   std::vector<Body> bodies_before_;
   bool started_ = false;
-  int depth_hint_ = 0, hardest_ = 0;  // halvings that steps need of late, and Newton iterations of the worst part
+  int halvings_ = 0;  // that steps need of late
 };
 
 }  // namespace sim_core

@@ -380,6 +380,16 @@ void Pairs::merge() {
   pairs_.erase(pairs_.begin() + static_cast<std::ptrdiff_t>(kept), pairs_.end());
 }
 
+void Pairs::add_stiffness(double share, std::vector<double>& stiffness) const {
+  for (const Pair& pair : pairs_) {
+    if (!pair.bears()) continue;
+    const double own = share * pair.row.symmetric.trace() / 3.0;
+    for (int c = 0; c < 4; ++c) {
+      if (pair.who.node[c] < free_nodes_) stiffness[pair.who.node[c]] += pair.weights[c] * pair.weights[c] * own;
+    }
+  }
+}
+
 void Pairs::count_errors(double stiffness, Norms& norms) const {
   for (const Pair& pair : pairs_) {
     PairSight sight = pair.sight;

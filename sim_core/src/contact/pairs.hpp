@@ -63,6 +63,8 @@ class Pairs {
 
   // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual.
   void look(const Buffer<double>& x, double share, Buffer<double>& residual);
+  // Adds a share of the stiffness by which pairs hold the free nodes, N/m.
+  void add_stiffness(double share, std::vector<double>& stiffness) const;
   // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
   void count_errors(double stiffness, Norms& norms) const;
   const std::vector<Pair>& list() const { return pairs_; }
