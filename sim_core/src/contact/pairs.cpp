@@ -261,10 +261,12 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   }
   if (!(softness > 0.0) || !(distance > 0.0)) return;
   const Vector3d n = rho / distance;
-  // The way of the first over the second, less that by which rho turns with them: half with each.
+  // The way of the first over the second, less that by which rho turns: with the triangle, or half with each edge.
+  const bool on_triangle = who.kind == PairKind::vertex_triangle;
   Matrix3d turn = Matrix3d::Zero();
-  for (int c = 0; c < 4; ++c) {
-    if (weights[c] != 0.0) turn += 0.5 * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+  for (int c = on_triangle ? 1 : 0; c < 4; ++c) {
+    if (weights[c] == 0.0) continue;
+    turn += (on_triangle ? 1.0 : 0.5) * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
   }
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
