@@ -101,6 +101,24 @@ def test_safe_share_keeps_the_distance_and_is_not_timid(edges: bool, most: float
 
 
 @KINDS
+def test_safe_share_takes_little_of_a_small_distance(edges: bool) -> None:
+    """Else halves of halves end at rounding, and what presses on is on the other side."""
+    rng = np.random.default_rng(7)
+    x = awkward(rng)
+    floor = 2.0 * distance(edges, x)
+    stopped = 0
+    for _ in range(200):
+        to = x + rng.normal(size=(4, 3))
+        at = x + core.safe_share(edges, x, to, 0.5, np.inf, floor) * (to - x)
+        assert distance(edges, at) >= 0.99 * distance(edges, x) * (1.0 - 1e-9)
+        stopped += distance(edges, at) < distance(edges, x)
+        if distance(edges, x) > 0.9 * floor:
+            break
+        x = at
+    assert stopped > 5
+
+
+@KINDS
 def test_safe_share_is_that_of_the_oracle(edges: bool) -> None:
     """Which leaves a tenth of the distance, too, and stops a little before."""
     rng = np.random.default_rng(4)

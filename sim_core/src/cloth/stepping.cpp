@@ -113,7 +113,7 @@ void Stepper::take(double dt, double residual, StepReport& report) {
     report.least_distance = std::min(report.least_distance, newton.pairs->least_distance());
   }
   ++report.substeps;
-  if (!(residual <= report.residual)) report.residual = residual;  // a NaN stays
+  if (!std::isnan(report.residual) && !(residual <= report.residual)) report.residual = residual;
   momentum_rate_.setZero();
   for (int i = 0; i < assembly_.numbering.nodes; ++i) {
     const Eigen::Vector3d before = at_node(v, i);

@@ -17,6 +17,8 @@ constexpr double parallel = 1e-14;
 // Of what is left of the distance, so much is advanced at a time, at most; and how often at most.
 constexpr double advance_share = 0.9;
 constexpr int advances_max = 1000;
+// Below the floor so much of a distance is left.
+constexpr double slowly = 0.99;
 
 Eigen::Vector2d closest_on_segments(const FourPoints& x) {
   const Vector3d u = x[1] - x[0], v = x[3] - x[2], r = x[0] - x[2];
@@ -76,7 +78,11 @@ double crossing_squared(const FourPoints& x) {
   return u.cross(v).squaredNorm() / (u.squaredNorm() * v.squaredNorm());
 }
 
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep, double most) {
+double Leaves::of(double distance) const {
+  return std::max(share * std::min(distance, most), std::min(slowly * distance, floor));
+}
+
+double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, const Leaves& leaves) {
   FourPoints at = x, motion;
   Vector3d mean = Vector3d::Zero();
   for (int i = 0; i < 4; ++i) mean += 0.25 * (to[i] - x[i]);
@@ -90,7 +96,7 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, doub
                              ? speed[0] + std::max({speed[1], speed[2], speed[3]})
                              : std::max(speed[0], speed[1]) + std::max(speed[2], speed[3]);
   double distance = between_closest(closest_weights(kind, x), x).norm();
-  const double least = keep * std::min(distance, most);
+  const double least = leaves.of(distance);
   if (fastest <= distance - least) return 1.0;
   if (!(distance > 0.0) || !std::isfinite(fastest)) return 0.0;
   double share = 0.0;

@@ -32,9 +32,17 @@ inline Eigen::Vector3d between_closest(const Eigen::Vector4d& weights, const Fou
 // Squared sine of the angle of the two segments.
 double crossing_squared(const FourPoints& x);
 
-// A share of the straight motion from x to `to` up to which the distance stays above `keep` times that at x, or times
-// `most` where that is less; 1 if it does to the end. Never too large, and too small by little [Li et al. 2021,
-// additive CCD, Algorithm 1].
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, double keep, double most);
+// What a motion may leave of a distance, m.
+struct Leaves {
+  double share;        // of the distance
+  double most;         // m: or of this, where that is less
+  double floor = 0.0;  // m: below this a motion takes little: else many would take a distance to rounding, and past it
+
+  double of(double distance) const;
+};
+
+// A share of the straight motion from x to `to` up to which the distance stays above what is to be left of that at x; 1
+// if it does to the end. Never too large, and too small by little [Li et al. 2021, additive CCD, Algorithm 1].
+double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, const Leaves& leaves);
 
 }  // namespace sim_core

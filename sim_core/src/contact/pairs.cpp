@@ -385,7 +385,7 @@ void Pairs::merge() {
 void Pairs::add_stiffness(double share, std::vector<double>& stiffness) const {
   for (const Pair& pair : pairs_) {
     if (!pair.bears()) continue;
-    const double own = share * pair.row.symmetric.trace() / 3.0;
+    const double own = share * pair.row.symmetric.trace() / (3.0 * pair.insistence);
     for (int c = 0; c < 4; ++c) {
       if (pair.who.node[c] < free_nodes_) stiffness[pair.who.node[c]] += pair.weights[c] * pair.weights[c] * own;
     }

@@ -12,6 +12,8 @@ using Eigen::Array3d;
 // Of the distance of a pair, or of the thickness where that is less, what a motion leaves: what slides past each other
 // comes from far to about the thickness.
 constexpr double keep = 0.5;
+// Thicknesses below which little is taken.
+constexpr double floor_share = 0.01;
 // Rounds in which nodes are capped one by one; after them all are by the same share.
 constexpr int rounds_max = 8;
 
@@ -39,6 +41,7 @@ double fastest(const Candidate& pair, const std::vector<double>& ways) {
 Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
+      leaves{keep, thickness_in, floor_share * thickness_in},
       margin_(margin),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
@@ -64,8 +67,6 @@ Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<
   for (int i : surface.vertices) ways[i] = (at_node(to, i) - at_node(from, i) - common).norm();
   return common;
 }
-
-double Neighbourhood::left(double distance) const { return keep * std::min(distance, thickness); }
 
 void Neighbourhood::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
@@ -129,8 +130,8 @@ double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<doub
   const std::vector<Candidate>& near = pairs(from);
   measure(from, to, way_);
   for (const Candidate& pair : near) {
-    if (fastest(pair, way_) <= pair.distance - left(pair.distance)) continue;
-    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), keep, thickness));
+    if (fastest(pair, way_) <= pair.distance - leaves.of(pair.distance)) continue;
+    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), leaves));
   }
   return least;
 }
@@ -152,9 +153,9 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
       const double distance = pair.distance - fastest(pair, drift_);
-      if (fastest(pair, way_) <= distance - left(distance)) continue;
+      if (fastest(pair, way_) <= distance - leaves.of(distance)) continue;
       const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]), place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, keep, thickness);
+      const double safe = safe_share(pair.kind, points_of(pair, from), ends, leaves);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == rounds_max) continue;

@@ -15,6 +15,7 @@ class Neighbourhood {
 
   const Surface surface;
   const double thickness;
+  const Leaves leaves;
 
   // The pairs, for positions x. Of each, `distance` is at most its distance there.
   std::vector<Candidate>& pairs(const Buffer<double>& x);
@@ -37,8 +38,6 @@ class Neighbourhood {
  private:
   double moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const;
   void rebuild(const Buffer<double>& x);
-  // What a motion leaves of a distance, m.
-  double left(double distance) const;
   bool cap_near(const Buffer<double>& from, Buffer<double>& to);
   // Of each vertex the length of its way but for a common one, which it returns: the middle of the box of all ways.
   Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to, std::vector<double>& ways) const;

@@ -24,7 +24,7 @@ bool began_near(const std::vector<Body>& bodies, const Vector3d& p) {
 
 void Norms::count(double force_squared) {
   squared += force_squared;
-  if (!(force_squared <= largest * largest)) largest = std::sqrt(force_squared);  // a NaN stays
+  if (!std::isnan(largest) && !(force_squared <= largest * largest)) largest = std::sqrt(force_squared);
 }
 
 ContactState::ContactState(int free_nodes)
@@ -73,11 +73,10 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     }
     const Vector3d r = at_node(residual, i);
     const auto bears = [&] { return which >= 0 && r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0; };
-    // A body comes first: pairs keep the node from the triangles of a surface meanwhile.
-    // So it is for a whole step where it began near one, lest it should change between them.
-    if (surfaces && !bears() && !began_near(at_start, at_node(start, i))) {
+    // The nearest counts, but what began a step near a body does not change to a surface: pairs keep it from that.
+    if (surfaces && !began_near(at_start, at_node(start, i))) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
-      if (one) {
+      if (one && one->gap < gap.distance) {
         gap = {one->gap, one->normal};
         which = static_cast<int>(at_end.size()) + one->surface;
       }
