@@ -61,6 +61,9 @@ class Pairs {
 
   // Sorts the pairs at x, with a share of the forces' last changes, and takes their forces from the residual.
   void look(const Buffer<double>& x, double share, Buffer<double>& residual);
+  // After the first look of a step: pairs that have a force and would open by no more than a prediction on straight lines
+  // does over a curved cloth bear in the first linear problem. Returns whether there are any.
+  bool resume();
   // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
   void count_errors(double stiffness, Norms& norms) const;
   const std::vector<Pair>& list() const { return pairs_; }
