@@ -6,7 +6,7 @@
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
 with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
 `stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `facets`: capstan over
-cylinders of triangles. `sphere`: a cloth on a sphere that turns, of triangles and round. `drops`: sheets fall, fold,
+cylinders of triangles, and over a cloth. `sphere`: a cloth on a sphere that turns, of triangles and round. `drops`: sheets fall, fold,
 are crumpled and pile up; after every step all edges are compared with all triangles, to see what crosses.
 `momentum`: what forces of pairs and their moments add up to. `protocols`: those of contact, with their settings; the
 stacked incline is on four meshes. Without a name all of them run; `--only pile` leaves out the drops and protocols
@@ -151,14 +151,17 @@ def momentum_all() -> None:
 
 
 def over_facets() -> None:
-    """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells, shorter and longer."""
+    """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells, shorter and longer.
+
+    Then over a held cloth on such a cylinder: the facets of this one are felt.
+    """
     for mu in capstan.FRICTION:
-        for facets in (None, 72, 60, 24):
-            strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets)
+        for facets, of_cloth in ((None, False), (72, False), (60, False), (24, False), (60, True)):
+            strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth)
             heavy, wrap = strip.draw()
             cloth, expected = strip.cloth, np.log(master_curves.capstan(mu, wrap, 0.05))
             print(
-                f"capstan, mu {mu}, facets {facets}: "
+                f"capstan, mu {mu}, facets {facets}{' of cloth' if of_cloth else ''}: "
                 f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
                 f"ripple {np.ptp(heavy) / heavy.mean():.2%}, {cloth.newton / cloth.steps:.1f} iterations a step, "
                 f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged",

@@ -130,7 +130,8 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   }
   Norms norms = look(problem, x);
   if (pairs) pairs->mark_best();
-  const bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);
+  bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);
+  if (pairs && !smoothly) resumed = pairs->resume() || resumed;
   std::vector<int> modes = contact.mode;
   double window[4];
   std::fill(window, window + 4, norms.squared);

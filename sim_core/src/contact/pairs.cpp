@@ -18,7 +18,8 @@ using Motions = Eigen::Matrix<double, 9, 1>;
 
 // Stiffness of the law, and of the proximal term, over that of a pair's nodes.
 constexpr double law_share = 0.1, proximal_share = 10.0, smooth_proximal_share = 1000.0;
-// A pair whose predicted gap is below minus so much of the thickness is made to bear.
+// A pair whose predicted gap is below minus so much of the thickness is made to bear, and one that bore at the end of
+// the last step bears on up to so much.
 constexpr double predicted_gap = 0.02;
 // Edges whose squared sine is smaller have no pair, nor have those that are closest nearer to an end than so much of
 // their length: vertices have one there.
@@ -149,6 +150,21 @@ void Pairs::look(const Buffer<double>& x, double share, Buffer<double>& residual
     if (pair.sight.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.sight.force;
   }
+}
+
+bool Pairs::resume() {
+  bool any = false;
+  for (Pair& pair : pairs_) {
+    if (pair.bears() || pair.sight.force.isZero(0.0) || pair.sight.gap > predicted_gap * pair.thickness) continue;
+    PairSight touching = pair.sight;
+    touching.gap = 0.0;
+    const PairRow row = pair_row(touching);
+    if (row.mode == contact_open) continue;
+    pair.row = row;
+    pair.row.force -= row.stiffness * pair.sight.gap * pair.sight.normal;
+    any = true;
+  }
+  return any;
 }
 
 // The pairs of closest points at x. A vertex may be closest to an edge or a corner of a triangle: the pair counts once,

@@ -9,7 +9,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import THICKNESS, Cloth, Surface, cylinder
+from stickslip_sim_core.cloth.solver import THICKNESS, Cloth, SelfContact, Surface, cylinder
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.reference import master_curves
 
@@ -86,11 +86,19 @@ class Strip:
         bending: B / T1.
         preset: Solver settings.
         facets: Of a cylinder of triangles, all around; None: the cylinder is round.
+        of_cloth: These triangles are another cloth, all of whose vertices are held.
         width: In cells.
     """
 
     def __init__(
-        self, mu: float, bending: float, preset: SolverSettings, facets: int | None = None, width: int = 2
+        self,
+        mu: float,
+        bending: float,
+        preset: SolverSettings,
+        facets: int | None = None,
+        *,
+        of_cloth: bool = False,
+        width: int = 2,
     ) -> None:
         self.preset = preset
         cell = 2.0 * np.pi * RADIUS / CELLS_PER_TURN
@@ -100,20 +108,26 @@ class Strip:
         along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * cell
         self.held = np.flatnonzero(along > along.max() - 0.1 * cell)
         light = np.flatnonzero(along < along.min() + 0.1 * cell)
-        surfaces = [] if facets is None else [tube(facets, width * cell, mu)]
+        covered = facets is not None and of_cloth
+        surfaces = [] if facets is None or covered else [tube(facets, width * cell, mu)]
+        parts, self.below = [mesh], np.empty((0, 3))
+        if facets is not None and of_cloth:
+            sheet, self.below = cover(facets, (width + 2) * cell)
+            parts.append(sheet)
         self.bodies = [cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])] if facets is None else []
         self.cloth = Cloth(
-            mesh,
+            meshes.together(*parts),
             isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT),
             preset,
-            held=self.held,
+            held=np.append(self.held, len(mesh.rest) + np.arange(len(self.below))),
+            self_contact=SelfContact(mu) if covered else None,
             surfaces=surfaces,
             force_scale=FORCE_SHARE * LIGHT * cell,
         )
         self.breadth = width * cell
         self.cloth.gravity[:] = 0.0
         self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
-        clearance = RADIUS + (0.0 if facets is None else 0.01 * THICKNESS)
+        clearance = RADIUS + (0.0 if facets is None else (0.1 if covered else 0.01) * THICKNESS)
         angle = np.clip(along / RADIUS, 0.0, WRAP)
         beyond = along - RADIUS * angle
         self.start = np.column_stack(
@@ -124,7 +138,7 @@ class Strip:
             ]
         )
         self.ahead = np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
-        self.cloth.set_state(self.start)
+        self.cloth.set_state(np.concatenate([self.start, self.below]))
 
     def draw(self) -> tuple[Floats, float]:
         """Return the heavy pull at each measured step [N/m], and the angle between the far directions [rad]."""
@@ -132,7 +146,7 @@ class Strip:
         first, last = round(SLIDING / dt), round((SLIDING + MEASURED) / dt)
         for step in range(1, last + 1):
             ends = self.start[self.held] + SPEED * step * dt * self.ahead
-            self.cloth.step(dt, held=ends, bodies=self.bodies, damping=DAMPING)
+            self.cloth.step(dt, held=np.concatenate([ends, self.below]), bodies=self.bodies, damping=DAMPING)
             if step > first:
                 pulls.append(self.cloth.reactions[self.held].sum(axis=0) / self.breadth)
         heavy = np.array(pulls)
@@ -149,3 +163,13 @@ def tube(facets: int, breadth: float, mu: float) -> Surface:
     j = (i + 1) % facets
     triangles = np.concatenate([np.column_stack([i, j, facets + i]), np.column_stack([j, facets + j, facets + i])])
     return Surface(triangles, np.concatenate([ring + np.array([0.0, s * breadth, 0.0]) for s in (-1.0, 1.0)]), mu)
+
+
+def cover(facets: int, breadth: float) -> tuple[meshes.Mesh, Floats]:
+    """Return a sheet around the arc that the strip lies on and three of its cells more, and its vertices (V, 3) [m]."""
+    angle = 2.0 * np.pi / facets
+    cells = int(np.ceil((WRAP + 12.0 * np.pi / CELLS_PER_TURN) / angle))
+    radius = RADIUS - THICKNESS
+    mesh = meshes.grid(cells * angle * radius, breadth, cells, max(2, round(breadth / (angle * radius))))
+    at = 0.5 * WRAP + mesh.rest[:, 0] / radius
+    return mesh, np.column_stack([-radius * np.cos(at), mesh.rest[:, 1], radius * np.sin(at)])

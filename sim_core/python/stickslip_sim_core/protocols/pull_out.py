@@ -20,6 +20,7 @@ SPEED = 0.01  # m/s
 SLIDING = 1.0  # s: after which the force is measured
 MEASURED = 0.4  # s: over which its mean is taken
 ROUGH = 10.0  # friction of the floor
+LIFTED = 0.2  # thicknesses: by which held edges are lifted; held where they touch, they could be pressed by any force
 LOWEST_MAX = 1e-5  # m: by which the lowest sheet may move
 
 # Of a node's weight: the force that residuals are measured in.
@@ -120,6 +121,7 @@ class Pulled:
         x = self.start[:, 0]
         self.drawn = np.flatnonzero((self.level == 1) & (x > x[self.level == 1].max() - 1e-9))
         self.rear = np.flatnonzero((self.level == 2) & (x < x[self.level == 2].min() + 1e-9))
+        self.start[np.concatenate([self.drawn, self.rear]), 2] += LIFTED * THICKNESS
         below, above = OVER_LOWER * mu, UPPER * mu
         self.cloth = Cloth(
             meshes.together(*parts),
