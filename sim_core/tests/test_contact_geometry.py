@@ -104,17 +104,17 @@ def test_safe_share_keeps_the_distance_and_is_not_timid(edges: bool, most: float
 def test_safe_share_takes_little_of_a_small_distance(edges: bool) -> None:
     """Else halves of halves end at rounding, and what presses on is on the other side."""
     rng = np.random.default_rng(7)
-    x = awkward(rng)
-    floor = 2.0 * distance(edges, x)
     stopped = 0
-    for _ in range(200):
+    for _ in range(400):
+        x = awkward(rng)
+        start = distance(edges, x)
+        if start < 1e-4:
+            continue
         to = x + rng.normal(size=(4, 3))
-        at = x + core.safe_share(edges, x, to, 0.5, np.inf, floor) * (to - x)
-        assert distance(edges, at) >= 0.99 * distance(edges, x) * (1.0 - 1e-9)
-        stopped += distance(edges, at) < distance(edges, x)
-        if distance(edges, x) > 0.9 * floor:
-            break
-        x = at
+        safe = core.safe_share(edges, x, to, 0.5, np.inf, 2.0 * start)
+        left = distance(edges, x + safe * (to - x))
+        assert left >= 0.99 * start * (1.0 - 1e-9)
+        stopped += safe < 1.0
     assert stopped > 5
 
 

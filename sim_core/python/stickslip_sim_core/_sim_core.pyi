@@ -202,7 +202,7 @@ class ClothSolver:
 def closest_weights(edges: bool, x: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')]) -> Annotated[NDArray[numpy.float64], dict(shape=(4), order='C')]:
     """Internal: see contact/closest.hpp."""
 
-def safe_share(edges: bool, x: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')], to: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')], keep: float, most: float) -> float:
+def safe_share(edges: bool, x: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')], to: Annotated[NDArray[numpy.float64], dict(shape=(4, 3), order='C')], keep: float, most: float, floor: float = 0.0) -> float:
     """Internal: see contact/closest.hpp."""
 
 def contact_candidates(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], x: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], reach: float) -> list[list[int]]:

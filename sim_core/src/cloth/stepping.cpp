@@ -183,13 +183,17 @@ void Stepper::check(double dt, const Drive& drive) {
   if (bodies_before_.size() != drive.bodies.size()) refuse("bodies: must keep their number");
 }
 
-// In parts, each of which is a step halved some times: once more where it does not converge, once less after one that
-// was easy.
+// In parts, each of which is a step halved some times: once more where it does not converge, and once less after one
+// that was easy, where pairs make parts of a step unlike, or after a step that was.
 StepReport Stepper::step(double dt, const Drive& drive) {
   check(dt, drive);
   StepReport report;
   const int all = 1 << settings_.halvings_max;
   const auto size = [&] { return all >> halvings_; };
+  int hardest = 0;
+  const auto ease = [&](int iterations) {
+    if (halvings_ > 0 && iterations <= easy * patience()) --halvings_;
+  };
   for (int tick = 0; tick < all;) {
     while (tick % size() != 0) ++halvings_;
     const int iterations = report.newton;
@@ -200,9 +204,11 @@ StepReport Stepper::step(double dt, const Drive& drive) {
       continue;
     }
     tick += size();
-    const bool was_easy = report.newton - iterations <= easy * patience();
-    if (was_easy && halvings_ > 0 && tick % (2 * size()) == 0) --halvings_;
+    const int taken = report.newton - iterations;
+    hardest = std::max(hardest, taken);
+    if (newton.pairs && tick % (2 * size()) == 0) ease(taken);
   }
+  if (!newton.pairs) ease(hardest);
   bodies_before_ = drive.bodies;
   ++report.steps;
   report.unconverged += !report.converged;
