@@ -67,8 +67,8 @@ Norms Newton::look(const StepProblem& problem, const Buffer<double>& x, double s
                                                 viscous * (at_node(x, i) - at_node(problem.start, i))) +
                            at_node(assembly_.gradient, i);
   }
-  if (pairs) {
-    pairs->look(x, share, residual);
+  if (pairs) pairs->look(x, share, residual);
+  if (contact.surfaces) {  // those that push cloth together hold it as stiffly as pairs do
     contact.stiffness = own_stiffness_;
     pairs->add_stiffness(contact_share, contact.stiffness);
   }

@@ -15,6 +15,9 @@ struct Candidate {
   int first, second;        // a vertex (node) and a triangle, or two edges, the lower first
   std::array<int, 4> node;  // in the order of closest_weights
   double distance;          // where they were looked for, m
+
+  // Whether a node of the four belongs to the first.
+  bool on_first(int c) const { return c < (kind == PairKind::vertex_triangle ? 1 : 2); }
 };
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x);

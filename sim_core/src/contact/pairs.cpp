@@ -125,7 +125,7 @@ void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const
                   const std::vector<double>& stiffness, double share) {
   start_ = &start;
   ends_ = &ends;
-  turns_.begin(start, expected);
+  turns_.begin(start, expected, free_nodes_);
   for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
   base_ = kept_;
 }
@@ -277,16 +277,16 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   }
   if (!(softness > 0.0) || !(distance > 0.0)) return;
   const Vector3d n = rho / distance;
-  // The way of the first over the second, less that by which rho turns: with the triangle, or half with each edge.
-  const bool on_triangle = who.kind == PairKind::vertex_triangle;
+  // The way of the first over the second, less that by which rho turns: with a surface, or half with each.
+  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
   Matrix3d turn = Matrix3d::Zero();
-  for (int c = on_triangle ? 1 : 0; c < 4; ++c) {
-    if (weights[c] == 0.0) continue;
-    turn += (on_triangle ? 1.0 : 0.5) * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+  for (int c = 0; c < 4; ++c) {
+    const int own = near.surface.sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
+    const double share = own >= settings_.sheets ? 1.0 : other >= settings_.sheets ? 0.0 : 0.5;
+    if (share * weights[c] != 0.0) turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
   }
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
-  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
   const double mu = settings_.mu(a, b), thickness = settings_.apart(a, b);
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);

@@ -1,6 +1,8 @@
 #include "contact/turns.hpp"
 
 #include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
 
 namespace sim_core {
 
@@ -8,6 +10,10 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 namespace {
+
+// Angle up to which a node's turn counts, and from twice which it does not: cloth that turns by more in a step is
+// stopped on its way, and velocities are no guide.
+constexpr double turn_most = 0.05;
 
 Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
   const Vector3d a = at_node(x, corner[1]) - at_node(x, corner[0]), b = at_node(x, corner[2]) - at_node(x, corner[0]);
@@ -20,7 +26,8 @@ Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
 
 }  // namespace
 
-void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected) {
+void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes) {
+  free_nodes_ = free_nodes;
   start_ = start;
   expected_ = expected;
   ++step_;
@@ -35,6 +42,10 @@ const Matrix3d& Turns::of(const Surface& surface, int node) {
   const int begin = surface.around_begin[node], end = surface.around_begin[node + 1];
   for (int t = begin; t < end; ++t) here.turn += turn_of(surface, surface.around[t]);
   here.turn /= end - begin;
+  if (node < free_nodes_) {
+    const double angle = std::sqrt(std::max(3.0 - here.turn.trace(), 0.0));
+    here.turn = Matrix3d::Identity() + std::clamp(2.0 - angle / turn_most, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
+  }
   return here.turn;
 }
 

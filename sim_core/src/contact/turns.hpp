@@ -6,7 +6,8 @@
 // unlike, but what it carries is as short as cloth is thick, and it is one where the surface moves rigidly.
 //
 // The end of the step is taken as velocities lead there, lest a law that carries by it should have derivatives by all
-// nodes around: what this misses is of the order dt^2, and none of it is left where motion ends.
+// nodes around: what this misses is of the order dt^2, and none of it is left where motion ends. Turns of free nodes
+// that are large fade out.
 #pragma once
 
 #include <Eigen/Core>
@@ -19,8 +20,8 @@ namespace sim_core {
 
 class Turns {
  public:
-  // A step begins at `start` and is expected to end at `expected`.
-  void begin(const Buffer<double>& start, const Buffer<double>& expected);
+  // A step begins at `start` and is expected to end at `expected`. The nodes behind the free ones go there surely.
+  void begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes);
   const Eigen::Matrix3d& of(const Surface& surface, int node);
 
  private:
@@ -32,7 +33,7 @@ class Turns {
   };
   std::vector<Turn> triangles_, nodes_;
   Buffer<double> start_, expected_;
-  int step_ = 0;
+  int step_ = 0, free_nodes_ = 0;
 };
 
 }  // namespace sim_core
