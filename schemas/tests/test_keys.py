@@ -182,8 +182,8 @@ PINNED: dict[str, object] = {
     "split": 0,
     "color_seed": 1423131992,
     "spec": "473d8dc6dc2024b5e3f18fbc9953dca6f325c8f53e87629de6d8277bf2b4c8db",
-    "cloth_simulation": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
-    "cloth_render": "3c2b35606083d3125e50c1f1cfb77725a5802eb33db4d3d035fb21f5ae0a16ac",
+    "cloth_simulation": "789307b6d058b495f6cb68d128e117725f930fd1eeb607576e3139c9ab7a18e8",
+    "cloth_render": "20ac91ca63472c7a6dab29d93cab25bed346a0cf15547c92da2515c5218ad95b",
 }
 
 

@@ -11,6 +11,7 @@ from stickslip_schemas.base import Float
 from stickslip_schemas.cloth import (
     OWN_LOOKS,
     PHYSICAL_AXES,
+    SELF_FRICTION,
     ClothAxes,
     ClothRender,
     ClothSimulation,
@@ -88,7 +89,7 @@ class ClothOnClothSpec(ClothSpec):
     kind: Literal["cloth_on_cloth"]
     axes: ClothOnClothAxes
     self_friction: Float = Field(
-        default=0.5, ge=0, le=10, description="friction coefficient of each of the two with itself"
+        default=SELF_FRICTION, ge=0, le=10, description="friction coefficient of each of the two with itself"
     )
     lamps: dict[OwnName, LampNumbers] = Field(
         default_factory=dict,
