@@ -8,7 +8,7 @@ import pytest
 import stickslip_sim_core
 import yaml
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.certificate import Certificate
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS, Certificate
 from stickslip_schemas.cloth import KERNELS, SELF_FRICTION, ClothSpec, PresetName
 from stickslip_schemas.fabrics import FabricNumbers, Material
 from stickslip_schemas.jobs import JobSpec
@@ -66,10 +66,13 @@ def test_the_figure_of_the_shawl_is_the_cores() -> None:
         TypeAdapter(Swing).validate_python(shawl.SWING_MAX + 1e-9)
 
 
-def test_cloth_feels_itself_by_one_default() -> None:
+def test_cloth_feels_itself_by_one_default_and_by_certified_contact() -> None:
     assert solver.SELF_FRICTION == SELF_FRICTION
     asked = inspect.signature(stickslip_sim_core.drop_and_drag).parameters["self_friction"].default
     assert ClothDragSpec.model_fields["self_friction"].default == asked == SELF_FRICTION
+    for name, preset in CERTIFICATION.items():
+        has = set(CONTACT_PROTOCOLS) & set(preset.protocols)
+        assert has == (set() if name == ROD_PRESET or name.startswith("thesis-") else set(CONTACT_PROTOCOLS)), name
 
 
 def test_the_example_of_clips_is_the_published_test_set() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import ValidationError
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS
 from stickslip_schemas.cloth import SELF_FRICTION
 from stickslip_schemas.kinds import KINDS, AnyJobSpec, job_spec_adapter, stored_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
@@ -127,6 +128,7 @@ def test_dragged_cloth_feels_itself_unless_its_spec_says_null(given: dict[str, A
     assert isinstance(simulation, ClothDragSimulation)
     assert simulation.self_friction == meant
     assert simulation.model_dump(mode="json")["self_friction"] == meant
+    assert spec.certified_protocols == (() if meant is None else CONTACT_PROTOCOLS)
     assert ("feels itself" in spec.cost_group(Stage.simulate, POINT)) == (meant is not None)
     assert "feels itself" not in spec.cost_group(Stage.render, POINT)
 

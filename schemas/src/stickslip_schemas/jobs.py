@@ -138,6 +138,11 @@ class JobSpec(Document):
         """True where no sample may be made without a passing certificate."""
         raise NotImplementedError
 
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Names of protocols that this certificate must have; a certificate without them does not vouch."""
+        return ()
+
     def simulation_settings(self) -> dict[str, Any]:
         """Return the fields of the simulation document that are the same for all samples."""
         raise NotImplementedError

@@ -9,6 +9,7 @@ from stickslip_schemas.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, ListAxis
 from stickslip_schemas.base import Float
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS
 from stickslip_schemas.cloth import (
     OWN_LOOKS,
     PHYSICAL_AXES,
@@ -106,6 +107,11 @@ class ClothDragSpec(ClothSpec):
         description="floors of your own, by the names that the axis `substrate` uses",
         json_schema_extra={"additionalProperties": False},
     )
+
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Those of contact, where the cloth feels itself."""
+        return () if self.self_friction is None else CONTACT_PROTOCOLS
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         """Return what the cost of a sample hangs on; cloth that feels itself costs more."""

@@ -8,6 +8,7 @@ from stickslip_schemas.appearance import LampNumbers
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, ListAxis
 from stickslip_schemas.base import Float
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS
 from stickslip_schemas.cloth import (
     OWN_LOOKS,
     PHYSICAL_AXES,
@@ -97,6 +98,11 @@ class ClothOnClothSpec(ClothSpec):
         description="lamps of your own, by the names that the axis `lighting` uses",
         json_schema_extra={"additionalProperties": False},
     )
+
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Those of contact."""
+        return CONTACT_PROTOCOLS
 
     def simulation_settings(self) -> dict[str, Any]:
         """Return the fields of the simulation document that are the same for all samples."""
