@@ -138,6 +138,6 @@ def test_what_is_known_of_every_pixel_reaches_the_reader(service: Service, tmp_p
         assert vertices[:, 2].min() - 0.01 < depth.min() <= depth.max() < vertices[:, 2].max() + 0.01
         pixels, _ = camera.project(arrays["positions"][0, instant])
         rows, columns = np.nonzero(cloth[frame])
-        assert abs(columns.min() - pixels[:, 0].min()) < 2
-        assert abs(rows.max() - pixels[:, 1].max()) < 2
+        assert abs(columns.min() - pixels[:, 0].min()) < 3  # a corner ends in a tip that is thinner than a pixel
+        assert abs(rows.max() - pixels[:, 1].max()) < 3
     assert np.linalg.norm(known["flow"][0, 0][cloth[0]].astype(float), axis=-1).mean() > 10.0  # it is dragged
