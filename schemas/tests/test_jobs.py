@@ -127,7 +127,8 @@ def test_dragged_cloth_feels_itself_unless_its_spec_says_null(given: dict[str, A
     simulation = spec.simulation(POINT)
     assert isinstance(simulation, ClothDragSimulation)
     assert simulation.self_friction == meant
-    assert simulation.model_dump(mode="json")["self_friction"] == meant
+    named = {} if meant is None else {"self_friction": meant}
+    assert simulation.model_dump(mode="json", include={"self_friction"}) == named
     assert spec.certified_protocols == (() if meant is None else CONTACT_PROTOCOLS)
     assert ("feels itself" in spec.cost_group(Stage.simulate, POINT)) == (meant is not None)
     assert "feels itself" not in spec.cost_group(Stage.render, POINT)
@@ -140,7 +141,7 @@ def test_documents_that_are_older_than_a_field_keep_their_meaning(meant: float |
     stored = json.loads(spec.model_dump_json())
     simulation = json.loads(spec.simulation(POINT).model_dump_json())
     if meant is None:
-        del stored["self_friction"], simulation["self_friction"]
+        del stored["self_friction"]
     assert stored_spec_adapter.validate_python(stored) == spec
     assert stored_spec_adapter.validate_json(json.dumps(stored)) == spec
     slot = {"slot": 0, "sample_key": "0" * 64, "split": 0, "labels": {}}

@@ -52,9 +52,8 @@ class ClothDragSimulation(ClothSimulation):
     """The trajectory of a dragged cloth: all that it depends on besides the build."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
-    self_friction: float | None = Field(
-        default=None, description="null, also in documents that are older than the field: it passes through itself"
-    )
+    # Left out where it is null: keys and splits are then those of documents that are older than the field.
+    self_friction: float | None = Field(default=None, exclude_if=lambda value: value is None)
 
 
 class ClothDragRender(ClothRender):
