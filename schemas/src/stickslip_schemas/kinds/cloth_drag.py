@@ -91,7 +91,7 @@ class ClothDragSpec(ClothSpec):
         description="friction coefficient of the cloth with itself; null: it passes through itself",
         json_schema_extra={
             "x-cost": "against null, 1.1 to 1.2 times the CPU time of a simulation where no parts of the cloth touch "
-            "each other, and up to 1.6 times where it folds over itself, as camel-ponte-roma does"
+            "each other, and up to 1.7 times where it folds over itself, as camel-ponte-roma does"
         },
     )
     lamps: dict[OwnName, LampNumbers] = Field(
