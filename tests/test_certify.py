@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS, CertificateUpload
 from stickslip_schemas.manifest import Manifest
 from stickslip_services.cli import app
 from stickslip_services.client.http import Client
@@ -62,7 +62,7 @@ def test_register_and_list(cli: Callable[..., Result], quick: Path) -> None:
 def test_a_cloth_job_from_refusal_to_dataset(
     cli: Callable[..., Result], server: RunningServer, quick: Path, tmp_path: Path
 ) -> None:
-    """The certificate is the rods' under the name of a preset of cloth: its protocols are real, its subject is not."""
+    """The certificate is the rods' under the name of a preset of cloth; one of its reports stands for contact, too."""
     upload = read_certificate(quick)
     build = upload.certificate.sim_core
     builds = BUILDS.model_copy(update={"sim_core": build})
@@ -75,8 +75,15 @@ def test_a_cloth_job_from_refusal_to_dataset(
         assert words in refused.stderr
 
     made: dict[str, Any] = {"preset": "certified", "extent": "full"}
+    alone = CertificateUpload(certificate=upload.certificate.model_copy(update=made), page=upload.page)
+    of_rods = upload.certificate.protocols
+    made["protocols"] = (*of_rods, *(of_rods[0].model_copy(update={"protocol": name}) for name in CONTACT_PROTOCOLS))
     full = CertificateUpload(certificate=upload.certificate.model_copy(update=made), page=upload.page)
     with Client(server.url) as client:
+        client.register(alone)
+        refused = cli("submit", spec)
+        assert refused.exit_code == 1
+        assert f"it must have {', '.join(CONTACT_PROTOCOLS)}, since cloth touches cloth" in refused.stderr
         entry = client.register(full)
         assert client.certificate(entry.digest) == full.certificate
         assert client.certificate_page(entry.digest) == full.page

@@ -26,7 +26,7 @@ SPEC: dict[str, Any] = {
         "viewpoint": ["calibrated", "left"],
     },
     "preset": "fast",
-    "mesh": 7,
+    "mesh": 9,
     "frames": 3,
     "quality": "draft",
     "samples_per_shard": 3,
@@ -62,10 +62,17 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
     spec = job_spec_adapter.validate_python(SPEC)
     simulation = spec.simulation({"material": "gray-interlock", "mu": 0.4})
     assert isinstance(simulation, ClothDragSimulation)
-    run = drop_and_drag("gray-interlock", 0.4, preset="fast", vertices=7, seed=simulation.seed)
+    run = drop_and_drag(
+        "gray-interlock",
+        0.4,
+        preset="fast",
+        vertices=9,
+        seed=simulation.seed,
+        self_friction=simulation.self_friction,
+    )
     arrays = read_arrays(directory)
     assert arrays["valid"].all()
-    assert arrays["positions"].shape == (4, 300, 49, 3)
+    assert arrays["positions"].shape == (4, 300, 81, 3)
     for slot in range(4):
         assert np.array_equal(arrays["positions"][slot], run.positions.astype(np.float32))
         assert np.array_equal(arrays["rest"][slot], run.rest.astype(np.float32))
@@ -76,6 +83,14 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
         for name in ("bias_side", "landed_side", "bias", "steps", "unconverged_steps", "worst_residual"):
             assert arrays[name][slot] == getattr(run, name), name
     assert len(set(arrays["light_seed"].tolist())) == 2  # one for each viewpoint: textures share a trace
+
+
+def test_cloth_feels_itself_unless_its_spec_says_null(directory: Path) -> None:
+    simulation = job_spec_adapter.validate_python(SPEC).simulation({"material": "gray-interlock", "mu": 0.4})
+    assert isinstance(simulation, ClothDragSimulation)
+    through = drop_and_drag("gray-interlock", 0.4, preset="fast", vertices=9, seed=simulation.seed, self_friction=None)
+    assert through.self_intersections.any()
+    assert not read_arrays(directory)["self_intersections"].any()
 
 
 def test_clips_show_the_cloth_of_their_sample(directory: Path) -> None:
@@ -123,6 +138,6 @@ def test_what_is_known_of_every_pixel_reaches_the_reader(service: Service, tmp_p
         assert vertices[:, 2].min() - 0.01 < depth.min() <= depth.max() < vertices[:, 2].max() + 0.01
         pixels, _ = camera.project(arrays["positions"][0, instant])
         rows, columns = np.nonzero(cloth[frame])
-        assert abs(columns.min() - pixels[:, 0].min()) < 2
-        assert abs(rows.max() - pixels[:, 1].max()) < 2
+        assert abs(columns.min() - pixels[:, 0].min()) < 3  # a corner ends in a tip that is thinner than a pixel
+        assert abs(rows.max() - pixels[:, 1].max()) < 3
     assert np.linalg.norm(known["flow"][0, 0][cloth[0]].astype(float), axis=-1).mean() > 10.0  # it is dragged

@@ -1,16 +1,18 @@
 """What two packages both say: the contract in the schemas, and what the core and the renderer do."""
 
+import inspect
 from pathlib import Path
 from typing import Any
 
 import pytest
 import stickslip_sim_core
+import yaml
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.certificate import Certificate
-from stickslip_schemas.cloth import KERNELS, ClothSpec, PresetName
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS, Certificate
+from stickslip_schemas.cloth import KERNELS, SELF_FRICTION, ClothSpec, PresetName
 from stickslip_schemas.fabrics import FabricNumbers, Material
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.kinds import KINDS, UnknownKindError
+from stickslip_schemas.kinds import KINDS, UnknownKindError, job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
@@ -23,9 +25,11 @@ from stickslip_services.queue.terms import terms_for
 from stickslip_services.testing import BUILDS
 from stickslip_sim_core import character, stage
 from stickslip_sim_core._sim_core import cloth_kernels
+from stickslip_sim_core.cloth import solver
 from stickslip_sim_core.cloth.solver import MU_MAX
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_sim_core.scenes import cloth_sphere, shawl
+from stickslip_training.benchmark.sets import load_set
 from stickslip_training.kinds import dataset_class
 from stickslip_workers.kinds import kind
 
@@ -60,6 +64,23 @@ def test_the_figure_of_the_shawl_is_the_cores() -> None:
     TypeAdapter(Swing).validate_python(shawl.SWING_MAX)
     with pytest.raises(ValidationError, match=f"less than or equal to {shawl.SWING_MAX:g}"):
         TypeAdapter(Swing).validate_python(shawl.SWING_MAX + 1e-9)
+
+
+def test_cloth_feels_itself_by_one_default_and_by_certified_contact() -> None:
+    assert solver.SELF_FRICTION == SELF_FRICTION
+    asked = inspect.signature(stickslip_sim_core.drop_and_drag).parameters["self_friction"].default
+    assert ClothDragSpec.model_fields["self_friction"].default == asked == SELF_FRICTION
+    for name, preset in CERTIFICATION.items():
+        has = set(CONTACT_PROTOCOLS) & set(preset.protocols)
+        assert has == (set() if name == ROD_PRESET or name.startswith("thesis-") else set(CONTACT_PROTOCOLS)), name
+
+
+def test_the_example_of_clips_is_the_published_test_set() -> None:
+    example = yaml.safe_load((ROOT / "examples/thesis-cloth-clips.yaml").read_text())
+    published = load_set("cloth-1").parsed_spec
+    assert isinstance(published, ClothDragSpec)
+    assert published.self_friction is None  # its clips show cloth that passes through itself
+    assert job_spec_adapter.validate_python(example).content_digest == published.content_digest
 
 
 def test_friction_has_one_range() -> None:

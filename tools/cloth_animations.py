@@ -79,7 +79,7 @@ def simulate(folder: Path, names: list[str]) -> None:
     from stickslip_sim_core import drop_and_drag, drop_on_cloth, rotating_sphere, shawl_on_figure
 
     made: Mapping[str, Callable[[str], Any]] = {
-        "cloth-drag": lambda material: drop_and_drag(material, 0.9, vertices=VERTICES, self_friction=0.5, seed=1),
+        "cloth-drag": lambda material: drop_and_drag(material, 0.9, vertices=VERTICES, seed=1),
         "cloth-on-cloth": lambda material: drop_on_cloth(
             material, material, 0.4, vertices=COARSER, frames=SHOWN["cloth-on-cloth"][1], seed=1
         ),

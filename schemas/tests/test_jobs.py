@@ -8,10 +8,14 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import ValidationError
-from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
-from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS
+from stickslip_schemas.cloth import SELF_FRICTION
+from stickslip_schemas.kinds import KINDS, AnyJobSpec, job_spec_adapter, stored_spec_adapter
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.problems import FieldError, field_errors
+from stickslip_schemas.states import Stage
+from stickslip_schemas.tasks import PackTask, SimulateTask
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -112,6 +116,48 @@ def test_bad_specs_are_pointed_at(document: Any, pointer: str, rule: str, value:
     assert error.pointer == pointer
     assert rule in error.rule
     assert value in error.value
+
+
+POINT = {"material": "royal-target", "mu": 0.1, "texture": "dots", "viewpoint": "left"}
+
+
+@pytest.mark.parametrize(("given", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)])
+def test_dragged_cloth_feels_itself_unless_its_spec_says_null(given: dict[str, Any], meant: float | None) -> None:
+    spec = job_spec_adapter.validate_python(CLOTH | given)
+    simulation = spec.simulation(POINT)
+    assert isinstance(simulation, ClothDragSimulation)
+    assert simulation.self_friction == meant
+    named = {} if meant is None else {"self_friction": meant}
+    assert simulation.model_dump(mode="json", include={"self_friction"}) == named
+    assert spec.certified_protocols == (() if meant is None else CONTACT_PROTOCOLS)
+    assert ("feels itself" in spec.cost_group(Stage.simulate, POINT)) == (meant is not None)
+    assert "feels itself" not in spec.cost_group(Stage.render, POINT)
+
+
+@pytest.mark.parametrize("meant", [None, 0.3])
+def test_documents_that_are_older_than_a_field_keep_their_meaning(meant: float | None) -> None:
+    """Cloth of the time before `self_friction` passed through itself: its documents must not take the default."""
+    spec = job_spec_adapter.validate_python(CLOTH | {"self_friction": meant})
+    stored = json.loads(spec.model_dump_json())
+    simulation = json.loads(spec.simulation(POINT).model_dump_json())
+    if meant is None:
+        del stored["self_friction"]
+    assert stored_spec_adapter.validate_python(stored) == spec
+    assert stored_spec_adapter.validate_json(json.dumps(stored)) == spec
+    slot = {"slot": 0, "sample_key": "0" * 64, "split": 0, "labels": {}}
+    assert PackTask.model_validate_json(json.dumps({"spec": stored, "shard": 0, "slots": [slot]})).spec == spec
+    task = SimulateTask.model_validate_json(json.dumps({"simulation": simulation}))
+    assert task.simulation == spec.simulation(POINT)
+
+
+@pytest.mark.parametrize("document", [None, 3, {}, {"kind": []}, {"kind": "silk_fly"}])
+def test_what_is_no_stored_spec_is_refused(document: Any) -> None:
+    with pytest.raises(ValidationError):
+        stored_spec_adapter.validate_python(document)
+
+
+def test_stored_defaults_are_fields() -> None:
+    assert all(set(kind.stored_defaults) <= set(kind.model_fields) for kind in KINDS.values())
 
 
 def test_too_many_points_in_all_are_refused_without_being_made() -> None:

@@ -63,17 +63,15 @@ def test_pinned_keys() -> None:
     assert sample.render.color_seed == PINNED["color_seed"]
     spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": 100.0, "phi0": 1.0, "phi1": 6.0}})
     assert spec.content_digest == PINNED["spec"]
-    (cloth,) = samples(
-        job_spec_adapter.validate_python(
-            {
-                "kind": "cloth_drag",
-                "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
-            }
-        ),
-        BUILDS,
-    )
+    dragged = {
+        "kind": "cloth_drag",
+        "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
+    }
+    (cloth,) = samples(job_spec_adapter.validate_python(dragged), BUILDS)
     assert cloth.simulation_key == PINNED["cloth_simulation"]
     assert cloth.render_key == PINNED["cloth_render"]
+    (through,) = samples(job_spec_adapter.validate_python(dragged | {"self_friction": None}), BUILDS)
+    assert through.simulation_key == PINNED["cloth_through_itself"]
 
 
 def test_simulation_depends_on_physics_and_sim_core_only() -> None:
@@ -182,8 +180,9 @@ PINNED: dict[str, object] = {
     "split": 0,
     "color_seed": 1423131992,
     "spec": "473d8dc6dc2024b5e3f18fbc9953dca6f325c8f53e87629de6d8277bf2b4c8db",
-    "cloth_simulation": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
-    "cloth_render": "3c2b35606083d3125e50c1f1cfb77725a5802eb33db4d3d035fb21f5ae0a16ac",
+    "cloth_simulation": "789307b6d058b495f6cb68d128e117725f930fd1eeb607576e3139c9ab7a18e8",
+    "cloth_through_itself": "f84503926eac24732bab821d09bd056ab61f5b67d962572967717844b5e2e584",
+    "cloth_render": "20ac91ca63472c7a6dab29d93cab25bed346a0cf15547c92da2515c5218ad95b",
 }
 
 

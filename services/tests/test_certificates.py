@@ -6,24 +6,25 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.certificate import Certificate, CertificateUpload
+from sqlalchemy import update
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS, Certificate, CertificateUpload
 from stickslip_schemas.manifest import Manifest
 from stickslip_schemas.states import JobState, Reason
 from stickslip_services.coordinator import make_app
+from stickslip_services.database.tables import certificates
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.validating import validate
 from stickslip_services.settings import Settings
 from stickslip_services.testing import BUILDS, ManualClock, PretendWorker, parsed, rods, serving, show_job
 
-KINDS = ("rod_hang", "cloth_drag")
+KINDS = ("rod_hang", "cloth_drag", "cloth_on_cloth", "cloth_sphere")
 PAGE = "<!doctype html><title>c</title>"
 
 
-def upload(**changes: Any) -> CertificateUpload:
+def upload(*, protocols: tuple[str, ...] = ("stick-slip", *CONTACT_PROTOCOLS), **changes: Any) -> CertificateUpload:
     error = changes.pop("error", 0.001)
-    protocol = {
-        "protocol": "stick-slip",
+    report = {
         "x": "strain",
         "y": "mu",
         "tolerance": 0.01,
@@ -39,7 +40,7 @@ def upload(**changes: Any) -> CertificateUpload:
         "sim_core": BUILDS.sim_core,
         "protocol_sources": "f" * 64,
         "extent": "full",
-        "protocols": [protocol],
+        "protocols": [report | {"protocol": name} for name in protocols],
         "passed": error <= 0.01,
         "environment": {},
     }
@@ -89,6 +90,39 @@ class TestTheRule:
         coordinator.add_certificate(upload(**other))
         with pytest.raises(PresetNotCertifiedError):
             coordinator.submit(cloth(), None)
+
+    @pytest.mark.parametrize("missing", CONTACT_PROTOCOLS)
+    def test_cloth_that_touches_cloth_needs_the_protocols_of_contact(
+        self, coordinator: Coordinator, weaver: PretendWorker, missing: str
+    ) -> None:
+        has = tuple(name for name in ("stick-slip", *CONTACT_PROTOCOLS) if name != missing)
+        added = coordinator.add_certificate(upload(protocols=has))
+        axes = {"material": "gray-interlock", "mu": 0.1, "texture": "dots"}
+        over = parsed(
+            {"kind": "cloth_on_cloth", "axes": axes | {"viewpoint": "left", "substrate_material": "gray-interlock"}}
+        )
+        for touching in (cloth(), cloth(self_friction=0.0), over):
+            with pytest.raises(
+                PresetNotCertifiedError, match=f"it must have {missing}, since .* `self_friction: null`"
+            ):
+                coordinator.submit(touching, None)
+        ball = parsed({"kind": "cloth_sphere", "axes": axes | {"viewpoint": "high", "angular_speed": 1.0}})
+        for alone in (cloth(self_friction=None), ball):
+            assert validate(coordinator.database, alone).certificate == added.digest
+        job = coordinator.submit(cloth(allow_uncertified=True), None)
+        weaver.work()
+        assert manifest_of(coordinator, job).certificate is None
+
+    def test_a_certificate_of_a_time_that_kept_no_protocols_counts_once_it_is_registered_again(
+        self, coordinator: Coordinator, weaver: PretendWorker
+    ) -> None:
+        coordinator.add_certificate(upload())
+        with coordinator.database.write() as connection:
+            connection.execute(update(certificates).values(protocols=""))  # as the migration leaves it
+        assert validate(coordinator.database, cloth()).refusal
+        assert not validate(coordinator.database, cloth(self_friction=None)).refusal
+        coordinator.add_certificate(upload())
+        assert not validate(coordinator.database, cloth()).refusal
 
     def test_the_full_one_that_came_last_stands(
         self, coordinator: Coordinator, weaver: PretendWorker, clock: ManualClock

@@ -13,6 +13,9 @@ from stickslip_schemas.keys import Sha256, canonical_json, content_key
 
 MAX_PAGE_CHARACTERS = 8 * 2**20
 
+CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
+"""What a certificate must have, too, where cloth touches itself or other cloth."""
+
 Numbers = tuple[Float | None, ...]
 
 

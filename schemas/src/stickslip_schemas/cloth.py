@@ -102,6 +102,10 @@ class Own(NamedTuple):
     built_in: tuple[str, ...]
 
 
+SELF_FRICTION = 0.5
+"""Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011] measured none; this is the
+middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
+
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
 """Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""
 

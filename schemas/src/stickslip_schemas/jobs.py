@@ -98,6 +98,8 @@ class JobSpec(Document):
     render_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     variant_axis: ClassVar[str | None] = None
     """The axis whose values differ between renders that can be made together, if there is one."""
+    stored_defaults: ClassVar[Mapping[str, Any]] = {}
+    """By field: its value in a stored spec that is older than the field, where that is not the field's default."""
 
     kind: str
     name: str | None = Field(
@@ -135,6 +137,11 @@ class JobSpec(Document):
     def needs_certificate(self) -> bool:
         """True where no sample may be made without a passing certificate."""
         raise NotImplementedError
+
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Names of protocols that this certificate must have; a certificate without them does not vouch."""
+        return ()
 
     def simulation_settings(self) -> dict[str, Any]:
         """Return the fields of the simulation document that are the same for all samples."""

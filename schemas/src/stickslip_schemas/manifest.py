@@ -21,7 +21,7 @@ from stickslip_schemas.builds import Builds
 from stickslip_schemas.cameras import Camera
 from stickslip_schemas.jobs import JobSpec, Quality
 from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.kinds import AnyJobSpec
+from stickslip_schemas.kinds import StoredJobSpec
 from stickslip_schemas.layout import samples_per_file
 from stickslip_schemas.tasks import FileEntry, ManifestSection, Rejection
 
@@ -93,7 +93,7 @@ class Manifest(Document):
     format: Literal["stickslip-dataset/1", "stickslip-dataset/2"] = "stickslip-dataset/2"
     dataset: str
     version: int = Field(ge=1)
-    spec: AnyJobSpec
+    spec: StoredJobSpec
     spec_digest: Sha256
     builds: Builds
     certificate: Sha256 | None = Field(

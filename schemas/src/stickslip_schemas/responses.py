@@ -8,7 +8,7 @@ from pydantic import Field
 from stickslip_schemas.base import Document, Int
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import ArtifactRef, Sha256
-from stickslip_schemas.kinds import AnyJobSpec
+from stickslip_schemas.kinds import StoredJobSpec
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
 T = TypeVar("T")
@@ -76,13 +76,13 @@ class Job(Document):
 class JobDetail(Job):
     """A job with what was asked for."""
 
-    spec: AnyJobSpec
+    spec: StoredJobSpec
 
 
 class Validation(Document):
     """What a job would be, without making one. `refusal` says why it would be refused now; null: it would not."""
 
-    spec: AnyJobSpec
+    spec: StoredJobSpec
     spec_digest: Sha256
     sample_count: int
     simulation_count: int = Field(description="different simulations; samples that differ in their look share one")

@@ -9,7 +9,7 @@ from pydantic import Field, TypeAdapter, model_validator
 from stickslip_schemas.base import Bool, Document, Float, Int
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.keys import Sha256, referred
-from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
+from stickslip_schemas.kinds import AnyRender, AnySimulation, StoredJobSpec
 from stickslip_schemas.states import Reason
 
 # --- where bytes are ------------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ class PackTask(Document):
     """Make the files of shard `shard` of every array."""
 
     stage: Literal["pack"] = "pack"
-    spec: AnyJobSpec
+    spec: StoredJobSpec
     shard: Int = Field(ge=0)
     slots: tuple[PackSlot, ...] = Field(min_length=1)
 
@@ -158,7 +158,7 @@ class PublishTask(Document):
     """Write the metadata and the manifest of a dataset version; its result is the commit."""
 
     stage: Literal["publish"] = "publish"
-    spec: AnyJobSpec
+    spec: StoredJobSpec
     dataset: str
     version: Int = Field(ge=1)
     builds: Builds

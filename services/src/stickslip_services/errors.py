@@ -13,6 +13,8 @@ StickslipError
 └── MissingArtifactError        500
 """
 
+from collections.abc import Sequence
+
 from stickslip_schemas.problems import FieldError
 
 
@@ -43,12 +45,18 @@ class KindNotAvailableError(StickslipError):
 class PresetNotCertifiedError(StickslipError):
     """No certificate vouches for the preset with the workers' build."""
 
-    def __init__(self, preset: str, sim_core: str) -> None:
+    def __init__(self, preset: str, sim_core: str, missing: Sequence[str] = ()) -> None:
         self.preset = preset
         self.rule = (
             f"run `stickslip certify --preset {preset}` with the workers' build {sim_core[:12]} (a few minutes; quick "
             "certificates do not count), or write `allow_uncertified: true` in the spec"
         )
+        if missing:
+            self.rule = (
+                f"it must have {', '.join(missing)}, since cloth touches cloth: {self.rule}. Certificates of the "
+                "thesis's presets have no protocols of contact: take another preset, or in a spec of `cloth_drag` "
+                "write `self_friction: null`"
+            )
         super().__init__(f"preset {preset!r} has no passing certificate: {self.rule}")
 
 

@@ -8,9 +8,11 @@ from stickslip_schemas.appearance import LampNumbers
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, ListAxis
 from stickslip_schemas.base import Float
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS
 from stickslip_schemas.cloth import (
     OWN_LOOKS,
     PHYSICAL_AXES,
+    SELF_FRICTION,
     ClothAxes,
     ClothRender,
     ClothSimulation,
@@ -88,7 +90,7 @@ class ClothOnClothSpec(ClothSpec):
     kind: Literal["cloth_on_cloth"]
     axes: ClothOnClothAxes
     self_friction: Float = Field(
-        default=0.5, ge=0, le=10, description="friction coefficient of each of the two with itself"
+        default=SELF_FRICTION, ge=0, le=10, description="friction coefficient of each of the two with itself"
     )
     lamps: dict[OwnName, LampNumbers] = Field(
         default_factory=dict,
@@ -96,6 +98,11 @@ class ClothOnClothSpec(ClothSpec):
         description="lamps of your own, by the names that the axis `lighting` uses",
         json_schema_extra={"additionalProperties": False},
     )
+
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Those of contact."""
+        return CONTACT_PROTOCOLS
 
     def simulation_settings(self) -> dict[str, Any]:
         """Return the fields of the simulation document that are the same for all samples."""

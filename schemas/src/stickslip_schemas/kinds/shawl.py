@@ -8,6 +8,7 @@ from pydantic import Field
 from stickslip_schemas.arrays import NAN, ArrayLayout
 from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
 from stickslip_schemas.base import Int
+from stickslip_schemas.certificate import CONTACT_PROTOCOLS
 from stickslip_schemas.cloth import (
     OWN_LOOKS,
     PHYSICAL_AXES,
@@ -106,6 +107,11 @@ class ShawlSpec(ClothSpec):
         le=161,
         description="vertices along a side of the mesh; 31 or more show folds",
     )
+
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Those of contact."""
+        return CONTACT_PROTOCOLS
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of shawls."""

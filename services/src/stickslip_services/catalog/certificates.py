@@ -24,16 +24,25 @@ class StoredCertificate:
     page: Sha256
 
 
-def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Sha256 | None:
-    """Return the digest of the full certificate of a preset and a build that was registered last if it passed."""
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """The full certificate of a preset and a build that was registered last, where it passed."""
+
+    digest: Sha256
+    protocols: frozenset[str]
+    """Names of those that it has."""
+
+
+def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Standing | None:
+    """Return the full certificate of a preset and a build that was registered last if it passed."""
     columns = certificates.c
     row = connection.execute(
-        select(columns.digest, columns.passed)
+        select(columns.digest, columns.passed, columns.protocols)
         .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
         .order_by(columns.created_at.desc(), columns.seq.desc())
         .limit(1)
     ).one_or_none()
-    return row.digest if row is not None and row.passed else None
+    return Standing(row.digest, frozenset(row.protocols.split())) if row is not None and row.passed else None
 
 
 def store_certificate(store: Store, upload: CertificateUpload) -> StoredCertificate:
@@ -50,9 +59,10 @@ def insert_certificate(
     connection: Connection, upload: CertificateUpload, stored: StoredCertificate, now: float
 ) -> CertificateEntry:
     """Register a certificate. One that is there already stays as it is, but it was measured last again."""
+    protocols = " ".join(report.protocol for report in upload.certificate.protocols)
     if _find(connection, stored.digest) is not None:
         known = certificates.c.digest == stored.digest
-        connection.execute(update(certificates).where(known).values(created_at=now))
+        connection.execute(update(certificates).where(known).values(created_at=now, protocols=protocols))
     else:
         connection.execute(
             insert(certificates).values(
@@ -63,6 +73,7 @@ def insert_certificate(
                 sim_core=upload.certificate.sim_core,
                 extent=upload.certificate.extent,
                 passed=upload.certificate.passed,
+                protocols=protocols,
                 created_at=now,
             )
         )

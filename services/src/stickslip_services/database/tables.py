@@ -278,6 +278,7 @@ certificates = Table(
     Column("sim_core", String, nullable=False),
     Column("extent", String, nullable=False),
     Column("passed", Boolean, nullable=False),
+    Column("protocols", String, nullable=False, server_default=""),  # names, with spaces between
     Column("created_at", Float, nullable=False),
     Index("ix_certificates_preset_sim_core", "preset", "sim_core"),
     sqlite_autoincrement=True,

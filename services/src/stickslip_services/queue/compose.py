@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, insert, select
 from stickslip_schemas.builds import Builds
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import Sha256
-from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds import stored_spec_adapter
 from stickslip_schemas.manifest import section_samples
 from stickslip_schemas.samples import dataset_id
 from stickslip_schemas.states import Stage, TaskState
@@ -242,4 +242,4 @@ def reserve_version(connection: Connection, task: StoredTask) -> None:
 
 def _job_spec(connection: Connection, job: int) -> tuple[Any, Builds]:
     row = connection.execute(select(jobs.c.spec, jobs.c.builds).where(jobs.c.seq == job)).one()
-    return job_spec_adapter.validate_json(row.spec), Builds.model_validate_json(row.builds)
+    return stored_spec_adapter.validate_json(row.spec), Builds.model_validate_json(row.builds)

@@ -14,7 +14,7 @@ from stickslip_schemas import tracing
 from stickslip_schemas.certificate import CertificateUpload
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import Sha256
-from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds import stored_spec_adapter
 from stickslip_schemas.responses import CertificateEntry, JobDetail
 from stickslip_schemas.states import JobState, Reason
 from stickslip_schemas.store import Store, is_unavailable, open_store
@@ -473,7 +473,7 @@ class Coordinator:
         with self.database.read() as connection:
             waiting = unplanned_jobs(connection)
         for row in waiting:
-            spec = job_spec_adapter.validate_json(row.spec)
+            spec = stored_spec_adapter.validate_json(row.spec)
             with self.database.read() as connection:
                 terms: Terms | None = None
                 refusal, reason = "", Reason.waiting_for_worker

@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, func, insert, select, update
 from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.keys import sha256
-from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds import stored_spec_adapter
 from stickslip_schemas.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 from stickslip_schemas.states import JobState, Reason, Stage, TaskState
 
@@ -199,7 +199,7 @@ def show_job(
     """Return a job with its spec."""
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
     return JobDetail(
-        **dict(_shown(connection, [row], workers, frames)[0]), spec=job_spec_adapter.validate_json(row.spec)
+        **dict(_shown(connection, [row], workers, frames)[0]), spec=stored_spec_adapter.validate_json(row.spec)
     )
 
 

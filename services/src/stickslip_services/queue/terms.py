@@ -15,12 +15,14 @@ def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
 
     Raise KindNotAvailableError where no worker makes the kind, UnknownKindError where nobody registered its class, and
     PresetNotCertifiedError where the spec needs a certificate and its preset has none that passed for the workers'
-    build.
+    build, with all protocols that the spec needs.
     """
     builds = builds_for(connection, registered(spec).kind)
     if builds is None:
         return None
-    certificate = standing_certificate(connection, spec.certified_preset, builds.sim_core)
+    standing = standing_certificate(connection, spec.certified_preset, builds.sim_core)
+    missing = [] if standing is None else [name for name in spec.certified_protocols if name not in standing.protocols]
+    certificate = None if standing is None or missing else standing.digest
     if certificate is None and spec.needs_certificate:
-        raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core)
+        raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core, missing)
     return Terms(builds, certificate)

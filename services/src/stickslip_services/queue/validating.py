@@ -3,7 +3,7 @@
 from sqlalchemy import Connection, func, select
 from stickslip_schemas.counting import count
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds import stored_spec_adapter
 from stickslip_schemas.layout import bytes_estimate
 from stickslip_schemas.responses import Validation
 from stickslip_schemas.states import TaskState
@@ -75,4 +75,4 @@ def _compression(connection: Connection, kind: str) -> float | None:
         .order_by(dataset_versions.c.created_at.desc())
         .limit(1)
     ).one_or_none()
-    return None if row is None else row.bytes / bytes_estimate(job_spec_adapter.validate_json(row.spec))
+    return None if row is None else row.bytes / bytes_estimate(stored_spec_adapter.validate_json(row.spec))

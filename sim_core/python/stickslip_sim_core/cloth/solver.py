@@ -97,6 +97,11 @@ def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rota
     return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
 
 
+SELF_FRICTION = 0.5
+"""Coefficient of friction of a cloth with itself in a scene, unless another is asked for: the middle of the two, of
+cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
+
+
 @dataclass(frozen=True, eq=False)
 class SelfContact:
     """How cloth feels itself and other cloth: nothing crosses, with exact Coulomb friction.

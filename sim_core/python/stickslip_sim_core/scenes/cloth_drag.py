@@ -6,7 +6,7 @@ from stickslip_sim_core import stage
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Cloth, SelfContact, plane
+from stickslip_sim_core.cloth.solver import SELF_FRICTION, Cloth, SelfContact, plane
 
 
 def drop_and_drag(
@@ -18,7 +18,7 @@ def drop_and_drag(
     frames: int = stage.FRAMES,
     seed: int = 0,
     mesh: meshes.Mesh | None = None,
-    self_friction: float | None = None,
+    self_friction: float | None = SELF_FRICTION,
     kernel: str | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> stage.DropAndDrag:

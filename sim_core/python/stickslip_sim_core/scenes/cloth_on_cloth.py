@@ -11,7 +11,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import THICKNESS, Cloth, SelfContact, plane
+from stickslip_sim_core.cloth.solver import SELF_FRICTION, THICKNESS, Cloth, SelfContact, plane
 
 BEHIND, LENGTH, WIDTH = 0.15, 0.6, 0.3
 """Of the stretched cloth [m]: how far behind the holders it begins, and its sides along x and y."""
@@ -21,9 +21,6 @@ STRETCH = 0.01
 
 FLOOR_FRICTION = 0.5
 """Of the stretched cloth with the floor below it."""
-
-SELF_FRICTION = 0.5
-"""Of each cloth with itself, unless another is asked for."""
 
 
 def drop_on_cloth(

@@ -12,7 +12,7 @@ from stickslip_sim_core.character import bones, figure
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, SelfContact, Surface, plane
+from stickslip_sim_core.cloth.solver import GRAVITY, SELF_FRICTION, Body, Cloth, SelfContact, Surface, plane
 
 NECKLINE, HEM, ANGLE = 0.095, 0.5, 5.3
 """The shawl is cut as a part of a ring: its radii inside and outside [m], and its angle [rad]."""
@@ -20,9 +20,6 @@ NECKLINE, HEM, ANGLE = 0.095, 0.5, 5.3
 APEX, SLOPE = 0.70, 0.4
 """It starts as part of a cone about the neck, open in front: how high the apex is [m], and how steep its sides are
 [rad]."""
-
-SELF_FRICTION = 0.5
-"""Of the shawl with itself, unless another is asked for."""
 
 SWING_MAX = 2.0
 """Largest size of the figure's motion; 1 is usual."""

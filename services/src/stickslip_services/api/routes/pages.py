@@ -15,7 +15,7 @@ from fastapi.responses import RedirectResponse, StreamingResponse
 from sqlalchemy import Connection
 from stickslip_schemas.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds import stored_spec_adapter
 from stickslip_schemas.responses import Dataset, DatasetVersion, JobDetail
 from stickslip_schemas.samples import SPLITS, grid
 from stickslip_schemas.states import JobState, TaskState
@@ -146,7 +146,7 @@ def get_job_map(job_id: str, coordinator: CoordinatorDep) -> Response:
     """Show the grid of a job as maps that fill."""
     with coordinator.database.read() as connection:
         row = find_job(connection, job_id)
-        spec = job_spec_adapter.validate_json(row.spec)
+        spec = stored_spec_adapter.validate_json(row.spec)
         if spec.sample_count > MOST_SAMPLES:
             return _page("map.html", maps=None, count=spec.sample_count)
         samples = list_samples(connection, row.seq, PageRequest(MOST_SAMPLES, None), None).items
@@ -160,7 +160,7 @@ def change_job(job_id: str, verb: str, coordinator: CoordinatorDep) -> Response:
     """Pause, resume or cancel a job, or submit its spec again; answer with where to go."""
     if verb == "resubmit":
         with coordinator.database.read() as connection:
-            spec = job_spec_adapter.validate_json(find_job(connection, job_id).spec)
+            spec = stored_spec_adapter.validate_json(find_job(connection, job_id).spec)
         made = coordinator.submit(spec, None)
         assert isinstance(made, JobDetail)  # there is no key, and so no replay
         job_id = made.id
