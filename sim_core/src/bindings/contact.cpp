@@ -57,8 +57,7 @@ void bind_contact(nb::module_& m) {
       [](bool edges, const Four& x, const Four& to, double keep, double most, double floor) {
         return safe_share(kind_of(edges), four(x), four(to), {keep, most, floor});
       },
-      "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0,
-      "Internal: see contact/closest.hpp.");
+      "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0, "Internal: see contact/closest.hpp.");
   m.def(
       "contact_candidates",
       [](const Triangles& triangles, const Points3& x, double reach) {

@@ -17,8 +17,6 @@ constexpr double parallel = 1e-14;
 // Of what is left of the distance, so much is advanced at a time, at most; and how often at most.
 constexpr double advance_share = 0.9;
 constexpr int advances_max = 1000;
-// Below the floor so much of a distance is left.
-constexpr double slowly = 0.99;
 
 Eigen::Vector2d closest_on_segments(const FourPoints& x) {
   const Vector3d u = x[1] - x[0], v = x[3] - x[2], r = x[0] - x[2];
@@ -79,7 +77,7 @@ double crossing_squared(const FourPoints& x) {
 }
 
 double Leaves::of(double distance) const {
-  return std::max(share * std::min(distance, most), std::min(slowly * distance, floor));
+  return std::max(share * std::min(distance, most), std::min(distance, floor));
 }
 
 double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, const Leaves& leaves) {

@@ -34,9 +34,10 @@ double crossing_squared(const FourPoints& x);
 
 // What a motion may leave of a distance, m.
 struct Leaves {
-  double share;        // of the distance
-  double most;         // m: or of this, where that is less
-  double floor = 0.0;  // m: below this a motion takes little: else many would take a distance to rounding, and past it
+  double share;  // of the distance
+  double most;   // m: or of this, where that is less
+  double floor =
+      0.0;  // m: below this nothing is taken: else many motions would take a distance to rounding, and past it
 
   double of(double distance) const;
 };

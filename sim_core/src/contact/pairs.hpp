@@ -65,8 +65,8 @@ class Pairs {
   void look(const Buffer<double>& x, double share, Buffer<double>& residual);
   // Adds a share of the stiffness by which pairs hold the free nodes, N/m.
   void add_stiffness(double share, std::vector<double>& stiffness) const;
-  // After the first look of a step: pairs that have a force and would open by no more than a prediction on straight lines
-  // does over a curved cloth bear in the first linear problem. Returns whether there are any.
+  // After the first look of a step: pairs that have a force and would open by no more than a prediction on straight
+  // lines does over a curved cloth bear in the first linear problem. Returns whether there are any.
   bool resume();
   // Counts the forces by which the law is missed, if gaps and slips are held with this stiffness, N/m.
   void count_errors(double stiffness, Norms& norms) const;

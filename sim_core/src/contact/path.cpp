@@ -12,7 +12,7 @@ using Eigen::Array3d;
 // Of the distance of a pair, or of the thickness where that is less, what a motion leaves: what slides past each other
 // comes from far to about the thickness.
 constexpr double keep = 0.5;
-// Thicknesses below which little is taken.
+// Thicknesses below which nothing comes nearer.
 constexpr double floor_share = 0.01;
 // Rounds in which nodes are capped one by one; after them all are by the same share.
 constexpr int rounds_max = 8;
