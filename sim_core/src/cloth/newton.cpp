@@ -26,7 +26,10 @@ constexpr double smooth_tolerance = 1e-6, smooth_reach = 4.0;
 // Where the matrix of a convex energy brings the squares of forces down by less than this factor in a whole
 // correction, the exact one takes its place until they grow.
 constexpr double slow = 0.25;
-// Such an attempt is given up where the squares of forces have grown by so much.
+// An exact attempt with pairs goes on for as many iterations again where it has brought the squares of forces down by
+// so much.
+constexpr double nearly = 1e-8;
+// An attempt by way of the smoothed law is given up where the squares of forces have grown by so much.
 constexpr double diverged = 1e8;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
 constexpr double length_tolerance = 2e-9;
@@ -143,7 +146,9 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   const int hops = smoothly ? smooth_hops_max : hops_max;
   double last_share = 0.0;
   strained_ = false;
-  for (int iteration = 0; iteration < iterations; ++iteration) {
+  const bool goes_on = pairs && !smoothly && iterations < settings_.newton_max;
+  for (int iteration = 0; iteration < (goes_on ? 2 : 1) * iterations; ++iteration) {
+    if (iteration >= iterations && !(least <= nearly * first)) break;
     contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && !smoothly && norms.largest <= settings_.tolerance && arrived(x)) break;

@@ -14,7 +14,7 @@ constexpr double loose = 0.1;
 // Iterations up to which steps may grow again, of those that a step may take.
 constexpr double easy = 0.6;
 // Times the patience where pairs matter: then halves of a step are hardly easier than the whole.
-constexpr double near_pairs = 5.0;
+constexpr double near_pairs = 2.5;
 // Iterations by way of a smoothed law.
 constexpr int smooth_iterations = 100;
 
