@@ -28,7 +28,7 @@ constexpr double smooth_tolerance = 1e-6, smooth_reach = 4.0;
 constexpr double slow = 0.25;
 // An exact attempt with pairs goes on for as many iterations again where it has brought the squares of forces down by
 // so much.
-constexpr double nearly = 1e-8;
+constexpr double nearly = 1e-4;
 // An attempt by way of the smoothed law is given up where the squares of forces have grown by so much.
 constexpr double diverged = 1e8;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
