@@ -3,7 +3,8 @@
     python sim_core/tests/test_golden.py           # compare with golden.json
     python sim_core/tests/test_golden.py --record  # after a change meant to change results: say why
 
-Cloth runs with the kernel level named, so that the level `baseline` gives the same bits on any x86-64 processor.
+Cloth runs with the kernel level named, so that the level `baseline` gives the same bits on any x86-64 processor. So do
+rods of varying curvature with BLAS of the oldest kernels: they are interpolated by matrix products.
 """
 
 import argparse
@@ -11,6 +12,8 @@ import hashlib
 import json
 import os
 import platform
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,6 +105,18 @@ def general_rods() -> str:
     return digest(found.centerline, found.curvature, found.energy, found.stable)
 
 
+def general_rods_anywhere() -> str:
+    """Solve these in a process whose BLAS does not look what the processor can do."""
+    return subprocess.run(
+        [sys.executable, "-c", "import test_golden; print(test_golden.general_rods())"],
+        cwd=Path(__file__).parent,
+        env={**os.environ, "OPENBLAS_CORETYPE": "Nehalem"},
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.strip()
+
+
 CLOTH: dict[str, Callable[[], str]] = {
     "plane and sphere, unstructured": lambda: fallen(
         "gray-interlock", meshes.unstructured(0.1, 0.1, 0.01, 3), box_below=False
@@ -112,7 +127,7 @@ CLOTH: dict[str, Callable[[], str]] = {
     "drop and drag, 21, touchdown": lambda: dragged("11oz-black-denim", 1.2, 21, 30, "certified"),
     "drop and drag, 15, fast": lambda: dragged("camel-ponte-roma", 0.3, 15, 60, "fast"),
 }
-RODS: dict[str, Callable[[], str]] = {"rods": rods, "general rods": general_rods}
+RODS: dict[str, Callable[[], str]] = {"rods": rods, "general rods": general_rods_anywhere}
 
 
 def results(kernel: str) -> dict[str, str]:
