@@ -21,7 +21,7 @@ SPEC: dict[str, Any] = {
     },
     "materials": {"felt": {"density": 0.3, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}},
     "preset": "fast",
-    "mesh": 13,
+    "mesh": 19,
     "frames": 3,
     "quality": "draft",
     "ground_truth": ["segmentation"],
