@@ -68,7 +68,7 @@ class Newton {
   PairData pair_rows_{};
   bool strained_ = false;  // whether the last correction was stopped short or took all rounds
   Buffer<double> trial_, wanted_, best_, ends_;
-  std::vector<double> own_stiffness_;
+  std::vector<double> own_stiffness_;  // of contacts, without that of pairs, N/m
   Buffer<float> change_, work_, image_, force_;
 };
 
