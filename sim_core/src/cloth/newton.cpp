@@ -122,9 +122,9 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   factors.of(problem.dt);
   evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = contact_share * assembly_.own_stiffness(i);
-  if (pairs) pairs->smoothing = smoothly ? smooth_from * pairs->near.thickness : 0.0;
   own_stiffness_ = contact.stiffness;
   if (pairs) {
+    pairs->smoothing = smoothly ? smooth_from * pairs->near.thickness : 0.0;
     Buffer<double> expected = ends_;
     for (int i = 0; i < free_nodes; ++i) {
       at_node(expected, i) = at_node(problem.start, i) + problem.dt * at_node(problem.velocity, i);

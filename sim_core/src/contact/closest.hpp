@@ -32,12 +32,12 @@ inline Eigen::Vector3d between_closest(const Eigen::Vector4d& weights, const Fou
 // Squared sine of the angle of the two segments.
 double crossing_squared(const FourPoints& x);
 
-// What a motion may leave of a distance, m.
+// What a motion may leave of a distance, m: a share of it, or of `most` where that is less. Below `floor` it takes
+// nothing, else many motions would take a distance to rounding, and past it.
 struct Leaves {
-  double share;  // of the distance
-  double most;   // m: or of this, where that is less
-  double floor =
-      0.0;  // m: below this nothing is taken: else many motions would take a distance to rounding, and past it
+  double share;
+  double most;
+  double floor = 0.0;
 
   double of(double distance) const;
 };

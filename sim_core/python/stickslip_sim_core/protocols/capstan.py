@@ -9,7 +9,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import THICKNESS, Cloth, SelfContact, Surface, cylinder
+from stickslip_sim_core.cloth.solver import THICKNESS, Body, Cloth, SelfContact, Surface, cylinder
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.reference import master_curves
 
@@ -88,6 +88,9 @@ class Strip:
         facets: Of a cylinder of triangles, all around; None: the cylinder is round.
         of_cloth: These triangles are another cloth, all of whose vertices are held.
         width: In cells.
+
+    Raises:
+        ValueError: The cylinder is of cloth, and `facets` is None.
     """
 
     def __init__(
@@ -108,26 +111,34 @@ class Strip:
         along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * cell
         self.held = np.flatnonzero(along > along.max() - 0.1 * cell)
         light = np.flatnonzero(along < along.min() + 0.1 * cell)
-        covered = facets is not None and of_cloth
-        surfaces = [] if facets is None or covered else [tube(facets, width * cell, mu)]
         parts, self.below = [mesh], np.empty((0, 3))
-        if facets is not None and of_cloth:
+        surfaces: list[Surface] = []
+        self.bodies: list[Body] = []
+        if of_cloth:
+            if facets is None:
+                raise ValueError("facets: must be a number where the cylinder is of cloth, got None")
             sheet, self.below = cover(facets, (width + 2) * cell)
             parts.append(sheet)
-        self.bodies = [cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])] if facets is None else []
+            apart = 0.1
+        elif facets is None:
+            self.bodies.append(cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
+            apart = 0.0
+        else:
+            surfaces.append(tube(facets, width * cell, mu))
+            apart = 0.01
         self.cloth = Cloth(
             meshes.together(*parts),
             isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT),
             preset,
             held=np.append(self.held, len(mesh.rest) + np.arange(len(self.below))),
-            self_contact=SelfContact(mu) if covered else None,
+            self_contact=SelfContact(mu) if of_cloth else None,
             surfaces=surfaces,
             force_scale=FORCE_SHARE * LIGHT * cell,
         )
         self.breadth = width * cell
         self.cloth.gravity[:] = 0.0
         self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
-        clearance = RADIUS + (0.0 if facets is None else (0.1 if covered else 0.01) * THICKNESS)
+        clearance = RADIUS + apart * THICKNESS
         angle = np.clip(along / RADIUS, 0.0, WRAP)
         beyond = along - RADIUS * angle
         self.start = np.column_stack(
