@@ -45,7 +45,7 @@ class Running:
         self.join()
 
     def join(self) -> None:
-        self._thread.join(timeout=30)
+        self._thread.join(timeout=120)
         assert not self._thread.is_alive()
 
 

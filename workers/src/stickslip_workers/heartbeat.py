@@ -10,6 +10,9 @@ from stickslip_workers.leases import LeaseBook
 
 log = logging.getLogger(__name__)
 
+LAST_BEAT_SECONDS = 5.0
+"""How long a heartbeat that is under way may take when it is told to stop."""
+
 
 class HeartbeatThread(threading.Thread):
     """Beats three times a lease. A daemon: it never keeps the process alive."""
@@ -24,8 +27,9 @@ class HeartbeatThread(threading.Thread):
         """Set when the coordinator does not know the session any more; the thread ends then."""
 
     def stop(self) -> None:
-        """Beat no more."""
+        """Beat no more. A beat that is under way may end first: its connection is about to be closed."""
         self._ended.set()
+        self.join(LAST_BEAT_SECONDS)
 
     def run(self) -> None:
         """Beat until told to stop."""
