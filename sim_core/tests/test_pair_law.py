@@ -8,7 +8,7 @@ from stickslip_sim_core import _sim_core as core
 
 Floats = NDArray[np.float64]
 
-K, KAPPA = 3.0, 40.0
+K, KAPPA, LAMBDA = 3.0, 20.0, 40.0
 OPEN, SLIP, STICK = 0, 1, 2
 
 
@@ -19,9 +19,15 @@ def frame(seed: int) -> tuple[Floats, Floats, Floats]:
 
 
 def law(
-    gap: float, n: Floats, slip: Floats, force: Floats, mu: float, kappa: float = KAPPA, smoothing: float = 0.0
+    gap: float,
+    n: Floats,
+    slip: Floats,
+    force: Floats,
+    mu: float,
+    proximal: tuple[float, float] = (KAPPA, LAMBDA),
+    smoothing: float = 0.0,
 ) -> tuple[int, Floats, Floats, Floats, float]:
-    found: tuple[int, Floats, Floats, Floats, float] = core.pair_law(gap, n, slip, force, mu, K, kappa, smoothing)
+    found: tuple[int, Floats, Floats, Floats, float] = core.pair_law(gap, n, slip, force, mu, K, *proximal, smoothing)
     return found
 
 
@@ -81,9 +87,9 @@ def test_sticking_row() -> None:
     gap, slip = -0.01, 0.02 * t - 0.01 * s
     mode, stiffness, symmetric, force, _ = law(gap, n, slip, 2.0 * n, 0.5)
     assert mode == STICK
-    assert stiffness == pytest.approx(KAPPA * np.eye(3))
+    assert stiffness == pytest.approx(KAPPA * np.outer(n, n) + LAMBDA * (np.outer(t, t) + np.outer(s, s)))
     assert symmetric == pytest.approx(stiffness)
-    assert force == pytest.approx(-KAPPA * (gap * n + slip))
+    assert force == pytest.approx(-KAPPA * gap * n - LAMBDA * slip)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -158,7 +164,7 @@ def test_smoothed_row_is_newtons(seed: int) -> None:
     mu, epsilon, gap = 0.4, 10.0 ** rng.uniform(-4.0, -1.0), 0.1 * rng.normal()
     force = 2.0 * rng.uniform() * n + 0.3 * t + 0.2 * s
     slip = 0.2 * rng.normal() * t + 0.2 * rng.normal() * s
-    _, stiffness, symmetric, rhs, error = law(gap, n, slip, force, mu, 1e12, epsilon)
+    _, stiffness, symmetric, rhs, error = law(gap, n, slip, force, mu, (1e12, 1e12), epsilon)
     at = smoothed_missed(gap, n, slip, force, mu, epsilon)
     assert error == pytest.approx(at @ at)
     v = 0.01 * rng.normal(size=3)

@@ -218,7 +218,7 @@ def feet(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order=
     Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see contact/patches.hpp.
     """
 
-def pair_law(gap: float, normal: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], slip: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], force: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], mu: float, stiffness: float, proximal: float, smoothing: float = 0.0) -> tuple[int, Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float]:
+def pair_law(gap: float, normal: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], slip: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], force: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], mu: float, stiffness: float, along: float, across: float, smoothing: float = 0.0) -> tuple[int, Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float]:
     """
     Internal: mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.
     """

@@ -108,12 +108,12 @@ void bind_contact(nb::module_& m) {
   m.def(
       "pair_law",
       [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force,
-         double mu, double stiffness, double proximal, double smoothing) {
-        const PairSight sight{gap, normal, slip, force, mu, stiffness, proximal, smoothing};
+         double mu, double stiffness, double along, double across, double smoothing) {
+        const PairSight sight{gap, normal, slip, force, mu, stiffness, along, across, smoothing};
         const PairRow row = pair_row(sight);
         return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(sight));
       },
-      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "proximal"_a, "smoothing"_a = 0.0,
+      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a, "smoothing"_a = 0.0,
       "Internal: mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.");
 }
 

@@ -104,6 +104,12 @@ double Assembly::own_stiffness(int node) const {
   return diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
 }
 
+Eigen::Matrix3d Assembly::own_block(int node) const {
+  const Eigen::Map<const Eigen::Matrix3f, 0, Eigen::OuterStride<4>> block(&blocks_[12L * membrane_diagonal_[node]]);
+  const double alike = diagonal_[node] + scalars_[bending_diagonal_[node]];
+  return alike * Eigen::Matrix3d::Identity() + block.cast<double>();
+}
+
 ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbers) {
   numbers.blocks.assign(blocks_.size(), 0.0f);
   kernel.membrane(membrane_.data(), x.data(), unused_.data(), numbers.blocks.data(), true);

@@ -50,6 +50,8 @@ class Assembly {
   void clear_diagonal();
   // Mean of a node's block on the diagonal, N/m.
   double own_stiffness(int node) const;
+  // That block, N/m.
+  Eigen::Matrix3d own_block(int node) const;
 
   // K's neighbour that the factor is of: the positive part of the stress, and the plate element that couples six nodes
   // in place of twelve.

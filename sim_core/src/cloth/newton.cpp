@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "math/stopwatch.hpp"
 
@@ -26,9 +27,10 @@ constexpr double smooth_tolerance = 1e-6, smooth_reach = 4.0;
 // Where the matrix of a convex energy brings the squares of forces down by less than this factor in a whole
 // correction, the exact one takes its place until they grow.
 constexpr double slow = 0.25;
-// An exact attempt with pairs goes on for as many iterations again where it has brought the squares of forces down by
-// so much.
+// An attempt with pairs that has brought the squares of forces down by so much goes on while it halves them in so many
+// iterations, up to so many times as long.
 constexpr double nearly = 1e-4;
+constexpr int halving_iterations = 15, longest = 4;
 // An attempt by way of the smoothed law is given up where the squares of forces have grown by so much.
 constexpr double diverged = 1e8;
 // A gap or a slip of a pair that counts as much as the tolerance does, m.
@@ -129,7 +131,9 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     for (int i = 0; i < free_nodes; ++i) {
       at_node(expected, i) = at_node(problem.start, i) + problem.dt * at_node(problem.velocity, i);
     }
-    pairs->begin(problem.start, ends_, expected, contact.stiffness, contact_share);
+    std::vector<Eigen::Matrix3d> own(free_nodes);
+    for (int i = 0; i < free_nodes; ++i) own[i] = assembly_.own_block(i);
+    pairs->begin(problem.start, ends_, expected, std::move(own));
   }
   Norms norms = look(problem, x);
   if (pairs) pairs->mark_best();
@@ -140,15 +144,15 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   std::fill(window, window + 4, norms.squared);
   const double first = norms.squared;
   trial_ = best_ = x;
-  double least = norms.squared;
-  int strained = 0;
+  double least = norms.squared, halved = least;
+  int strained = 0, halved_at = 0;
   const bool convex = pairs && assembly_.definite;
   const int hops = smoothly ? smooth_hops_max : hops_max;
   double last_share = 0.0;
   strained_ = false;
-  const bool goes_on = pairs && !smoothly && iterations < settings_.newton_max;
-  for (int iteration = 0; iteration < (goes_on ? 2 : 1) * iterations; ++iteration) {
-    if (iteration >= iterations && !(least <= nearly * first)) break;
+  for (int iteration = 0; iteration < (pairs ? longest : 1) * iterations; ++iteration) {
+    const bool goes_on = least <= nearly * first && iteration - halved_at <= halving_iterations;
+    if (iteration >= iterations && !goes_on) break;
     contact.hold_reversed = iteration >= reversals_from;
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && !smoothly && norms.largest <= settings_.tolerance && arrived(x)) break;
@@ -201,12 +205,13 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     if (pairs && pairs->smoothing > 0.0 && sharpen(problem, x, share, norms)) {
       if (pairs->smoothing == 0.0) break;
       std::fill(window, window + 4, norms.squared);
-      least = std::numeric_limits<double>::infinity();
+      least = halved = std::numeric_limits<double>::infinity();
     }
     if (norms.squared < least) {
       least = norms.squared, best_ = x;
       if (pairs) pairs->mark_best();
     }
+    if (least < 0.5 * halved) halved = least, halved_at = iteration;
   }
   if (pairs && pairs->smoothing > 0.0) {
     pairs->smoothing = 0.0;

@@ -16,21 +16,23 @@ namespace {
 PairRow open_row(const PairSight& sight) { return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -sight.force}; }
 
 PairRow stick_row(const PairSight& sight) {
-  const Matrix3d stiffness = sight.proximal * Matrix3d::Identity();
-  return {contact_stick, stiffness, stiffness, -sight.proximal * (sight.gap * sight.normal + sight.slip)};
+  const Vector3d& n = sight.normal;
+  const Matrix3d stiffness = sight.across * Matrix3d::Identity() + (sight.along - sight.across) * n * n.transpose();
+  return {contact_stick, stiffness, stiffness, -sight.along * sight.gap * n - sight.across * sight.slip};
 }
 
 PairRow slip_row(const PairSight& sight) {
   const Vector3d& n = sight.normal;
-  const double kappa = sight.proximal, k = sight.stiffness, pressing = std::max(sight.force.dot(n), 0.0);
+  const double kappa = sight.along, lambda = sight.across, k = sight.stiffness;
+  const double pressing = std::max(sight.force.dot(n), 0.0);
   const Vector3d tangential = sight.force - sight.force.dot(n) * n, tau = tangential - k * sight.slip;
   const double size = tau.norm(), bound = sight.mu * pressing;
   const Vector3d t = size > 0.0 ? Vector3d(tau / size) : Vector3d(n.unitOrthogonal());
   const double beta = size > 0.0 ? std::min(bound / size, 1.0) : 0.0;
-  // s = beta k/(1 - beta) and s/(beta k) = 1/(1 - beta), or kappa in place of s.
-  const bool soft = beta * k < kappa * (1.0 - beta);
-  const double side = soft ? beta * k / (1.0 - beta) : kappa;
-  const double pull = soft ? 1.0 / (1.0 - beta) : kappa / (beta * k);
+  // s = beta k/(1 - beta) and s/(beta k) = 1/(1 - beta), or lambda in place of s.
+  const bool soft = beta * k < lambda * (1.0 - beta);
+  const double side = soft ? beta * k / (1.0 - beta) : lambda;
+  const double pull = soft ? 1.0 / (1.0 - beta) : lambda / (beta * k);
   const Matrix3d across = Matrix3d::Identity() - n * n.transpose() - t * t.transpose();
   const Matrix3d symmetric = kappa * n * n.transpose() + side * across;
   const double turns = soft ? 1.0 : (1.0 - beta) * pull;
@@ -91,12 +93,13 @@ Smoothed smoothed(const PairSight& sight) {
 PairRow smoothed_row(const PairSight& sight) {
   const Smoothed law = smoothed(sight);
   const Vector3d &n = sight.normal, &t = law.direction;
-  const double k = sight.stiffness, kappa = sight.proximal, pressing = sight.force.dot(n);
+  const double k = sight.stiffness, pressing = sight.force.dot(n);
   const Vector3d tangential = sight.force - pressing * n;
-  const auto compliance = [&](double share) { return (1.0 - share) / k + share / kappa; };
+  const auto compliance = [&](double share, double proximal) { return (1.0 - share) / k + share / proximal; };
   // dr_N = pull - press dg; then friction, of the bound mu (r_N + dr_N).
-  const double soft = compliance(law.share), press = law.share / soft, pull = -(pressing - law.pressing) / (k * soft);
-  const double soft_along = compliance(law.along), soft_across = compliance(law.across);
+  const double soft = compliance(law.share, sight.along), press = law.share / soft,
+               pull = -(pressing - law.pressing) / (k * soft);
+  const double soft_along = compliance(law.along, sight.across), soft_across = compliance(law.across, sight.across);
   const double along = law.along / soft_along, across = law.across / soft_across;
   const double coupling = law.by_bound * sight.mu / (k * soft_along);
   const Matrix3d side = Matrix3d::Identity() - n * n.transpose() - t * t.transpose();

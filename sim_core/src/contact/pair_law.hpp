@@ -7,14 +7,14 @@
 //     r_N = max(0, r_N - k g),   r_T = projection of tau on the disc of radius mu r_N,  tau = r_T - k u.
 //
 // Newton's method takes the derivative of the branch at hand, with a proximal term [Rockafellar 1976], by which pairs
-// that say the same do no harm: c + dc + dr/kappa = 0. It vanishes as the iteration converges. With the pair's motion v
-// = sum w_i dx_i the row is dr = force - stiffness v:
+// that say the same do no harm: g + dg + dr_N/kappa = 0 along the normal, u + du + dr_T/lambda = 0 across it. It
+// vanishes as the iteration converges. With the pair's motion v = sum w_i dx_i the row is dr = force - stiffness v:
 //
-//     open :  stiffness 0                 force -r
-//     stick:  kappa 1                     -kappa (g n + u)
-//     slip :  kappa (n + mu t) n^T + s P  -kappa g n + (mu r_N - t . r_T - mu kappa g) t - (s / (beta k)) P r_T
+//     open :  stiffness 0                       force -r
+//     stick:  kappa n n^T + lambda (1 - n n^T)  -kappa g n - lambda u
+//     slip :  kappa (n + mu t) n^T + s P        -kappa g n + (mu r_N - t . r_T - mu kappa g) t - (s / (beta k)) P r_T
 //
-// with t = tau/|tau|, beta = mu r_N/|tau|, P = 1 - n n^T - t t^T and s = min(kappa, beta k/(1 - beta)), by which
+// with t = tau/|tau|, beta = mu r_N/|tau|, P = 1 - n n^T - t t^T and s = min(lambda, beta k/(1 - beta)), by which
 // friction turns with the slip.
 //
 // Where this does not find which pairs bear and which slip, the law is smoothed over an energy epsilon, as by the
@@ -35,12 +35,13 @@
 namespace sim_core {
 
 struct PairSight {
-  double gap;                      // m
-  Eigen::Vector3d normal;          // from the second to the first
-  Eigen::Vector3d slip;            // m: of the first over the second since the start of the step, across the normal
-  Eigen::Vector3d force;           // N: on the first
-  double mu, stiffness, proximal;  // k and kappa, N/m
-  double smoothing = 0.0;          // epsilon, J
+  double gap;              // m
+  Eigen::Vector3d normal;  // from the second to the first
+  Eigen::Vector3d slip;    // m: of the first over the second since the start of the step, across the normal
+  Eigen::Vector3d force;   // N: on the first
+  double mu, stiffness;    // k, N/m
+  double along, across;    // kappa and lambda: proximal, along the normal and across it, N/m
+  double smoothing = 0.0;  // epsilon, J
 };
 
 struct PairRow {

@@ -18,6 +18,9 @@ using Motions = Eigen::Matrix<double, 9, 1>;
 
 // Stiffness of the law, and of the proximal term, over that of a pair's nodes.
 constexpr double law_share = 0.1, proximal_share = 10.0, smooth_proximal_share = 1000.0;
+// Along the normal a node counts with its stiffness there and this share of its mean one. Cloth is much stiffer in its
+// plane than across it: with the mean alone, pairs that contradict each other by rounding trade large forces.
+constexpr double mean_share = 0.2;
 // A pair whose predicted gap is below minus so much of the thickness is made to bear, and one that bore at the end of
 // the last step bears on up to so much.
 constexpr double predicted_gap = 0.02;
@@ -29,7 +32,7 @@ constexpr double hand_on_cosine = 0.5;
 // Pairs that say nearly the same but contradict each other trade forces until one lets go. A pair whose gap or slip
 // stays above this share of what it was, between `insist_from` [m] and a share of the thickness, gets a larger proximal
 // stiffness: by so much, up to so much in all.
-constexpr double insist_above = 0.5, insist_from = 2e-9, insist_up_to = 0.02, insist_more = 4.0, insist_max = 4096.0;
+constexpr double insist_above = 0.5, insist_from = 2e-9, insist_up_to = 0.5, insist_more = 4.0, insist_max = 1024.0;
 // Pairs whose middles are nearer than so much of the thickness are one; forces are handed on up to so far.
 constexpr double merge_share = 0.2, hand_on_share = 0.5;
 // Pieces further apart than so many thicknesses, and what they may have come towards each other in this step, are no
@@ -113,8 +116,7 @@ Pairs::Pairs(Surface surface, const PairSettings& settings, double margin, int f
     : near(std::move(surface), settings.farthest(), margin),
       settings_(settings),
       free_nodes_(free_nodes),
-      least_distance_(std::numeric_limits<double>::infinity()),
-      softness_(near.surface.sheet_of_node.size(), 0.0) {}
+      least_distance_(std::numeric_limits<double>::infinity()) {}
 
 void Pairs::restart() {
   kept_.clear();
@@ -122,11 +124,11 @@ void Pairs::restart() {
 }
 
 void Pairs::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-                  const std::vector<double>& stiffness, double share) {
+                  std::vector<Matrix3d> own) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
-  for (int i = 0; i < free_nodes_; ++i) softness_[i] = share / stiffness[i];
+  own_ = std::move(own);
   base_ = kept_;
 }
 
@@ -247,7 +249,6 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   const Vector3d rho = between_closest(weights, at);
   const double distance = rho.norm();
   least_distance_ = std::min(least_distance_, distance);
-  double softness = 0.0;
   Vector4d along_first = Vector4d::Zero(), along_second = Vector4d::Zero();
   if (who.kind == PairKind::edge_edge) {
     along_first << -1.0, 1.0, 0.0, 0.0;
@@ -268,15 +269,23 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   Motions given = Motions::Zero();
   for (int c = 0; c < 4; ++c) {
     const int node = who.node[c];
-    softness += weights[c] * weights[c] * softness_[node];
     if (node < free_nodes_) continue;
     const Vector3d way = at_node(*ends_, node) - at_node(x, node);
     given.segment<3>(0) += weights[c] * way;
     given.segment<3>(3) += along_first[c] * way;
     given.segment<3>(6) += along_second[c] * way;
   }
-  if (!(softness > 0.0) || !(distance > 0.0)) return;
+  if (!(distance > 0.0)) return;
   const Vector3d n = rho / distance;
+  double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] >= free_nodes_) continue;
+    const Matrix3d& own = own_[who.node[c]];
+    const double mean = own.trace() / 3.0;
+    softness += weights[c] * weights[c] / mean;
+    softness_along += weights[c] * weights[c] / (mean_share * mean + std::max(n.dot(own * n), 0.0));
+  }
+  if (!(softness > 0.0)) return;
   // The way of the first over the second, less that by which rho turns: with a surface, or half with each.
   const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
   Matrix3d turn = Matrix3d::Zero();
@@ -294,6 +303,7 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
                     feature,
                     weights,
                     {distance - thickness, n, slip, Vector3d::Zero(), mu, law_share / softness,
+                     smoothing > 0.0 ? smooth_proximal_share / softness : proximal_share / softness_along,
                      (smoothing > 0.0 ? smooth_proximal_share : proximal_share) / softness,
                      law_share / softness * smoothing * smoothing},
                     first - 0.5 * rho,
@@ -320,7 +330,8 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
           last < insist_up_to * pairs_[i].thickness && now > insist_above * last) {
         pairs_[i].insistence = std::min(insist_more * before[o].insistence, insist_max);
       }
-      pairs_[i].sight.proximal *= pairs_[i].insistence;
+      pairs_[i].sight.along *= pairs_[i].insistence;
+      pairs_[i].sight.across *= pairs_[i].insistence;
       ++o;
     } else {
       fresh.push_back(i);

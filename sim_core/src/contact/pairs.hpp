@@ -54,10 +54,9 @@ class Pairs {
   // Forgets all forces.
   void restart();
   // An attempt at a step begins at `start`, with the forces that were kept last, and takes held nodes to `ends`, and
-  // the others to where they are `expected` if nothing stops them; `stiffness`: of the free nodes, `share` of their
-  // own.
+  // the others to where they are `expected` if nothing stops them; `own`: stiffness of the free nodes, N/m.
   void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-             const std::vector<double>& stiffness, double share);
+             std::vector<Eigen::Matrix3d> own);
   // A step ended.
   void keep();
 
@@ -107,7 +106,7 @@ class Pairs {
   std::vector<Pair> pairs_, base_, kept_, best_;  // sorted by kind, first, feature
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
-  std::vector<double> softness_;  // of all nodes, m/N: 0 where held
+  std::vector<Eigen::Matrix3d> own_;  // of the free nodes, N/m
   std::vector<int> nodes_;
   Buffer<float> weights_, stiffness_;
 };
