@@ -164,7 +164,8 @@ def over_facets() -> None:
             print(
                 f"capstan, mu {mu}, facets {facets}{' of cloth' if of_cloth else ''}: "
                 f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
-                f"ripple {np.ptp(heavy) / heavy.mean():.2%}, {cloth.newton / cloth.steps:.1f} iterations a step, "
+                f"ripple {np.ptp(heavy) / heavy.mean():.2%}, {strip.iterations:.1f} iterations a step while it slides and "
+                f"{cloth.newton / cloth.steps:.1f} in all, "
                 f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged",
                 flush=True,
             )

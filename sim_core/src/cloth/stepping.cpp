@@ -64,7 +64,14 @@ int Stepper::patience() const { return static_cast<int>((near() ? near_pairs : 1
 
 bool Stepper::near() const { return newton.pairs && newton.pairs->matter(); }
 
-StepOutcome Stepper::solve_smoothly(const StepProblem& problem, StepReport& report) {
+// Where Newton's method fails near other cloth: with stiff pairs, else by way of a smoothed law.
+StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report) {
+  x = driven;
+  newton.pairs->stiff = true;
+  const StepOutcome outcome = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
+  newton.pairs->stiff = false;
+  if (outcome.converged) return outcome;
+  x = driven;
   assembly_.definite = true;
   return newton.solve(problem, x, false, smooth_iterations, report, settings_.krylov_tolerance, true);
 }
@@ -87,10 +94,7 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
   StepOutcome outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
                                      settings_.krylov_tolerance, false);
   // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
-  if (!outcome.converged && near()) {
-    x = driven;
-    outcome = solve_smoothly(problem, report);
-  }
+  if (!outcome.converged && near()) outcome = solve_hard(problem, driven, report);
   if (!outcome.converged && (deepest || !near())) {
     x = driven;
     outcome = newton.solve(problem, x, deepest, settings_.newton_max, report,
@@ -132,10 +136,7 @@ bool Stepper::attempt(double dt, const Drive& drive, bool hard, StepReport& repo
   newton.predict(problem, x, predicted_, false);
   const Buffer<double> driven = x;
   tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
-  if (!tried_.converged && hard && near()) {
-    x = driven;
-    tried_ = solve_smoothly(problem, report);
-  }
+  if (!tried_.converged && hard && near()) tried_ = solve_hard(problem, driven, report);
   tried_dt_ = dt;
   return tried_.converged;
 }

@@ -46,7 +46,7 @@ class Stepper {
  private:
   int patience() const;
   bool near() const;
-  StepOutcome solve_smoothly(const StepProblem& problem, StepReport& report);
+  StepOutcome solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report);
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);
   void count_contacts(StepReport& report) const;

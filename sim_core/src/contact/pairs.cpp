@@ -18,9 +18,9 @@ using Motions = Eigen::Matrix<double, 9, 1>;
 
 // Stiffness of the law, and of the proximal term, over that of a pair's nodes.
 constexpr double law_share = 0.1, proximal_share = 10.0, smooth_proximal_share = 1000.0;
-// Along the normal a node counts with its stiffness there and this share of its mean one. Cloth is much stiffer in its
+// Along the normal a node counts with its stiffness there and a share of its mean one. Cloth is much stiffer in its
 // plane than across it: with the mean alone, pairs that contradict each other by rounding trade large forces.
-constexpr double mean_share = 0.2;
+constexpr double mean_share = 0.2, stiff_mean_share = 1.0;
 // A pair whose predicted gap is below minus so much of the thickness is made to bear, and one that bore at the end of
 // the last step bears on up to so much.
 constexpr double predicted_gap = 0.02;
@@ -277,13 +277,14 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   }
   if (!(distance > 0.0)) return;
   const Vector3d n = rho / distance;
+  const double share = stiff ? stiff_mean_share : mean_share;
   double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
   for (int c = 0; c < 4; ++c) {
     if (who.node[c] >= free_nodes_) continue;
     const Matrix3d& own = own_[who.node[c]];
     const double mean = own.trace() / 3.0;
     softness += weights[c] * weights[c] / mean;
-    softness_along += weights[c] * weights[c] / (mean_share * mean + std::max(n.dot(own * n), 0.0));
+    softness_along += weights[c] * weights[c] / (share * mean + std::max(n.dot(own * n), 0.0));
   }
   if (!(softness > 0.0)) return;
   // The way of the first over the second, less that by which rho turns: with a surface, or half with each.

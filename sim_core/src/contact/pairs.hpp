@@ -50,6 +50,7 @@ class Pairs {
 
   Neighbourhood near;
   double smoothing = 0.0;  // m: over which the law is smooth; 0 for the exact one
+  bool stiff = false;      // along the normals, too
 
   // Forgets all forces.
   void restart();

@@ -150,6 +150,8 @@ class Strip:
         )
         self.ahead = np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
         self.cloth.set_state(np.concatenate([self.start, self.below]))
+        self.iterations = 0.0
+        """Of Newton's method in a measured step, in the mean."""
 
     def draw(self) -> tuple[Floats, float]:
         """Return the heavy pull at each measured step [N/m], and the angle between the far directions [rad]."""
@@ -157,8 +159,10 @@ class Strip:
         first, last = round(SLIDING / dt), round((SLIDING + MEASURED) / dt)
         for step in range(1, last + 1):
             ends = self.start[self.held] + SPEED * step * dt * self.ahead
+            before = self.cloth.newton
             self.cloth.step(dt, held=np.concatenate([ends, self.below]), bodies=self.bodies, damping=DAMPING)
             if step > first:
+                self.iterations += (self.cloth.newton - before) / (last - first)
                 pulls.append(self.cloth.reactions[self.held].sum(axis=0) / self.breadth)
         heavy = np.array(pulls)
         mean = heavy.mean(axis=0)
