@@ -157,15 +157,15 @@ def over_facets() -> None:
     Then over a held cloth on such a cylinder: the facets of this one are felt.
     """
     for mu in capstan.FRICTION:
-        for facets, of_cloth in ((None, False), (72, False), (60, False), (24, False), (60, True)):
+        for facets, of_cloth in ((None, False), (72, False), (60, False), (24, False), (60, True), (120, True)):
             strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth)
             heavy, wrap = strip.draw()
             cloth, expected = strip.cloth, np.log(master_curves.capstan(mu, wrap, 0.05))
             print(
                 f"capstan, mu {mu}, facets {facets}{' of cloth' if of_cloth else ''}: "
                 f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
-                f"ripple {np.ptp(heavy) / heavy.mean():.2%}, {strip.iterations:.1f} iterations a step while it slides and "
-                f"{cloth.newton / cloth.steps:.1f} in all, "
+                f"ripple {np.ptp(heavy) / heavy.mean():.2%}, "
+                f"{strip.iterations:.1f} iterations a measured step, {cloth.newton / cloth.steps:.1f} a step in all, "
                 f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged",
                 flush=True,
             )

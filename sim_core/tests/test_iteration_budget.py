@@ -2,13 +2,14 @@
 
 The counts are of the portable kernels, and repeat to the bit. Without the share of friction in Newton's matrix, the
 sphere takes ten times as many. Without its share in what contact prescribes, the shaken floor takes a fifth more.
-Results stay right in both cases; only the cost grows.
+Results stay right in both cases; only the cost grows. So they do where cloth slides over cloth.
 """
 
 import numpy as np
 
 from stickslip_sim_core import Cloth, fabric, plane, preset_named, sphere
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.protocols.capstan import Strip
 
 
 def _cloth(cells: int, height: float, held: bool = False) -> Cloth:
@@ -46,3 +47,11 @@ def test_on_a_floor_that_is_shaken() -> None:
         assert cloth.unconverged_steps == 0
         spent += cloth.newton
     assert spent < 186
+
+
+def test_over_a_curved_cloth() -> None:
+    """Measured: 4.7 a step; with pairs as stiff along their normals as across them: 12.8."""
+    strip = Strip(0.5, 0.05, preset_named("certified"), 48, of_cloth=True)
+    strip.draw()
+    assert strip.cloth.unconverged_steps == 0
+    assert strip.iterations < 9
