@@ -5,7 +5,7 @@
 
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
 with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
-`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames. `facets`: capstan over
+`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames and all 300. `facets`: capstan over
 cylinders of triangles, and over a cloth. `sphere`: a cloth on a sphere that turns, of triangles and round. `drops`:
 sheets fall, fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see what
 crosses.
@@ -113,7 +113,8 @@ def stretched(vertices: int, frames: int) -> None:
 
 def stretch_all() -> None:
     for vertices in (21, 41):
-        stretched(vertices, 50)
+        for frames in (50, 300):
+            stretched(vertices, frames)
 
 
 def tumble_all(only: str) -> None:
