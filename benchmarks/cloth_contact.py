@@ -5,10 +5,10 @@
 
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
 with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
-`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames and all 300. `facets`: capstan over
-cylinders of triangles, and over a cloth. `sphere`: a cloth on a sphere that turns, of triangles and round. `drops`:
-sheets fall, fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see what
-crosses.
+`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames and all 300. `facets`:
+capstan over cylinders of triangles, and over a cloth. `sphere`: a cloth on a sphere that turns, of triangles and round.
+`drops`: sheets fall, fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see
+what crosses.
 `momentum`: what forces of pairs and their moments add up to. `protocols`: those of contact, with their settings; the
 stacked incline is on four meshes. Without a name all of them run; `--only pile` leaves out the drops and protocols
 whose names begin otherwise. With --figures the pictures of the protocols are drawn, too (needs matplotlib).
