@@ -249,7 +249,7 @@ def test_the_first_call_of_a_process_is_not_gone_by(start: Start, double: Coordi
 def test_a_simulation_tells_how_far_it_is(start: Start, double: CoordinatorDouble) -> None:
     start()
     double.offer(cloth=_cloth())
-    double.until(lambda: "cloth" in double.frames, timeout=60)
+    double.until(lambda: "cloth" in double.frames)
     done, frames = double.frames["cloth"]
     assert 0 < done <= frames == 300
 
