@@ -83,9 +83,10 @@ void bind_cloth(nb::module_& m) {
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, const Edges& clamped,
              double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
              int patience, int halvings_max, double step_error, int coarsest, int finest, const std::string& kernel,
-             const std::vector<double>& thickness, const std::optional<Eigen::MatrixXd>& mu,
-             const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
-             const Points3& surface_positions, const std::vector<double>& crease) {
+             const std::vector<double>& thickness, const std::optional<Eigen::MatrixXd>& mu, double edge_share,
+             double second_share, const Triangles& surface_triangles,
+             const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
+             const std::vector<double>& crease) {
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, {stretching}, rigidity, damping});
@@ -94,14 +95,15 @@ void bind_cloth(nb::module_& m) {
                 rest, triangles, list, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
                 {step_error, coarsest, finest}, kernel,
-                mu ? std::optional<PairSettings>({thickness, *mu, static_cast<int>(thickness.size() - crease.size())})
+                mu ? std::optional<PairSettings>(
+                         {thickness, *mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share})
                    : std::nullopt,
                 {surface_triangles, surface_of_vertex, surface_positions, crease});
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
           "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
-          "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "surface_triangles"_a,
-          "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
+          "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "edge_share"_a, "second_share"_a,
+          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a)
       .def(
           "step",

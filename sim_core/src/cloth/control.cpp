@@ -16,9 +16,10 @@ constexpr double factor_work = 9.0, newton_work = 1.5;
 // Longer steps may cost so much more per time than shorter ones before they are given up, and are forgiven so much of
 // it with each step.
 constexpr double dearer = 1.1, forgiving = 0.98, memory = 0.7;
-// Times that a step may be halved further than the error asks for, where it is not solved; such steps grow again after
-// one that took no more iterations than this.
-constexpr int hard = 2, easy = 6;
+// Times that a step may be halved further than the error asks for, where it is not solved, and where it is not near
+// other cloth: there halving is cheaper than other ways to solve it. Such steps grow again after one that took no more
+// iterations than this.
+constexpr int hard = 2, hard_near = 4, easy = 6;
 
 int level_of(int steps, const char* name) {
   int level = 0;
@@ -38,7 +39,7 @@ StepController::StepController(Stepper& stepper, const StepControl& control)
       control_(control),
       coarsest_(level_of(control.coarsest, "coarsest")),
       finest_(level_of(control.finest, "finest")),
-      last_(finest_ + hard),
+      last_(finest_ + hard_near),
       level_(finest_),
       cost_(last_ + 1, 0.0) {
   if (!(control.error > 0.0) || !std::isfinite(control.error)) refuse("error: must be finite and > 0");
@@ -72,9 +73,10 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
     const double share = static_cast<double>(size) / all, dt = share * (end - begin);
     const Drive drive = motion(begin + (end - begin) * (tick + size) / all);
     StepReport report;
-    const bool solved = stepper_.attempt(dt, drive, level_ >= finest_, report);
+    const bool solved = stepper_.attempt(dt, drive, report);
+    const int last = stepper_.near() ? last_ : finest_ + hard;
     const double missed = stepper_.missed() / control_.error;
-    if (solved ? level_ < finest_ && missed > reject_at : level_ < last_) {
+    if (solved ? level_ < finest_ && missed > reject_at : level_ < last) {
       stepper_.reject();
       total.add_work(report);
       ++total.halvings;

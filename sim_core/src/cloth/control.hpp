@@ -36,7 +36,7 @@ class StepController {
 
   Stepper& stepper_;
   StepControl control_;
-  int coarsest_, finest_, last_, level_;  // log2 of steps in an interval; `last_`: of those that are not solved else
+  int coarsest_, finest_, last_, level_;  // log2 of steps in an interval; `last_`: of the shortest
   std::vector<double> cost_;              // by level: work per interval of late, 0 where unknown
 };
 

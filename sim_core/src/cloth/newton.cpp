@@ -40,8 +40,6 @@ constexpr double length_tolerance = 2e-9;
 constexpr double common_least = 0.1;
 // A correction that leads further than so many hops of its search for pairs is no guide.
 constexpr int hops_max = 1, smooth_hops_max = 4;
-// Iterations in a row that are stopped short, or take all rounds, after which an attempt is given up.
-constexpr int strained_max = 4;
 
 }  // namespace
 

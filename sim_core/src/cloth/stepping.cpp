@@ -15,6 +15,9 @@ constexpr double loose = 0.1;
 constexpr double easy = 0.6;
 // Times the patience where pairs matter: then halves of a step are hardly easier than the whole.
 constexpr double near_pairs = 2.5;
+// Iterations in a row that strain the cloth, after which an attempt is given up: of a step that may be halved at once,
+// and of one for which halving comes last.
+constexpr int strained_soon = 2, strained_long = 4;
 // Iterations by way of a smoothed law.
 constexpr int smooth_iterations = 100;
 
@@ -28,7 +31,9 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings)
       settings_(settings),
       start_(x),
       inertial_(x),
-      predicted_(x) {}
+      predicted_(x) {
+  newton.strained_max = strained_long;
+}
 
 void Stepper::restart() {
   started_ = false;
@@ -127,16 +132,16 @@ void Stepper::take(double dt, double residual, StepReport& report) {
   last_dt_ = dt;
 }
 
-bool Stepper::attempt(double dt, const Drive& drive, bool hard, StepReport& report) {
+bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   check(dt, drive);
   drive_nodes(0.0, 1.0, dt, drive);
   assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, x, predicted_, false);
-  const Buffer<double> driven = x;
+  newton.strained_max = strained_soon;
   tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
-  if (!tried_.converged && hard && near()) tried_ = solve_hard(problem, driven, report);
+  newton.strained_max = strained_long;
   tried_dt_ = dt;
   return tried_.converged;
 }

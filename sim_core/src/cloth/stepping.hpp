@@ -30,10 +30,12 @@ class Stepper {
   StepReport step(double dt, const Drive& drive);
 
   // One attempt at a step, as a whole and within the settings' patience, to be accepted or rejected: then nothing has
-  // happened. `hard`: by way of a smoothed law, too, where pairs are near.
-  bool attempt(double dt, const Drive& drive, bool hard, StepReport& report);
+  // happened.
+  bool attempt(double dt, const Drive& drive, StepReport& report);
   void accept(const Drive& drive, StepReport& report);
   void reject();
+  // Whether pairs mattered in the last attempt.
+  bool near() const;
   // Largest distance of a free node from where it was predicted in the last attempt, m.
   double missed() const;
 
@@ -45,7 +47,6 @@ class Stepper {
 
  private:
   int patience() const;
-  bool near() const;
   StepOutcome solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report);
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);

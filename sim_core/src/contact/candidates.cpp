@@ -10,7 +10,6 @@ using Eigen::Array3d;
 
 struct Box {
   Array3d low, high;
-  bool meets(const Box& other) const { return (low <= other.high).all() && (other.low <= high).all(); }
 };
 
 template <std::size_t count>
@@ -81,6 +80,38 @@ class Grid {
   std::vector<int> begin_, items_;
 };
 
+// The boxes of a cell, one coordinate after the other, so that one is compared with many at a time.
+class Around {
+ public:
+  void take(const std::vector<Box>& boxes, const int* begin, const int* end) {
+    for (int c = 0; c < 3; ++c) {
+      low_[c].clear();
+      high_[c].clear();
+      for (const int* i = begin; i < end; ++i) {
+        low_[c].push_back(boxes[*i].low[c]);
+        high_[c].push_back(boxes[*i].high[c]);
+      }
+    }
+    meet_.resize(static_cast<std::size_t>(end - begin));
+  }
+  // Of those after one: whether they meet it.
+  const std::vector<char>& meeting(int one) {
+    const double *low = low_[0].data(), *low_y = low_[1].data(), *low_z = low_[2].data(), *high = high_[0].data(),
+                 *high_y = high_[1].data(), *high_z = high_[2].data();
+    char* meet = meet_.data();
+    const int count = static_cast<int>(meet_.size());
+    for (int j = one + 1; j < count; ++j) {
+      meet[j] = (low[one] <= high[j]) & (low[j] <= high[one]) & (low_y[one] <= high_y[j]) & (low_y[j] <= high_y[one]) &
+                (low_z[one] <= high_z[j]) & (low_z[j] <= high_z[one]);
+    }
+    return meet_;
+  }
+
+ private:
+  std::array<std::vector<double>, 3> low_, high_;
+  std::vector<char> meet_;
+};
+
 void add_if_near(std::vector<Candidate>& out, Candidate pair, const Buffer<double>& x, double reach) {
   const FourPoints at = points_of(pair, x);
   pair.distance = between_closest(closest_weights(pair.kind, at), at).norm();
@@ -109,7 +140,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     if (cell < 0) continue;
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
       const auto& corner = surface.triangles[*t];
-      if (!surface.feel(vertex, corner[0]) || (p < boxes[*t].low).any() || (p > boxes[*t].high).any()) continue;
+      if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any() || !surface.feel(vertex, corner[0])) continue;
       if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
       add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
                   reach);
@@ -119,14 +150,19 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
   boxes.clear();
   for (const auto& ends : surface.edges) boxes.push_back(box_of(ends, x, 0.5 * reach));
   const Grid edges(boxes);
+  Around around;
   for (int cell = 0; cell < edges.cells(); ++cell) {
-    for (const int* i = edges.begin(cell); i < edges.end(cell); ++i) {
+    const int *begin = edges.begin(cell), *end = edges.end(cell);
+    around.take(boxes, begin, end);
+    for (const int* i = begin; i < end; ++i) {
       const auto& a = surface.edges[*i];
       if (a[0] > surface.last_felt[surface.sheet_of_node[a[0]]]) continue;  // none of those to come is felt
-      for (const int* j = i + 1; j < edges.end(cell); ++j) {
+      const std::vector<char>& meet = around.meeting(static_cast<int>(i - begin));
+      for (const int* j = i + 1; j < end; ++j) {
+        if (!meet[j - begin]) continue;
         const auto& b = surface.edges[*j];
         if (!surface.feel(a[0], b[0])) continue;
-        if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1] || !boxes[*i].meets(boxes[*j])) continue;
+        if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1]) continue;
         // Boxes that meet in many cells count in the one with the lowest corner of what they share.
         if (edges.cell_at(boxes[*i].low.max(boxes[*j].low)) != cell) continue;
         add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}, 0.0}, x, reach);

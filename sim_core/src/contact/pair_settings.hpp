@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <vector>
 
+#include "contact/closest.hpp"
+
 namespace sim_core {
 
 // Of sheets and surfaces.
@@ -12,6 +14,10 @@ struct PairSettings {
   std::vector<double> thickness;  // m: two keep the mean of theirs apart
   Eigen::MatrixXd mu;             // of each two; negative where they do not feel each other
   int sheets;                     // that come before the surfaces
+  // What edges of two sheets, and vertices of the later over triangles of the earlier, keep of the thickness. Where
+  // sheets lie flat on each other, both and the vertices of the earlier sheet say the same: which of them bear is
+  // arbitrary then, and changes all the time. Those that keep less only bear where cloth is curved.
+  double edge_share = 1.0, second_share = 1.0;
 
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // What pairs of closest points keep apart, m. Nodes feel surfaces by themselves: pairs only catch what comes nearer
@@ -19,6 +25,12 @@ struct PairSettings {
   double apart(int a, int b) const {
     constexpr double surface_share = 0.25;
     return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
+  }
+  // The same of a pair whose first piece is of one sheet and whose second is of another.
+  double apart(PairKind kind, int first, int second) const {
+    const bool other = first != second && std::max(first, second) < sheets;
+    const double share = !other ? 1.0 : kind == PairKind::edge_edge ? edge_share : first > second ? second_share : 1.0;
+    return share * apart(first, second);
   }
   // The largest of these.
   double farthest() const {

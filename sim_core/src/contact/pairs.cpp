@@ -39,7 +39,10 @@ constexpr double merge_share = 0.2, hand_on_share = 0.5;
 // pair.
 constexpr double near_share = 2.0;
 
-auto key(const Pair& pair) { return std::make_tuple(pair.who.kind, pair.who.first, pair.feature); }
+template <class Any>
+auto key(const Any& pair) {
+  return std::make_tuple(pair.who.kind, pair.who.first, pair.feature);
+}
 
 // How the closest points move over their pieces, and how the normal turns, by a pair's motions m, m_1, m_2: they lie
 // where rho is across the directions a_k = sum w_ki x_i, so that
@@ -77,6 +80,18 @@ double missed(const PairSight& sight, int mode) {
 }
 
 }  // namespace
+
+PairPast::PairPast(const Pair& pair)
+    : who(pair.who),
+      feature(pair.feature),
+      mode(pair.row.mode),
+      force(pair.sight.force),
+      change(pair.change),
+      normal(pair.sight.normal),
+      middle(pair.middle),
+      thickness(pair.thickness),
+      insistence(pair.insistence),
+      missed(sim_core::missed(pair.sight, pair.row.mode)) {}
 
 Motions Pair::motions(const Buffer<float>& change, int free_nodes) const {
   Motions out = given;
@@ -136,7 +151,7 @@ void Pairs::keep() {
   kept_.clear();
   for (const Pair& pair : pairs_) {
     if (pair.sight.force.isZero(0.0)) continue;
-    kept_.push_back(pair);
+    kept_.emplace_back(pair);
     kept_.back().change.setZero();
     kept_.back().insistence = 1.0;
   }
@@ -297,7 +312,7 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
   }
   Vector3d slip = rho - turn * between_closest(weights, before);
   slip -= slip.dot(n) * n;
-  const double mu = settings_.mu(a, b), thickness = settings_.apart(a, b);
+  const double mu = settings_.mu(a, b), thickness = settings_.apart(who.kind, a, b);
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
   pairs_.push_back({who,
@@ -316,17 +331,17 @@ void Pairs::add(const Candidate& who, int feature, const Vector4d& weights, cons
 
 // Pairs take the forces they had. The force of one that is gone goes to the most alike of those that are new and have
 // the vertex, or an edge, in common: the closest feature has changed.
-void Pairs::hand_on(const std::vector<Pair>& before, double share) {
-  std::vector<const Pair*> orphans;
+void Pairs::hand_on(const std::vector<PairPast>& before, double share) {
+  std::vector<const PairPast*> orphans;
   std::vector<std::size_t> fresh;
   std::size_t o = 0;
   for (std::size_t i = 0; i < pairs_.size(); ++i) {
     for (; o < before.size() && key(before[o]) < key(pairs_[i]); ++o) orphans.push_back(&before[o]);
     if (o < before.size() && key(before[o]) == key(pairs_[i])) {
-      pairs_[i].sight.force = before[o].sight.force + share * before[o].change;
+      pairs_[i].sight.force = before[o].force + share * before[o].change;
       pairs_[i].insistence = before[o].insistence;
-      const int mode = before[o].row.mode;
-      const double last = missed(before[o].sight, mode), now = missed(pairs_[i].sight, mode);
+      const int mode = before[o].mode;
+      const double last = before[o].missed, now = missed(pairs_[i].sight, mode);
       if (smoothing == 0.0 && share == 1.0 && mode != contact_open && last > insist_from &&
           last < insist_up_to * pairs_[i].thickness && now > insist_above * last) {
         pairs_[i].insistence = std::min(insist_more * before[o].insistence, insist_max);
@@ -339,8 +354,8 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
     }
   }
   for (; o < before.size(); ++o) orphans.push_back(&before[o]);
-  for (const Pair* orphan : orphans) {
-    const Vector3d force = orphan->sight.force + share * orphan->change;
+  for (const PairPast* orphan : orphans) {
+    const Vector3d force = orphan->force + share * orphan->change;
     if (force.isZero(0.0)) continue;
     std::size_t heir = pairs_.size();
     double best = hand_on_cosine;
@@ -351,7 +366,7 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
                                                               : a.first == b.first || a.second == b.second ||
                                                                     a.first == b.second || a.second == b.first;
       if (!common) continue;
-      const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
+      const double alike = pairs_[i].sight.normal.dot(orphan->normal);
       if (alike > best) best = alike, heir = i;
     }
     if (heir < pairs_.size()) {
@@ -361,18 +376,18 @@ void Pairs::hand_on(const std::vector<Pair>& before, double share) {
     best = hand_on_share * orphan->thickness;
     for (std::size_t i = 0; i < pairs_.size(); ++i) {
       const double far = (pairs_[i].middle - orphan->middle).norm();
-      const double alike = pairs_[i].sight.normal.dot(orphan->sight.normal);
+      const double alike = pairs_[i].sight.normal.dot(orphan->normal);
       if (far < best && std::abs(alike) > hand_on_cosine) best = far, heir = i;
     }
     if (heir < pairs_.size()) {
-      pairs_[heir].sight.force += pairs_[heir].sight.normal.dot(orphan->sight.normal) > 0.0 ? force : Vector3d(-force);
+      pairs_[heir].sight.force += pairs_[heir].sight.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
     }
   }
 }
 
 // Leaves one of the pairs that are at nearly the same place, as where a vertex lies on a vertex: they would say the
-// same but for rounding, and contradict each other. One that has a force stays before one that has none, and then the
-// closer one; it takes the forces of the others.
+// same but for rounding, and contradict each other. One that keeps more apart stays before one that keeps less, then
+// one that has a force before one that has none, then the closer one; it takes the forces of the others.
 void Pairs::merge() {
   const std::size_t count = pairs_.size();
   const Vector3d across(0.62, 0.55, 0.56);  // along no edge of a mesh that is aligned with the axes
@@ -382,10 +397,13 @@ void Pairs::merge() {
   std::vector<std::size_t> place(count), order(count);
   for (std::size_t l = 0; l < count; ++l) place[line[l].second] = l;
   std::iota(order.begin(), order.end(), std::size_t{0});
-  std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
-    const bool free_a = pairs_[a].sight.force.isZero(0.0), free_b = pairs_[b].sight.force.isZero(0.0);
-    return free_a != free_b ? free_b : pairs_[a].sight.gap < pairs_[b].sight.gap;
-  });
+  std::vector<std::tuple<bool, bool, double>> rank(count);  // whether it keeps less apart, has no force; its gap
+  for (std::size_t i = 0; i < count; ++i) {
+    const auto sheet = [&](int c) { return near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
+    rank[i] = {pairs_[i].thickness < settings_.apart(sheet(0), sheet(3)), pairs_[i].sight.force.isZero(0.0),
+               pairs_[i].sight.gap};
+  }
+  std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return rank[a] < rank[b]; });
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
@@ -482,12 +500,12 @@ void Pairs::solved(const Buffer<float>& change) {
     pair.change = pair.force_change(change, free_nodes_);
     pair.added = pair.released = false;
   }
-  base_ = pairs_;
+  base_.assign(pairs_.begin(), pairs_.end());
 }
 
 void Pairs::return_to_best() {
   base_ = best_;
-  for (Pair& pair : base_) pair.change.setZero();
+  for (PairPast& pair : base_) pair.change.setZero();
 }
 
 PairData Pairs::rows() {

@@ -43,6 +43,17 @@ struct Pair {
   Eigen::Vector3d force_change(const Buffer<float>& change, int free_nodes) const;
 };
 
+// What is kept of a pair: its force, and how well it did.
+struct PairPast {
+  Candidate who;
+  int feature, mode;
+  Eigen::Vector3d force, change, normal, middle;
+  double thickness, insistence;
+  double missed;  // m: by which it missed what its row asked for, if it bore
+
+  PairPast(const Pair& pair);
+};
+
 class Pairs {
  public:
   // `margin`: how far nodes move before pairs are looked for anew, m.
@@ -82,7 +93,7 @@ class Pairs {
   // Takes over the forces' changes that belong to the solved motion.
   void solved(const Buffer<float>& change);
   // Keeps the pairs at hand as the best; back to them, without changes.
-  void mark_best() { best_ = pairs_; }
+  void mark_best() { best_.assign(pairs_.begin(), pairs_.end()); }
   void return_to_best();
 
   // The rows, for the product with the matrix; and minus their right-hand side, to be subtracted from the nodes'.
@@ -98,13 +109,14 @@ class Pairs {
  private:
   void select(const Buffer<double>& x);
   void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x);
-  void hand_on(const std::vector<Pair>& before, double share);
+  void hand_on(const std::vector<PairPast>& before, double share);
   void merge();
 
   PairSettings settings_;
   int free_nodes_;
   double least_distance_;
-  std::vector<Pair> pairs_, base_, kept_, best_;  // sorted by kind, first, feature
+  std::vector<Pair> pairs_;                   // sorted by kind, first, feature
+  std::vector<PairPast> base_, kept_, best_;  // likewise
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
   std::vector<Eigen::Matrix3d> own_;  // of the free nodes, N/m

@@ -131,7 +131,7 @@ class Strip:
             isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT),
             preset,
             held=np.append(self.held, len(mesh.rest) + np.arange(len(self.below))),
-            self_contact=SelfContact(mu) if of_cloth else None,
+            self_contact=SelfContact(mu, bearing="vertices") if of_cloth else None,
             surfaces=surfaces,
             force_scale=FORCE_SHARE * LIGHT * cell,
         )

@@ -63,7 +63,7 @@ def drop_on_cloth(
         [fabric_of(fabric), fabric_of(substrate)],
         settings,
         held=np.concatenate([held, count + below.edge]),
-        self_contact=SelfContact([[self_friction, mu], [mu, self_friction]]),
+        self_contact=SelfContact([[self_friction, mu], [mu, self_friction]], bearing="first"),
         kernel=kernel,
     )
     hung = stage.hang(mesh, cloth.fabrics[0], seed=seed, kernel=kernel)
