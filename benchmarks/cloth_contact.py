@@ -155,15 +155,17 @@ def momentum_all() -> None:
 def over_facets() -> None:
     """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells, shorter and longer.
 
-    Then over a held cloth on such a cylinder: the facets of this one are felt.
+    Then over a held cloth on such a cylinder, which is rough, with a strip of cells of 5 degrees and of 2.5.
     """
+    cases = ((72, None, False), (72, 72, False), (72, 60, False), (72, 24, False))
+    cases += ((72, 60, True), (72, 120, True), (144, 60, True), (144, 120, True))
     for mu in capstan.FRICTION:
-        for facets, of_cloth in ((None, False), (72, False), (60, False), (24, False), (60, True), (120, True)):
-            strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth)
+        for cells, facets, of_cloth in cases:
+            strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth, cells_per_turn=cells)
             heavy, wrap = strip.draw()
             cloth, expected = strip.cloth, np.log(master_curves.capstan(mu, wrap, 0.05))
             print(
-                f"capstan, mu {mu}, facets {facets}{' of cloth' if of_cloth else ''}: "
+                f"capstan, mu {mu}, {cells} cells a turn, facets {facets}{' of cloth' if of_cloth else ''}: "
                 f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
                 f"ripple {np.ptp(heavy) / heavy.mean():.2%}, "
                 f"{strip.iterations:.1f} iterations a measured step, {cloth.newton / cloth.steps:.1f} a step in all, "

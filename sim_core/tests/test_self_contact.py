@@ -112,6 +112,67 @@ class TestStack:
         assert not stacked_incline.run(friction=(0.3,), sheets=(2,), cells=3, unstructured=0).passed
 
 
+class TestBearing:
+    @staticmethod
+    def ridges(bearing: str) -> Cloth:
+        """A sheet that is folded upwards, held as a whole, and one folded downwards that is pressed on it, edge on edge
+        in the middle: its sides go down by 2 mm."""
+        sheet = meshes.grid(0.02, 0.02, 5, 4)
+        folded, height = sheet.rest * [1.0, 0.8], 0.6 * np.abs(sheet.rest[:, 1])
+        below = np.column_stack([folded[:, ::-1], -height])
+        above = np.column_stack([folded, height + 2.0 * THICKNESS])
+        sides = len(below) + np.flatnonzero(height > height.max() - 1e-9)
+        held = np.append(np.arange(len(below)), sides)
+        cloth = Cloth(
+            meshes.together(sheet, sheet), SOFT, CERTIFIED, held=held, self_contact=SelfContact(0.5, bearing=bearing)
+        )
+        start = np.concatenate([below, above])
+        cloth.set_state(start)
+        for step in range(20):
+            ends = start[held]
+            ends[len(below) :, 2] -= 1e-4 * (step + 1)
+            cloth.step(0.02, held=ends, damping=5.0)
+        assert cloth.unconverged_steps == 0
+        return cloth
+
+    @pytest.mark.parametrize(("bearing", "share"), [("all", 1.0), ("vertices", 0.9), ("first", 0.9)])
+    def test_how_far_edges_of_two_sheets_stay_apart(self, bearing: str, share: float) -> None:
+        cloth = self.ridges(bearing)
+        pairs = cloth.pair_forces
+        assert np.linalg.norm(pairs.forces, axis=1).max() > 5e-4
+        assert pairs.distance == pytest.approx(share * THICKNESS, rel=1e-4)
+        assert cloth.least_distance == pytest.approx(share * THICKNESS, rel=1e-3)
+
+    @pytest.mark.parametrize("bearing", ["vertices", "first"])
+    def test_which_vertices_bear_where_sheets_lie_flat(self, bearing: str) -> None:
+        first, second = meshes.grid(0.05, 0.05, 5, 5), meshes.unstructured(0.06, 0.06, 0.009, 1)
+        both = meshes.together(first, second)
+        cloth = Cloth(both, MATERIAL, CERTIFIED, self_contact=SelfContact(0.5, bearing=bearing))
+        cloth.set_state(np.concatenate([flat(first, 2.02 * THICKNESS), flat(second, 1.01 * THICKNESS)]))
+        assert watched(cloth, 30, bodies=[plane(0.5)], damping=2.0) == 0
+        pairs, of_first = cloth.pair_forces, len(first.rest)
+        heavy = np.linalg.norm(pairs.forces, axis=1) > 1e-6
+        assert pairs.distance[heavy] == pytest.approx(THICKNESS, abs=1e-8)
+        assert (pairs.weights[heavy].max(axis=1) == 1.0).all()  # vertices over triangles
+        from_second = (pairs.vertices[:, 0] >= of_first) & heavy
+        assert from_second.any() == (bearing == "vertices")
+        weight = cloth.masses[:of_first].sum() * GRAVITY
+        share = (pairs.weights * (pairs.vertices < of_first)).sum(axis=1)
+        assert (share @ pairs.forces)[2] == pytest.approx(weight, rel=1e-3)
+
+    def test_within_a_sheet_all_bear(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A strip that folds onto itself is the same to the bit."""
+
+        def run(bearing: str) -> bytes:
+            monkeypatch.setattr(tumbles, "SelfContact", lambda mu: SelfContact(mu, bearing=bearing))
+            fold = tumbles.tumble("folding-0")
+            tumbles.watch(fold, 70)
+            assert fold.cloth.least_distance < 1.01 * THICKNESS
+            return fold.cloth.positions.tobytes()
+
+        assert run("all") == run("first")
+
+
 def flat(mesh: meshes.Mesh, height: float = 0.0) -> Floats:
     return np.column_stack([mesh.rest, np.full(len(mesh.rest), height)])
 
@@ -388,6 +449,10 @@ class TestRefusals:
     def test_thickness_of_a_fine_mesh(self) -> None:
         with pytest.raises(ValueError, match="thickness: must be less than the distance at rest"):
             Cloth(self.MESH, MATERIAL, CERTIFIED, self_contact=SelfContact(0.5, 0.009))
+
+    def test_bearing(self) -> None:
+        with pytest.raises(ValueError, match="bearing: must be one of all, vertices, first, got 'second'"):
+            SelfContact(0.5, bearing="second")
 
     def test_number_of_sheets(self) -> None:
         with pytest.raises(ValueError, match="mu: must be of 1 sheets"):

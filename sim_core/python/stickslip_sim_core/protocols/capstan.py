@@ -17,7 +17,7 @@ FRICTION = (0.1, 0.3, 0.8, 1.5)
 BENDING = (1e-4, 0.05)  # B / T1, B = D / (2 R^2)
 RADIUS, WRAP = 0.05, 2.0  # m, rad
 CELLS_PER_TURN = 72  # 5 degrees each
-FREE_CELLS = 24  # beyond the cylinder, on each side: many times sqrt(D/T1)
+FREE = 2.0 * np.pi / 3.0  # beyond the cylinder, on each side, over its radius: many times sqrt(D/T1)
 LIGHT = 2.0  # T1, N/m
 DENSITY, STRETCHING = 0.1, 2e4  # kg/m^2, N/m
 SPEED, DAMPING = 0.01, 2.0  # m/s, 1/s
@@ -88,6 +88,7 @@ class Strip:
         facets: Of a cylinder of triangles, all around; None: the cylinder is round.
         of_cloth: These triangles are another cloth, all of whose vertices are held.
         width: In cells.
+        cells_per_turn: How fine the strip is.
 
     Raises:
         ValueError: The cylinder is of cloth, and `facets` is None.
@@ -102,11 +103,12 @@ class Strip:
         *,
         of_cloth: bool = False,
         width: int = 2,
+        cells_per_turn: int = CELLS_PER_TURN,
     ) -> None:
         self.preset = preset
-        cell = 2.0 * np.pi * RADIUS / CELLS_PER_TURN
-        free = drawn = FREE_CELLS
-        cells = free + drawn + round(WRAP * RADIUS / cell)
+        cell = 2.0 * np.pi * RADIUS / cells_per_turn
+        free = round(FREE * RADIUS / cell)
+        cells = 2 * free + round(WRAP * RADIUS / cell)
         mesh = meshes.grid(cells * cell, width * cell, cells, width)
         along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * cell
         self.held = np.flatnonzero(along > along.max() - 0.1 * cell)
@@ -181,9 +183,9 @@ def tube(facets: int, breadth: float, mu: float) -> Surface:
 
 
 def cover(facets: int, breadth: float) -> tuple[meshes.Mesh, Floats]:
-    """Return a sheet around the arc that the strip lies on and three of its cells more, and its vertices (V, 3) [m]."""
+    """Return a sheet around the arc that the strip lies on and 30 degrees more, and its vertices (V, 3) [m]."""
     angle = 2.0 * np.pi / facets
-    cells = int(np.ceil((WRAP + 12.0 * np.pi / CELLS_PER_TURN) / angle))
+    cells = int(np.ceil((WRAP + np.pi / 6.0) / angle))
     radius = RADIUS - THICKNESS
     mesh = meshes.grid(cells * angle * radius, breadth, cells, max(2, round(breadth / (angle * radius))))
     at = 0.5 * WRAP + mesh.rest[:, 0] / radius
