@@ -157,8 +157,8 @@ def over_facets() -> None:
 
     Then over a held cloth on such a cylinder, which is rough, with a strip of cells of 5 degrees and of 2.5.
     """
-    cases = ((72, None, False), (72, 72, False), (72, 60, False), (72, 24, False))
-    cases += ((72, 60, True), (72, 120, True), (144, 60, True), (144, 120, True))
+    rigid = [(72, facets, False) for facets in (None, 72, 60, 24)]
+    cases = [*rigid, *((cells, facets, True) for cells in (72, 144) for facets in (60, 120))]
     for mu in capstan.FRICTION:
         for cells, facets, of_cloth in cases:
             strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth, cells_per_turn=cells)
