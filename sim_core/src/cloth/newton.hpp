@@ -37,8 +37,8 @@ class Newton {
   std::unique_ptr<Pairs> pairs;  // of cloth with cloth; null where it does not feel itself
   Buffer<double> residual;       // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
   ClothPhases phases;
-  int strained_max =
-      0;  // iterations in a row that are stopped short, or take all rounds, before an attempt is given up
+  // Iterations in a row that are stopped short, or take all rounds, after which an attempt is given up.
+  int strained_max = 0;
 
   // Solves for the free nodes of x, or leaves the best found in it; its held nodes are at their ends. `from_rest`:
   // begins at the start of the step, not where the velocity leads. GMRES stops at `krylov_tolerance` of its right-hand
