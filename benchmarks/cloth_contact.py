@@ -155,10 +155,11 @@ def momentum_all() -> None:
 def over_facets() -> None:
     """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells, shorter and longer.
 
-    Then over a held cloth on such a cylinder, which is rough, with a strip of cells of 5 degrees and of 2.5.
+    Then over a held cloth on such a cylinder, which is rough, with strips of cells of 5 to 2.5 degrees.
     """
     rigid = [(72, facets, False) for facets in (None, 72, 60, 24)]
-    cases = [*rigid, *((cells, facets, True) for cells in (72, 144) for facets in (60, 120))]
+    of_cloth_cases = ((72, 60), (72, 120), (96, 120), (120, 90), (144, 60), (144, 120))
+    cases = [*rigid, *((cells, facets, True) for cells, facets in of_cloth_cases)]
     for mu in capstan.FRICTION:
         for cells, facets, of_cloth in cases:
             strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth, cells_per_turn=cells)
