@@ -173,6 +173,12 @@ class TestDropAndDrag:
 
 
 class TestClothOnCloth:
+    @pytest.mark.parametrize("substrate", fabric_names())
+    def test_a_stretched_cloth_lies_still(self, substrate: str) -> None:
+        """Until it is touched: the first frames."""
+        others = drop_on_cloth("gray-interlock", substrate, 0.4, vertices=9, frames=2, seed=1).others
+        assert np.abs(others - others[0]).max() < 1e-9
+
     def test_a_stretched_cloth_is_a_floor_of_the_same_friction(self) -> None:
         floor = drop_and_drag("gray-interlock", 0.4, vertices=9, frames=80)
         cloth = drop_on_cloth("gray-interlock", "11oz-black-denim", 0.4, vertices=9, frames=80)

@@ -16,8 +16,9 @@ from stickslip_sim_core.cloth.solver import SELF_FRICTION, THICKNESS, Cloth, Sel
 BEHIND, LENGTH, WIDTH = 0.15, 0.6, 0.3
 """Of the stretched cloth [m]: how far behind the holders it begins, and its sides along x and y."""
 
-STRETCH = 0.01
-"""Its strain along both, as it is fixed all around."""
+STRETCH = (0.01, 0.005)
+"""Its strain along each, as it is fixed all around. Equal ones would have no principal direction, from which the
+stiffness is read: each triangle would take another one by rounding, and the cloth would tremble."""
 
 FLOOR_FRICTION = 0.5
 """Of the stretched cloth with the floor below it."""
@@ -95,10 +96,10 @@ class Stretched:
 
 def stretched(cells: int) -> Stretched:
     """Return a cloth of so many cells a side, its warp along x, under the whole way of the dragged one."""
-    mesh = meshes.grid(LENGTH / (1.0 + STRETCH), WIDTH / (1.0 + STRETCH), cells, cells)
+    mesh = meshes.grid(LENGTH / (1.0 + STRETCH[0]), WIDTH / (1.0 + STRETCH[1]), cells, cells)
     half = np.abs(mesh.rest).max(axis=0) - 1e-9
     positions = np.zeros((len(mesh.rest), 3))
-    positions[:, :2] = (1.0 + STRETCH) * mesh.rest + np.array([0.5 * LENGTH - BEHIND, 0.0])
+    positions[:, :2] = (1.0 + np.array(STRETCH)) * mesh.rest + np.array([0.5 * LENGTH - BEHIND, 0.0])
     positions[:, 2] = -THICKNESS
     return Stretched(mesh, np.flatnonzero((np.abs(mesh.rest) > half).any(axis=1)), positions)
 
