@@ -16,10 +16,10 @@ constexpr double factor_work = 9.0, newton_work = 1.5;
 // Longer steps may cost so much more per time than shorter ones before they are given up, and are forgiven so much of
 // it with each step.
 constexpr double dearer = 1.1, forgiving = 0.98, memory = 0.7;
-// Times that a step may be halved further than the error asks for, where it is not solved, and where it is not near
-// other cloth: there halving is cheaper than other ways to solve it. Such steps grow again after one that took no more
-// iterations than this.
-constexpr int hard = 2, hard_near = 4, easy = 6;
+// Times that a step may be halved further than the error asks for, where it is not solved; such steps grow again after
+// one that took no more iterations than this. Near other cloth all steps take more, and halving is cheaper than other
+// ways to solve them.
+constexpr int hard = 2, hard_near = 4, easy = 6, easy_near = 15;
 
 int level_of(int steps, const char* name) {
   int level = 0;
@@ -74,7 +74,8 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
     const Drive drive = motion(begin + (end - begin) * (tick + size) / all);
     StepReport report;
     const bool solved = stepper_.attempt(dt, drive, report);
-    const int last = stepper_.near() ? last_ : finest_ + hard;
+    const bool near = stepper_.near();
+    const int last = near ? last_ : finest_ + hard;
     const double missed = stepper_.missed() / control_.error;
     if (solved ? level_ < finest_ && missed > reject_at : level_ < last) {
       stepper_.reject();
@@ -94,7 +95,8 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
     learn(level_, work_of(report), share);
     total.add(report);
     tick += size;
-    const bool grows = level_ > finest_ ? report.newton <= easy : missed < grow_at && worth_growing(level_);
+    const bool grows =
+        level_ > finest_ ? report.newton <= (near ? easy_near : easy) : missed < grow_at && worth_growing(level_);
     if (grows && tick % ticks(level_ - 1) == 0) --level_;
   }
   return total;
