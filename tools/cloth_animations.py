@@ -118,6 +118,7 @@ def render(folder: Path, out: Path, names: list[str]) -> None:
     from stickslip_schemas.store import DirectoryStore
     from stickslip_schemas.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 
+    out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as store_folder:
         store = DirectoryStore(store_folder)
         actor = RenderActor(store_folder)
