@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler
 
@@ -35,6 +35,8 @@ class Proxy:
     fault: Fault = no_fault
     counts: Counter[str] = field(default_factory=Counter)
     """How many requests there were, by method, and faults, by name."""
+    one_by_one: threading.Lock = field(default_factory=threading.Lock)
+    """Held while the server answers a conditional request."""
 
     def some(self, seed: int, shares: dict[str, float]) -> None:
         """Let faults happen at random, each to its share of the requests."""
@@ -64,7 +66,10 @@ def _handler(proxy: Proxy) -> type[BaseHTTPRequestHandler]:
                 time.sleep(0.3)
             if fault in ("503", "409", "500"):
                 return self._answer(int(fault), {"Content-Type": "application/xml"}, f"<Error>{fault}</Error>".encode())
-            status, headers, answer = self._ask(body)
+            # S3 looks and writes at once; moto does one after the other, and lets two writers of one object win.
+            conditional = self.command == "PUT" and "If-None-Match" in self.headers
+            with proxy.one_by_one if conditional else nullcontext():
+                status, headers, answer = self._ask(body)
             if fault == "lost answer":  # done, but nobody hears of it
                 return self._hang_up()
             if fault == "torn download":
