@@ -31,10 +31,11 @@ import httpx
 import numpy as np
 from plan import coordinator, peak_megabytes, spec
 from sqlalchemy import text
-from stickslip_schemas.chunks import encode_chunk, encode_shard
-from stickslip_schemas.layout import layout
+from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
+from stickslip_schemas.format.chunks import encode_chunk, encode_shard
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import FileEntry, PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, parsed

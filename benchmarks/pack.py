@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.documents.tasks import ChunkRef, PackSlot, PackTask, RecordRef
+from stickslip_schemas.format.chunks import encode_chunk
+from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
-from stickslip_schemas.layout import layout
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import ChunkRef, PackSlot, PackTask, RecordRef
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.records import encode_records
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from stickslip_schemas.builds import Builds
+from stickslip_schemas.plan.builds import Builds
 
 
 def spec(samples: int, *, start: float) -> dict[str, Any]:

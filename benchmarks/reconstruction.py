@@ -25,7 +25,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another
 import numpy as np  # noqa: E402
 import numpy.typing as npt  # noqa: E402
 from rod_families import RANGES, varying_rods  # noqa: E402
-from stickslip_schemas.cameras import load_rig  # noqa: E402
+from stickslip_schemas.spec.cameras import load_rig  # noqa: E402
 from stickslip_sim_core import solve_rods  # noqa: E402
 from stickslip_training.reconstruction import Reconstruction, Verdict, reconstruct  # noqa: E402
 from stickslip_training.reconstruction.hull import moving_cylinder, visual_hull  # noqa: E402

@@ -48,14 +48,14 @@ from stickslip_blender.stage import Shot
 from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.textures import texture_image
 from stickslip_blender.workshop import Workshop
-from stickslip_schemas.cameras import load_rig, rig_digest
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.codecs import decode_clip
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
+from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.cameras import load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
-from stickslip_schemas.textures import Texture
 
 MATERIAL = "gray-interlock"
 TEXTURES = tuple(Texture)[:8]

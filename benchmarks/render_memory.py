@@ -13,9 +13,9 @@ import numpy as np
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.holders import Holders
 from stickslip_blender.textures import texture_image
-from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
 
 LENGTH = 20
 SIDE = 32

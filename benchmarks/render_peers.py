@@ -20,7 +20,7 @@ import numpy as np
 from render_cloth import COMPARED, TEXTURES, Bench, View, decibels, shots, squared
 from stickslip_blender.engine import CLOTH_SAMPLING, Sampling
 from stickslip_blender.multiplexed import encode
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.jobs import Quality
 
 LADDER = (8, 16, 32, 64)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from stickslip_blender.color import silicone_color
 from stickslip_blender.scenes.rod_hang import RodRenderer
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.jobs import Quality
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from stickslip_blender.blender import import_bpy
 from stickslip_blender.color import silicone_color
 from stickslip_blender.engine import REFERENCE, SAMPLING, Sampling
 from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, POINTS, RodRenderer
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 
 OTHERS = {
     f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(samples=samples, denoiser=denoiser)

@@ -19,12 +19,12 @@ from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.holders import Holders
 from stickslip_blender.preview import sheet
 from stickslip_blender.textures import texture_image
-from stickslip_schemas.cameras import load_rig, rig_digest
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.drag_stage import HELD_OUT_VIEWPOINTS
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.kinds.cloth.drag_scene import HELD_OUT_VIEWPOINTS
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.textures import HELD_OUT_TEXTURES, Texture
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.cameras import load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import HELD_OUT_TEXTURES, Texture
+from stickslip_schemas.spec.jobs import Quality
 
 Clip = npt.NDArray[np.uint8]
 

@@ -27,7 +27,7 @@ from stickslip_blender.looks import look_of
 from stickslip_blender.raster import projected, see, window_about
 from stickslip_blender.substrates import drawn_substrate
 from stickslip_blender.view import set_view
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 
 VIEWS = ("calibrated", "left", "right")
 

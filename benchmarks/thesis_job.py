@@ -22,7 +22,7 @@ from typing import Any
 import httpx
 import numpy as np
 import yaml
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.format.manifest import Manifest
 from stickslip_training.data.reader import DatasetReader
 
 SPEC = Path(__file__).parents[1] / "examples" / "thesis-rods.yaml"

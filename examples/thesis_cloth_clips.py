@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import yaml
 from demo import console, run, service
+from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
-from stickslip_schemas.manifest import Manifest
 from stickslip_services.client.http import Client
 from thesis_cloth_simulations import DATABASE
 

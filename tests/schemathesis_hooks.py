@@ -11,9 +11,9 @@ import schemathesis
 from hypothesis import strategies as st
 from PIL import Image
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.worker_api import ReportBatch
 from stickslip_schemas.kinds import AnyJobSpec
-from stickslip_schemas.worker_api import ReportBatch
 
 RELATIONS = (
     "low must be less than high",

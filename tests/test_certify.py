@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stickslip_schemas.certificate import CONTACT_PROTOCOLS, CertificateUpload
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.format.manifest import Manifest
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.cli import app
 from stickslip_services.client.http import Client
 from stickslip_services.local.certifying import read_certificate

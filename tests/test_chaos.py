@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 import yaml
 from harness import STICKSLIP, Service, command_line, descendants, read_arrays, wait_for
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.format.manifest import MANIFEST_NAME, SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import MANIFEST_NAME, SEAL_NAME, SEALED_NAMES, Manifest
-from stickslip_schemas.samples import samples
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import samples
 from stickslip_schemas.store import DirectoryStore, Store, open_store
 from stickslip_services.database.opening import connect
 from stickslip_services.queue.audit import audit

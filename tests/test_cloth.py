@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import STICKSLIP, Service, read_arrays
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.cloth import SEGMENTS
+from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth.spec import SEGMENTS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_sim_core import drop_and_drag
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.kinds.cloth_drag import ClipDataset

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from harness import Service, read_arrays
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.samples import dataset_id
+from stickslip_schemas.plan.points import dataset_id
 from stickslip_training.kinds import open_samples
 
 SPEC: dict[str, Any] = {

@@ -22,7 +22,7 @@ import pytest
 import yaml
 from harness import STICKSLIP, Service
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.scene_file import SceneFile
+from stickslip_schemas.spec.scene_file import SceneFile
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

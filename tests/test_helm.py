@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 import pytest
 import yaml
-from stickslip_schemas.states import JobState, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_services.coordinator import GRACE_SECONDS, make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import HttpApi, PretendWorker, failure, rods, serving

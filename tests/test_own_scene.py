@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from stickslip_schemas.certificate import Certificate, CurveReport, ProtocolReport
-from stickslip_schemas.scene_file import SceneFile
+from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
+from stickslip_schemas.spec.scene_file import SceneFile
 from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS
 from stickslip_workers.builds import solver_build

@@ -111,12 +111,12 @@ def render(folder: Path, out: Path, names: list[str]) -> None:
     """Render what was simulated, by the worker's actor, and write moving pictures."""
     from stickslip_blender.actor import RenderActor
     from stickslip_blender.preview import moving
-    from stickslip_schemas.cameras import load_rig, rig_digest
-    from stickslip_schemas.clips import shown_frames
-    from stickslip_schemas.codecs import decode_clip
+    from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
+    from stickslip_schemas.format.codecs import decode_clip
     from stickslip_schemas.kinds import kind_named
+    from stickslip_schemas.spec.appearance import shown_frames
+    from stickslip_schemas.spec.cameras import load_rig, rig_digest
     from stickslip_schemas.store import DirectoryStore
-    from stickslip_schemas.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as store_folder:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_training.data.reader import DatasetReader
 from stickslip_workers.stages.preview import labelled, moving, sheet, text_of
 

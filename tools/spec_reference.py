@@ -8,10 +8,10 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from stickslip_schemas.appearance import Calibration, FloorNumbers, LampNumbers
-from stickslip_schemas.base import Document
-from stickslip_schemas.fabrics import FabricNumbers
+from stickslip_schemas.base.document import Document
 from stickslip_schemas.kinds import KINDS
+from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
+from stickslip_schemas.spec.fabrics import FabricNumbers
 
 HEAD = """# Every key of a spec
 

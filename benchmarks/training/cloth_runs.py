@@ -22,7 +22,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another
 
 import numpy as np  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
-from stickslip_schemas.clips import shown_frames  # noqa: E402
+from stickslip_schemas.spec.appearance import shown_frames  # noqa: E402
 from stickslip_sim_core import build_info, drop_and_drag, fabric_names  # noqa: E402
 from stickslip_sim_core.cloth import fabric as fabric_named  # noqa: E402
 from stickslip_training.cloth.runs import STEP, write_packed  # noqa: E402

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import predictions
 from stickslip_training.cloth.runs import grid_order, load_runs, write_packed

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.cloth.render import silhouettes
 from stickslip_training.cloth.runs import load_runs
 from stickslip_training.cloth.training import RIG, frames_at

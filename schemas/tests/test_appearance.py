@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from PIL import Image
 from pydantic import ValidationError
-from stickslip_schemas.appearance import Calibration
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.cloth import ClothRender, Lighting, Substrate
-from stickslip_schemas.drag_stage import Viewpoint
+from stickslip_schemas.documents.problems import field_errors
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.pictures import MAX_BYTES, UnfitPictureError, read_picture
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
+from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
+from stickslip_schemas.kinds.cloth.spec import ClothRender, Lighting, Substrate
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
-from stickslip_schemas.layout import layout
-from stickslip_schemas.pictures import MAX_BYTES, UnfitPictureError, read_picture
-from stickslip_schemas.problems import field_errors
-from stickslip_schemas.samples import samples
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import samples
+from stickslip_schemas.spec.appearance import Calibration
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.fabrics import Texture
 
 BUILDS = Builds(sim_core="1" * 64, simulate="2" * 64, render="3" * 64, pack="4" * 64)
 LAB: dict[str, Any] = {

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
-from stickslip_schemas.axes import axis_values
 from stickslip_schemas.kinds.rod_hang import GammaAxis
+from stickslip_schemas.spec.axes import axis_values
 
 _AXIS: TypeAdapter[Any] = TypeAdapter(GammaAxis)
 

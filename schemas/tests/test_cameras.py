@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
-from stickslip_schemas.drag_stage import Viewpoint
+from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
+from stickslip_schemas.spec.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
 
 LEVEL = Camera(  # three units in front of the origin on the x axis, looking back at it
     name="level",

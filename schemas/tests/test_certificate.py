@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.certificate import Certificate
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.samples import publish_key, samples
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import publish_key, samples
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 

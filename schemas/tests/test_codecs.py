@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.chunks import CorruptChunkError, decode_chunk, encode_chunk
-from stickslip_schemas.codecs import axes_order, decode_sample, encode_sample
+from stickslip_schemas.format.chunks import CorruptChunkError, decode_chunk, encode_chunk
+from stickslip_schemas.format.codecs import axes_order, decode_sample, encode_sample
+from stickslip_schemas.spec.arrays import ArrayLayout
 
 SHAPE = (6, 24, 20, 3)
 CLIP = ArrayLayout("video", "uint8", SHAPE, ("frame", "y", "x", "rgb"), "", per_sample=True, is_clip=True)

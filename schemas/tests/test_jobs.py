@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import ValidationError
-from stickslip_schemas.certificate import CONTACT_PROTOCOLS
-from stickslip_schemas.cloth import SELF_FRICTION
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.documents.problems import FieldError, field_errors
+from stickslip_schemas.documents.tasks import PackTask, SimulateTask
 from stickslip_schemas.kinds import KINDS, AnyJobSpec, job_spec_adapter, stored_spec_adapter
+from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
-from stickslip_schemas.problems import FieldError, field_errors
-from stickslip_schemas.states import Stage
-from stickslip_schemas.tasks import PackTask, SimulateTask
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.scene_file import SceneFile
+from stickslip_schemas.spec.scene_file import SceneFile
 
 SCENE: dict[str, Any] = {
     "format": "stickslip-scene/1",

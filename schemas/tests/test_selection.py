@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from stickslip_schemas.arrays import COMMON_ARRAYS, ArrayLayout
-from stickslip_schemas.selection import Selection
+from stickslip_schemas.format.selection import Selection
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 
 ARRAYS = (
     ArrayLayout("video", "uint8", (2, 8, 8, 3), ("frame", "y", "x", "rgb"), "clip", per_sample=True),

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zarr
 import zarr.storage
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import (
     CorruptArtifactError,
     DirectoryStore,

@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.events import DatasetPublishedEvent, JobStateEvent
+from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStateEvent
 from stickslip_services.client import AsyncClient, Client, ProblemError, UnreachableError, verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.certificate import Certificate, CertificateUpload, CurveReport, ProtocolReport
+from stickslip_schemas.documents.certificate import Certificate, CertificateUpload, CurveReport, ProtocolReport
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import BUILDS, PretendWorker, parsed, rejection, rods, serving, wait_until

@@ -7,9 +7,10 @@ import httpx
 import pytest
 from fastapi import FastAPI
 from sqlalchemy import update
-from stickslip_schemas.certificate import CONTACT_PROTOCOLS, Certificate, CertificateUpload
-from stickslip_schemas.manifest import Manifest
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
+from stickslip_schemas.format.manifest import Manifest
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.coordinator import make_app
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import PresetNotCertifiedError

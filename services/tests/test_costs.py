@@ -2,10 +2,10 @@
 
 import pytest
 from sqlalchemy import select
-from stickslip_schemas.responses import Eta
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.tasks import TaskResult
-from stickslip_schemas.worker_api import Heartbeat, Lease, LeaseRequest, LeaseState
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import Eta
+from stickslip_schemas.documents.tasks import TaskResult
+from stickslip_schemas.documents.worker_api import Heartbeat, Lease, LeaseRequest, LeaseState
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.database.tables import cost_groups
 from stickslip_services.errors import ConflictError

@@ -4,10 +4,9 @@ import re
 from typing import Any
 
 import pytest
-from stickslip_schemas.manifest import Contents, Manifest
-from stickslip_schemas.samples import dataset_id, samples
-from stickslip_schemas.states import Reason
-from stickslip_schemas.tasks import Rejection
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.format.manifest import Contents, Manifest, Rejection
+from stickslip_schemas.plan.points import dataset_id, samples
 from stickslip_services.coordinator import make_app
 from stickslip_services.pages.dataset_page import LISTED, dataset_page
 from stickslip_services.settings import Settings

@@ -11,7 +11,7 @@ import pytest
 import tensorstore
 import xarray
 import zarr
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import httpx
 import pytest
 from sqlalchemy import select
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import open_store
 from stickslip_services import upkeep
 from stickslip_services.addresses import DATABASE_VARIABLE

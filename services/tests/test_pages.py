@@ -9,8 +9,8 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import JobState
 from stickslip_services.api.routes.pages import _changes
 from stickslip_services.coordinator import make_app
 from stickslip_services.pages.pictures import line_plot, png

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from stickslip_schemas.selection import SELECTION_NAME, Selection
+from stickslip_schemas.format.selection import SELECTION_NAME, Selection
 from stickslip_services.cli import app
 from stickslip_services.client.comparing import differences
 from stickslip_services.client.http import Client

@@ -6,8 +6,8 @@ from typing import Any
 import httpx
 import pytest
 from sqlalchemy import select
-from stickslip_schemas.responses import Progress
-from stickslip_schemas.states import JobState, Reason, Stage
+from stickslip_schemas.base.states import JobState, Reason, Stage
+from stickslip_schemas.documents.responses import Progress
 from stickslip_services.cli import wording
 from stickslip_services.cli.main import app
 from stickslip_services.coordinator import make_app

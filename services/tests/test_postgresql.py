@@ -17,7 +17,7 @@ import pytest
 from httpx_sse import connect_sse
 from sqlalchemy import func, select, text
 from sqlalchemy.exc import OperationalError
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.states import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.cli import app

@@ -6,7 +6,7 @@ from typing import Any
 
 import httpx
 import pytest
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.states import JobState
 from stickslip_services.cli.main import app
 from stickslip_services.coordinator import make_app
 from stickslip_services.errors import QuotaExceededError

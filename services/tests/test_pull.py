@@ -6,8 +6,8 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import Contents, Manifest, seal_text, with_manifest_digest
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.format.manifest import Contents, Manifest, seal_text, with_manifest_digest
 from stickslip_services.client.http import Client, ProblemError, UnexpectedError, UnreachableError
 from stickslip_services.client.pulling import (
     DamagedError,

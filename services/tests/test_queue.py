@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 from sqlalchemy import select, update
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.manifest import Manifest
-from stickslip_schemas.responses import Dataset
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.tasks import PackTask, PublishSection, PublishTask, RenderTask
-from stickslip_schemas.worker_api import LeaseRequest
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import Dataset
+from stickslip_schemas.documents.tasks import PackTask, PublishSection, PublishTask, RenderTask
+from stickslip_schemas.documents.worker_api import LeaseRequest
+from stickslip_schemas.format.manifest import Manifest
+from stickslip_schemas.plan.builds import Builds
 from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import jobs, tasks

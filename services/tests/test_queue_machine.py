@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
 from sqlalchemy import select
-from stickslip_schemas.states import JobState, Reason
-from stickslip_schemas.worker_api import Lease
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.documents.worker_api import Lease
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.audit import audit

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import text
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import MANIFEST_NAME
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import JobState
+from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.cli import app
 from stickslip_services.coordinator import main

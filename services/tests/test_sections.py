@@ -9,10 +9,10 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
-from stickslip_schemas.selection import Selection
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
+from stickslip_schemas.format.selection import Selection
 from stickslip_services.cli import app
 from stickslip_services.client.aio import AsyncClient
 from stickslip_services.client.http import Client
@@ -33,7 +33,7 @@ SECTIONS = [f"manifest/{number}.json" for number in range(4)]
 
 @pytest.fixture(autouse=True)
 def small_sections(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stickslip_schemas.manifest.SECTION_SAMPLES", 3)
+    monkeypatch.setattr("stickslip_schemas.format.manifest.SECTION_SAMPLES", 3)
 
 
 @pytest.fixture

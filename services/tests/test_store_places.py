@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import zarr
 import zarr.storage
-from stickslip_schemas.responses import JobDetail
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.documents.responses import JobDetail
 from stickslip_services import coordinator as program
 from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.base.states import JobState, Reason
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.store_watch import HOLD_SECONDS

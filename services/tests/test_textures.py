@@ -10,9 +10,9 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
-from stickslip_schemas.keys import referred
-from stickslip_schemas.responses import JobDetail
-from stickslip_schemas.tasks import RenderTask
+from stickslip_schemas.base.keys import referred
+from stickslip_schemas.documents.responses import JobDetail
+from stickslip_schemas.documents.tasks import RenderTask
 from stickslip_services.cli import app
 from stickslip_services.client import AsyncClient, Client
 from stickslip_services.client.http import ProblemError

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stickslip_schemas.manifest import MANIFEST_NAME
-from stickslip_schemas.responses import JobDetail
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.states import JobState
+from stickslip_schemas.documents.responses import JobDetail
+from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services import upkeep
 from stickslip_services.catalog.versions import damaged_files

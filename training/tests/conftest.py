@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.format.layout import layout, samples_per_file
+from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry, Manifest, Rejection
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
-from stickslip_schemas.layout import layout, samples_per_file
-from stickslip_schemas.manifest import MANIFEST_NAME, Manifest
-from stickslip_schemas.samples import SPLITS, dataset_id, samples
-from stickslip_schemas.states import Reason
-from stickslip_schemas.tasks import FileEntry, Rejection
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import dataset_id, samples
+from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout, describe
+from stickslip_schemas.spec.jobs import SPLITS
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
 POINTS = 150

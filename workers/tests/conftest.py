@@ -11,23 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, RecordRef
+from stickslip_schemas.format.chunks import encode_chunk
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import FileEntry, Rejection
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
-from stickslip_schemas.layout import layout
-from stickslip_schemas.samples import dataset_id, samples
-from stickslip_schemas.states import Reason
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import dataset_id, samples
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import (
-    ChunkRef,
-    FileEntry,
-    PackOutput,
-    PackSlot,
-    PackTask,
-    PublishTask,
-    RecordRef,
-    Rejection,
-)
 from stickslip_workers.cluster import Cluster
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish

@@ -7,8 +7,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from pydantic import BaseModel
-from stickslip_schemas.tasks import TaskResult
-from stickslip_schemas.worker_api import (
+from stickslip_schemas.documents.tasks import TaskResult
+from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
     Lease,

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from stickslip_schemas.chunks import encode_chunk
+from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, RenderTask, TaskResult
+from stickslip_schemas.format.chunks import encode_chunk
 from stickslip_schemas.store import open_store
-from stickslip_schemas.tasks import ChunkRef, RenderOutput, RenderTask, TaskResult
 
 BUILD = "2" * 64
 FINE, DISK_FULL, BUG, UNTIL_RELEASED = range(4)

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.manifest import section_samples
-from stickslip_schemas.samples import dataset_id
+from stickslip_schemas.documents.tasks import PackOutput, PublishSection, PublishTask
+from stickslip_schemas.format.manifest import Rejection, section_samples
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import PackOutput, PublishSection, PublishTask, Rejection
 
 
 def publish_task(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.sources import UNCOUNTED, sources
+from stickslip_schemas.plan.sources import UNCOUNTED, sources
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_workers import builds
 from stickslip_workers.kinds import kind
@@ -41,7 +41,7 @@ def note(frame, event, argument):
     if event == "call" and frame.f_code.co_name != "<module>":
         ran.add(frame.f_code.co_filename)
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import task_adapter
+from stickslip_schemas.documents.tasks import task_adapter
 from stickslip_workers.stages.actor import StageActor
 actor = StageActor(sys.argv[2])
 import stickslip_sim_core, stickslip_workers.stages.simulate  # what is run at import is no work

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stickslip_schemas.certificate import Certificate
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import Certification, plots
 from stickslip_workers.__main__ import main

@@ -13,20 +13,20 @@ import xarray
 import zarr
 from PIL import Image
 from publishing import publish_task
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.chunks import encode_trajectory
-from stickslip_schemas.cloth import PICTURE_DECIBELS
-from stickslip_schemas.codecs import encode_clip
-from stickslip_schemas.drag_stage import Viewpoint
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, SimulateTask
+from stickslip_schemas.format.chunks import encode_trajectory
+from stickslip_schemas.format.codecs import encode_clip
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import Manifest, Pictures, Rejection
+from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
+from stickslip_schemas.kinds.cloth.spec import PICTURE_DECIBELS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Manifest, Pictures
-from stickslip_schemas.samples import dataset_id, samples
-from stickslip_schemas.states import Reason
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import dataset_id, samples
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, Rejection, SimulateTask
 from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_workers.stages import pack as pack_module

@@ -11,11 +11,11 @@ from typing import Any
 import fake_renderer
 import pytest
 from coordinator_double import CoordinatorDouble
+from stickslip_schemas.base.states import Reason, Stage
+from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
-from stickslip_schemas.states import Reason, Stage
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_workers.cluster import Cluster
 from stickslip_workers.coordinator_client import SupersededError
 from stickslip_workers.dispatcher import Dispatcher

@@ -4,8 +4,8 @@ import errno
 
 import pytest
 from ray import exceptions as ray_errors
-from stickslip_schemas.chunks import CorruptChunkError
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.format.chunks import CorruptChunkError
 from stickslip_schemas.store import CorruptArtifactError
 from stickslip_workers.failures import MESSAGE_LENGTH, failure, process_failure
 

@@ -3,7 +3,7 @@
 import threading
 from typing import Any, cast
 
-from stickslip_schemas.worker_api import Heartbeat, HeartbeatAnswer, WorkerSession
+from stickslip_schemas.documents.worker_api import Heartbeat, HeartbeatAnswer, WorkerSession
 from stickslip_workers.heartbeat import HeartbeatThread
 from stickslip_workers.leases import LeaseBook
 

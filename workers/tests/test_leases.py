@@ -1,8 +1,8 @@
 """The lease book: what a late answer says of an old lease does not touch a new one."""
 
+from stickslip_schemas.documents.tasks import SimulateTask
+from stickslip_schemas.documents.worker_api import Lease
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
-from stickslip_schemas.tasks import SimulateTask
-from stickslip_schemas.worker_api import Lease
 from stickslip_workers.leases import LeaseBook
 
 

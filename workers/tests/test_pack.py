@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import zarr
-from stickslip_schemas.layout import layout
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import ChunkRef, PackTask
+from stickslip_schemas.format.layout import layout
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import ChunkRef, PackTask
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.run import run_tasks

@@ -12,10 +12,10 @@ import xarray
 import zarr
 from PIL import Image
 from publishing import changed
-from stickslip_schemas.jobs import Quality
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.format.manifest import Contents, Manifest, Pictures, check_seal
 from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
-from stickslip_schemas.manifest import Contents, Manifest, Pictures, check_seal
+from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.publish import publish
 
@@ -63,7 +63,7 @@ def test_a_version_of_many_samples_has_sections(make_dataset: Make, monkeypatch:
     """The same version with and without sections: other lists, and the same files."""
     made = make_dataset(count=7, per_shard=2, rejected=(2, 5))
     whole = _tree(made.publish())
-    monkeypatch.setattr("stickslip_schemas.manifest.SECTION_SAMPLES", 5)
+    monkeypatch.setattr("stickslip_schemas.format.manifest.SECTION_SAMPLES", 5)
     directory = made.publish()
     tree = _tree(directory)
     names = ["manifest/0.json", "manifest/1.json"]
@@ -91,7 +91,7 @@ def test_a_version_of_many_samples_has_sections(make_dataset: Make, monkeypatch:
 
 
 def test_labels_have_large_chunks(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stickslip_schemas.arrays.LABEL_SAMPLES", 3)
+    monkeypatch.setattr("stickslip_schemas.spec.arrays.LABEL_SAMPLES", 3)
     made = make_dataset(count=7, per_shard=2, rejected=(2,))
     directory = made.publish()
     assert sorted(path.name for path in (directory / "gamma/c").iterdir()) == ["0", "1", "2"]

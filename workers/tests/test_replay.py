@@ -6,11 +6,11 @@ from pathlib import Path
 
 import fake_renderer
 import pytest
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTask, TaskResult, task_adapter
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
-from stickslip_schemas.states import Reason
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import RecordRef, RenderTask, SimulateTask, TaskResult, task_adapter
 from stickslip_workers.__main__ import main
 from stickslip_workers.replay import replay
 

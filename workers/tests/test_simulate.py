@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import stickslip_sim_core
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
-from stickslip_schemas.states import Reason
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import SimulateTask, TaskResult
 from stickslip_workers.stages.run import run_tasks
 
 

@@ -1,10 +1,10 @@
 """Renders that share a trace are put together, and their result is taken apart again."""
 
 import pytest
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
-from stickslip_schemas.states import Reason
-from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_workers.together import apart, together, trace_of
 
 RECORD = RecordRef(digest="d" * 64, row=0)

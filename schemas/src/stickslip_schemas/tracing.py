@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from stickslip_schemas.tasks import TaskResult
-from stickslip_schemas.worker_api import Lease
+from stickslip_schemas.documents.tasks import TaskResult
+from stickslip_schemas.documents.worker_api import Lease
 
 ENDPOINT = "OTEL_EXPORTER_OTLP_ENDPOINT"
 """Environment variable with the URL of a collector; the other variables of OpenTelemetry's SDK hold as well."""

@@ -15,7 +15,7 @@ StickslipError
 
 from collections.abc import Sequence
 
-from stickslip_schemas.problems import FieldError
+from stickslip_schemas.documents.problems import FieldError
 
 
 class StickslipError(Exception):

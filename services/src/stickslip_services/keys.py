@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from sqlalchemy import Connection, insert, select, update
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.clock import as_datetime

@@ -20,29 +20,10 @@ import uvicorn
 from fastapi import FastAPI
 from pydantic import BaseModel
 from stickslip_schemas import tracing
-from stickslip_schemas.arrays import FORMAT, ArrayLayout
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.chunks import decode_chunk, decode_shard_index, encode_chunk, encode_shard
-from stickslip_schemas.codecs import encode_sample
-from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.layout import layout, samples_per_file
-from stickslip_schemas.manifest import (
-    GROUP_NAME,
-    MANIFEST_NAME,
-    SEAL_NAME,
-    Manifest,
-    has_sections,
-    seal_text,
-    section_path,
-    with_manifest_digest,
-)
-from stickslip_schemas.responses import Dataset, Job, JobDetail
-from stickslip_schemas.states import Reason, Stage
-from stickslip_schemas.store import DirectoryStore, Store
-from stickslip_schemas.tasks import (
+from stickslip_schemas.base.states import Reason, Stage
+from stickslip_schemas.documents.responses import Dataset, Job, JobDetail
+from stickslip_schemas.documents.tasks import (
     ChunkRef,
-    FileEntry,
-    ManifestSection,
     PackOutput,
     PackTask,
     PublishOutput,
@@ -54,7 +35,7 @@ from stickslip_schemas.tasks import (
     TaskResult,
     input_digests,
 )
-from stickslip_schemas.worker_api import (
+from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
     Lease,
@@ -67,6 +48,25 @@ from stickslip_schemas.worker_api import (
     WorkerRegistration,
     WorkerSession,
 )
+from stickslip_schemas.format.chunks import decode_chunk, decode_shard_index, encode_chunk, encode_shard
+from stickslip_schemas.format.codecs import encode_sample
+from stickslip_schemas.format.layout import layout, samples_per_file
+from stickslip_schemas.format.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    FileEntry,
+    Manifest,
+    ManifestSection,
+    has_sections,
+    seal_text,
+    section_path,
+    with_manifest_digest,
+)
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
+from stickslip_schemas.store import DirectoryStore, Store
 
 from stickslip_services.api.connections import PatientProtocol
 from stickslip_services.catalog import datasets

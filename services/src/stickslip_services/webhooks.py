@@ -18,7 +18,7 @@ from datetime import datetime
 import httpx
 from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select, update
 from standardwebhooks import Webhook as Signer
-from stickslip_schemas.events import EventName
+from stickslip_schemas.documents.responses import EventName
 
 from stickslip_services.addresses import is_loopback
 from stickslip_services.clock import Clock, as_datetime

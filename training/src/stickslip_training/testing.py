@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Array, Floats, SingleFloats
 from stickslip_training.cloth.crop import stage

@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.cli import app
 from stickslip_training.cloth.clips import read_clips
 from stickslip_training.cloth.crop import HEIGHT, WIDTH

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, stage
 from stickslip_training.cloth.render import (
     draw_textures,

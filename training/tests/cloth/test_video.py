@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
 from stickslip_training.cloth.training import INSTANTS

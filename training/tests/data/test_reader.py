@@ -9,8 +9,8 @@ import google_crc32c
 import numpy as np
 import pytest
 import zarr
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_training.data.errors import (
     CorruptDataError,
     DatasetError,
@@ -216,7 +216,7 @@ def test_a_valid_sample_without_a_chunk_raises(clips, tmp_path):
 
 def test_a_chunk_of_another_size_raises(clips, tmp_path):
     """A smaller chunk with a good checksum would leave a part of the buffer as it was."""
-    from stickslip_schemas.chunks import encode_chunk, encode_shard
+    from stickslip_schemas.format.chunks import encode_chunk, encode_shard
 
     made = clips.copy(tmp_path / "v1")
     shape = made.arrays["video"].shape[1:]

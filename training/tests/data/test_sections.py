@@ -4,9 +4,8 @@ import pickle
 
 import numpy as np
 import pytest
-from stickslip_schemas.keys import canonical_json, sha256
-from stickslip_schemas.manifest import section_path, section_samples
-from stickslip_schemas.tasks import FileEntry, ManifestSection
+from stickslip_schemas.base.keys import canonical_json, sha256
+from stickslip_schemas.format.manifest import FileEntry, ManifestSection, section_path, section_samples
 from stickslip_training.data.errors import (
     CorruptDataError,
     DatasetError,
@@ -51,7 +50,7 @@ def write_sections(made, **changes):
 
 @pytest.fixture(autouse=True)
 def small_sections(monkeypatch):
-    monkeypatch.setattr("stickslip_schemas.manifest.SECTION_SAMPLES", 9)
+    monkeypatch.setattr("stickslip_schemas.format.manifest.SECTION_SAMPLES", 9)
 
 
 @pytest.fixture
@@ -136,7 +135,7 @@ def test_sections_must_be_all_there(sectioned):
 
 def test_a_version_of_the_format_before_is_read(make_clips):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stickslip_schemas.arrays.LABEL_SAMPLES", 8)  # a shard group
+        patch.setattr("stickslip_schemas.spec.arrays.LABEL_SAMPLES", 8)  # a shard group
         made = make_clips()
     assert (made.root / "mu/c/1").exists()
     with pytest.raises(InvalidDatasetError, match="chunk_grid"):

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.layout import layout
-from stickslip_schemas.samples import SPLITS
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.spec.jobs import SPLITS
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.export import content as content_module
@@ -343,7 +343,7 @@ def test_one_sample_at_a_time_is_read(clips: Any, tmp_path: Path, monkeypatch: p
 
 
 def test_files_are_of_one_split_and_of_bounded_size(clips: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from stickslip_schemas.selection import Selection
+    from stickslip_schemas.format.selection import Selection
 
     with DatasetReader(clips.root) as reader:
         content = Content(reader, Selection())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
-from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_training.cli import app
 from stickslip_training.reconstruction import ReconstructionError, Verdict, reconstruct
 from stickslip_training.reconstruction.photographs import read_calibration, reconstruct_folder

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.reconstruction import curve
 from stickslip_training.reconstruction.hull import HullTooLargeError, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.refinement import _Problem, draw, samples, start

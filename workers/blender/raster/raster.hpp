@@ -1,6 +1,6 @@
 // Which triangle is seen at each of many samples a pixel, and the mean albedo that a pixel then has.
 //
-// Image coordinates are those of stickslip_schemas.cameras: integer pixel coordinates are pixel centres. A pixel has
+// Image coordinates are those of stickslip_schemas.spec.cameras: integer pixel coordinates are pixel centres. A pixel has
 // grid x grid samples, one in each of as many cells; inside its cell a sample sits at
 //
 //     x = ((5 j mod grid) + 1/2) / grid,   y = ((5 i mod grid) + 1/2) / grid      cell (i, j) = (column, row)

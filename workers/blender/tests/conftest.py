@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.spec.cameras import Camera, load_rig
 
 
 @pytest.fixture

@@ -24,18 +24,18 @@ from stickslip_blender.lights import drawn_light
 from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_blender.stage import ClothStage
 from stickslip_blender.substrates import drawn_substrate
-from stickslip_schemas.cameras import Camera, rig_digest
-from stickslip_schemas.chunks import decode_chunk
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.codecs import decode_clip
-from stickslip_schemas.jobs import Quality
-from stickslip_schemas.keys import is_sha256
+from stickslip_schemas.base.keys import is_sha256
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
+from stickslip_schemas.format.chunks import decode_chunk
+from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.sources import UNCOUNTED, sources
-from stickslip_schemas.states import Reason
+from stickslip_schemas.plan.sources import UNCOUNTED, sources
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.cameras import Camera, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import CorruptArtifactError, DirectoryStore
-from stickslip_schemas.tasks import ChunkRef, RenderOutput, TaskResult
-from stickslip_schemas.textures import Texture
 
 LONG_WAY_DOWN = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.1), 150)  # a tenth too long for the rig
 

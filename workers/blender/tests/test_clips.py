@@ -15,9 +15,9 @@ from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.holders import Holders
 from stickslip_blender.raster import projected, see, window_about
 from stickslip_blender.textures import texture_image
-from stickslip_schemas.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
 
 LOOK = {
     "rig": "drag",
@@ -65,9 +65,9 @@ from stickslip_blender.blender import import_bpy
 from stickslip_blender.clips import ClothRenderer
 from stickslip_blender.holders import Holders
 from stickslip_blender.textures import texture_image
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.spec.fabrics import Texture
 sheet = np.load(sys.argv[1])
 look = ClothDragRender.model_validate_json(sys.argv[2])
 clips.GATE = float(sys.argv[3])

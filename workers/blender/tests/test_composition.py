@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.multiplexed import ALBEDOS, TOLERANCE
 from stickslip_blender.raster import Window, _raster
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
 

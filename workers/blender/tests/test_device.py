@@ -15,8 +15,8 @@ import hashlib, sys
 import numpy as np
 from stickslip_blender.device import NoDeviceError
 from stickslip_blender.scenes.rod_hang import RodRenderer
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.jobs import Quality
 line = np.linspace((0.0, 0.0, 0.0), (0.2, 0.1, -0.9), 150)
 try:
     with RodRenderer(quality=Quality.preview) as renderer:

@@ -9,7 +9,7 @@ from stickslip_blender.engine import Sampling, new_scene, set_sampling
 from stickslip_blender.environment import SoftBox, panorama, set_environment
 from stickslip_blender.pixels import FrameReader
 from stickslip_blender.view import new_view, set_view
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from stickslip_blender import ground_truth as module
 from stickslip_blender.geometry import FLOOR, Geometry
 from stickslip_blender.ground_truth import CLOTH, GROUND, PROP, ground_truth
 from stickslip_blender.holders import Holders
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.cloth import SEGMENTS, GroundTruth
+from stickslip_schemas.kinds.cloth.spec import SEGMENTS, GroundTruth
+from stickslip_schemas.spec.cameras import load_rig
 
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:

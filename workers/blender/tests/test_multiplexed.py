@@ -8,8 +8,8 @@ from stickslip_blender.clips import GATE, ClothRenderer, block_decibels
 from stickslip_blender.engine import ClothSampling
 from stickslip_blender.holders import Holders
 from stickslip_blender.multiplexed import encode
-from stickslip_schemas.cameras import load_rig, rig_digest
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.spec.cameras import load_rig, rig_digest
 
 
 def test_encoding_is_srgb() -> None:

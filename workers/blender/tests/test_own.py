@@ -14,13 +14,13 @@ from stickslip_blender.lights import drawn_light
 from stickslip_blender.stage import ClothStage
 from stickslip_blender.substrates import drawn_substrate
 from stickslip_blender.textures import SIZE, own_texture, texture_image
-from stickslip_schemas.appearance import Calibration, FloorNumbers, LampNumbers
-from stickslip_schemas.cameras import load_rig, rig_digest
-from stickslip_schemas.codecs import decode_clip
+from stickslip_schemas.documents.tasks import RenderOutput, TaskResult, input_digests, task_adapter
+from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
+from stickslip_schemas.spec.cameras import load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.store import DirectoryStore
-from stickslip_schemas.tasks import RenderOutput, TaskResult, input_digests, task_adapter
-from stickslip_schemas.textures import Texture
 
 Clip = npt.NDArray[np.uint8]
 

@@ -9,7 +9,7 @@ from stickslip_blender.ground_truth import CLOTH, GROUND, PROP, ground_truth
 from stickslip_blender.holders import Holders
 from stickslip_blender.multiplexed import Composer
 from stickslip_blender.scenes.shawl import SUNK, Figure
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 
 
 def ball() -> tuple[Any, Any]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.raster import GRID, Textures, Window, _raster, projected, see, see_albedo, window_about
 from stickslip_blender.raster.visibility import barycentric
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
 

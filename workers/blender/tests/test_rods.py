@@ -10,8 +10,8 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.pixels import Window
 from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, RADIUS, RodRenderer
-from stickslip_schemas.cameras import Camera
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.jobs import Quality
 
 ORANGE = (0.9, 0.5, 0.2)
 Views = npt.NDArray[np.uint8]
@@ -39,8 +39,8 @@ _FRESH = """
 import hashlib, sys
 import numpy as np
 from stickslip_blender.scenes.rod_hang import RodRenderer
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.jobs import Quality
 with RodRenderer(quality=Quality.draft) as renderer:
     views = renderer.render(np.load(sys.argv[1]), load_rig("rod-4"), color=(0.9, 0.5, 0.2))
 print(hashlib.sha256(views.tobytes()).hexdigest())
@@ -140,7 +140,7 @@ import time
 import numpy as np
 from stickslip_blender.color import silicone_color
 from stickslip_blender.scenes.rod_hang import RodRenderer
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 line = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 150)
 with RodRenderer(quality="draft") as renderer:
     renderer.render(line, load_rig("rod-4"), color=silicone_color(0))

@@ -6,9 +6,9 @@ from stickslip_blender.geometry import FLOOR
 from stickslip_blender.lights import LIGHTS, drawn_light
 from stickslip_blender.looks import grained, look_of, looks
 from stickslip_blender.substrates import HARD, drawn_substrate, floor_factor, substrate_names
-from stickslip_schemas.cameras import load_rig
-from stickslip_schemas.cloth import Lighting, Substrate
-from stickslip_schemas.fabrics import Material
+from stickslip_schemas.kinds.cloth.spec import Lighting, Substrate
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.fabrics import Material
 
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:

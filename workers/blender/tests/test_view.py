@@ -10,7 +10,7 @@ from stickslip_blender.blender import import_bpy
 from stickslip_blender.engine import Sampling, new_scene, set_sampling
 from stickslip_blender.pixels import FrameReader
 from stickslip_blender.view import new_view, set_view
-from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.spec.cameras import Camera, load_rig
 
 _SKEWED = Camera.model_validate(  # rolled, off-centre, not square, pixels not square either
     Camera.looking_at(

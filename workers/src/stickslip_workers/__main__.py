@@ -13,8 +13,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 from stickslip_schemas import tracing
+from stickslip_schemas.documents.tasks import task_adapter
 from stickslip_schemas.store import open_store, store_place
-from stickslip_schemas.tasks import task_adapter
 
 from stickslip_workers.backoff import Backoff
 from stickslip_workers.coordinator_client import CoordinatorError
@@ -225,8 +225,8 @@ def _certify(options: argparse.Namespace) -> int:
 
 def _scene(options: argparse.Namespace) -> int:
     """Return 0 if the trajectories are valid, 1 if not, 2 if there was nothing to run."""
-    from stickslip_schemas.certificate import Certificate
-    from stickslip_schemas.scene_file import SceneFile
+    from stickslip_schemas.documents.certificate import Certificate
+    from stickslip_schemas.spec.scene_file import SceneFile
 
     from stickslip_workers.own_scene import simulate_scene
 

@@ -1,13 +1,13 @@
 """Which code runs here: the digests that go into content keys, for each kind and stage.
 
-A build covers the files that the work imports (see `stickslip_schemas.sources`), the compiled core where it is used,
-and the versions of libraries that decide on bytes.
+A build covers the files that the work imports (see `stickslip_schemas.plan.sources`), the compiled core where it is
+used, and the versions of libraries that decide on bytes.
 """
 
 from importlib import metadata
 
-from stickslip_schemas.keys import content_key
-from stickslip_schemas.sources import UNCOUNTED, digests, sources
+from stickslip_schemas.base.keys import content_key
+from stickslip_schemas.plan.sources import UNCOUNTED, digests, sources
 
 from stickslip_workers.kinds import kind
 

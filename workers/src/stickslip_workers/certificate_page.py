@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from stickslip_schemas.certificate import Certificate, CurveReport, ProtocolReport
+from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
 from stickslip_sim_core.protocols import ProtocolResult
 
 _STYLE = """

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import RecordRef, SimulateOutput, TaskResult
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RecordRef, SimulateOutput, TaskResult
 
 from stickslip_workers.stages.records import Array, encode_records
 
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
-    from stickslip_schemas.cloth import ClothSimulation
-    from stickslip_schemas.fabrics import FabricNumbers
+    from stickslip_schemas.kinds.cloth.spec import ClothSimulation
+    from stickslip_schemas.spec.fabrics import FabricNumbers
     from stickslip_sim_core.cloth import Fabric
 
 
@@ -98,7 +98,7 @@ def forces_of(run: DraggedRun) -> dict[str, Array]:
 
 
 def drop_labels(run: DraggedRun) -> dict[str, Any]:
-    """Return the labels of a drop: see `stickslip_schemas.drag_stage`."""
+    """Return the labels of a drop: see `stickslip_schemas.kinds.cloth.drag_scene`."""
     return {"bias_side": int(run.bias_side), "landed_side": int(run.landed_side), "bias": float(run.bias)}
 
 

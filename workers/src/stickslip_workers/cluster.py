@@ -25,7 +25,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
 
 log = logging.getLogger(__name__)
 

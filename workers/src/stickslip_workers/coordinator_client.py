@@ -6,8 +6,8 @@ from typing import TypeVar
 
 import httpx
 from pydantic import BaseModel
-from stickslip_schemas.problems import ProblemCode
-from stickslip_schemas.worker_api import (
+from stickslip_schemas.documents.problems import ProblemCode
+from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
     LeaseBatch,

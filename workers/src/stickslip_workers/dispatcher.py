@@ -15,11 +15,18 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas import tracing
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.states import Reason, Stage
+from stickslip_schemas.base.states import Reason, Stage
+from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, Task, TaskResult
+from stickslip_schemas.documents.worker_api import (
+    Lease,
+    LeaseRequest,
+    Report,
+    ReportBatch,
+    WorkerRegistration,
+    WorkerSession,
+)
+from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.store import open_store
-from stickslip_schemas.tasks import RenderTask, SimulateTask, Task, TaskResult
-from stickslip_schemas.worker_api import Lease, LeaseRequest, Report, ReportBatch, WorkerRegistration, WorkerSession
 
 from stickslip_workers.backoff import Backoff
 from stickslip_workers.cluster import Cluster, ClusterLostError

@@ -1,9 +1,9 @@
 """From exceptions to reason codes."""
 
-from stickslip_schemas.chunks import CorruptChunkError
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import TaskResult
+from stickslip_schemas.format.chunks import CorruptChunkError
 from stickslip_schemas.store import is_unavailable
-from stickslip_schemas.tasks import TaskResult
 
 MESSAGE_LENGTH = 2000
 """The most that a result says of an error [characters]; the rest is in the log."""

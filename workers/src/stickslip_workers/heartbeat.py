@@ -3,7 +3,7 @@
 import logging
 import threading
 
-from stickslip_schemas.worker_api import Heartbeat, WorkerSession
+from stickslip_schemas.documents.worker_api import Heartbeat, WorkerSession
 
 from stickslip_workers.coordinator_client import CoordinatorClient, CoordinatorError, UnknownWorkerError
 from stickslip_workers.leases import LeaseBook

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Iterable
 
-from stickslip_schemas.worker_api import Lease, LeaseState
+from stickslip_schemas.documents.worker_api import Lease, LeaseState
 
 
 class LeaseBook:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.certificate import Certificate
-from stickslip_schemas.keys import content_key
-from stickslip_schemas.scene_file import Box, Cylinder, Key, MeshBody, Motion, Plane, SceneFile, Sphere
-from stickslip_schemas.scene_file import Sheet as SheetOfFile
+from stickslip_schemas.base.keys import content_key
+from stickslip_schemas.documents.certificate import Certificate
+from stickslip_schemas.spec.scene_file import Box, Cylinder, Key, MeshBody, Motion, Plane, SceneFile, Sphere
+from stickslip_schemas.spec.scene_file import Sheet as SheetOfFile
 from stickslip_sim_core import Body, Surface, box, cylinder, plane, run_scene, sphere
 from stickslip_sim_core.cloth.meshes import Mesh, grid, unstructured
 from stickslip_sim_core.motions import Keyframes, MovingMesh, read_moving_mesh, rotation

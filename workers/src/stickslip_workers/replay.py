@@ -4,9 +4,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import RenderTask, TaskResult
 from stickslip_schemas.store import open_store
-from stickslip_schemas.tasks import RenderTask, TaskResult
 
 from stickslip_workers.failures import failed
 from stickslip_workers.settings import RENDER_ACTOR

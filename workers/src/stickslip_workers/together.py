@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from stickslip_schemas.keys import canonical_json
-from stickslip_schemas.tasks import RenderOutput, RenderTask, TaskResult
+from stickslip_schemas.base.keys import canonical_json
+from stickslip_schemas.documents.tasks import RenderOutput, RenderTask, TaskResult
 
 from stickslip_workers.failures import failure
 

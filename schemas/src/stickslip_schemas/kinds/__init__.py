@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, TypeAdapter
 
-from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothRender, ClothOnClothSimulation, ClothOnClothSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender, ClothSphereSimulation, ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation, RodHangSpec
 from stickslip_schemas.kinds.shawl import ShawlRender, ShawlSimulation, ShawlSpec
+from stickslip_schemas.spec.jobs import JobSpec
 
 KINDS: dict[str, type[JobSpec]] = {
     "rod_hang": RodHangSpec,

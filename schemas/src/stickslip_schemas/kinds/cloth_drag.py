@@ -5,12 +5,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.appearance import FloorNumbers, LampNumbers
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, ListAxis
-from stickslip_schemas.base import Float
-from stickslip_schemas.certificate import CONTACT_PROTOCOLS
-from stickslip_schemas.cloth import (
+from stickslip_schemas.base.document import Float
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, Viewpoint, ViewpointName
+from stickslip_schemas.kinds.cloth.spec import (
     OWN_LOOKS,
     PHYSICAL_AXES,
     SELF_FRICTION,
@@ -21,14 +19,15 @@ from stickslip_schemas.cloth import (
     Lighting,
     LightingAxis,
     Own,
-    OwnName,
     Substrate,
     SubstrateAxis,
     TextureAxis,
 )
-from stickslip_schemas.drag_stage import DROP_LABELS, Viewpoint, ViewpointName
-from stickslip_schemas.jobs import SeedRule
-from stickslip_schemas.states import Stage
+from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import SHORTHAND, ListAxis
+from stickslip_schemas.spec.fabrics import OwnName
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 
 class ClothDragAxes(ClothAxes):

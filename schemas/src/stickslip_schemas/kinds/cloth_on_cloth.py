@@ -4,12 +4,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.appearance import LampNumbers
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, ListAxis
-from stickslip_schemas.base import Float
-from stickslip_schemas.certificate import CONTACT_PROTOCOLS
-from stickslip_schemas.cloth import (
+from stickslip_schemas.base.document import Float
+from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, Viewpoint, ViewpointName
+from stickslip_schemas.kinds.cloth.spec import (
     OWN_LOOKS,
     PHYSICAL_AXES,
     SELF_FRICTION,
@@ -21,14 +18,15 @@ from stickslip_schemas.cloth import (
     LightingAxis,
     MaterialAxis,
     Own,
-    OwnName,
     Substrate,
     TextureAxis,
     codes,
 )
-from stickslip_schemas.drag_stage import DROP_LABELS, Viewpoint, ViewpointName
-from stickslip_schemas.fabrics import FabricNumbers, Material
-from stickslip_schemas.jobs import SeedRule
+from stickslip_schemas.spec.appearance import LampNumbers
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import SHORTHAND, ListAxis
+from stickslip_schemas.spec.fabrics import FabricNumbers, Material, OwnName
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 
 class ClothOnClothAxes(ClothAxes):

@@ -5,9 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.cloth import (
+from stickslip_schemas.kinds.cloth.spec import (
     OWN_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
@@ -15,11 +13,12 @@ from stickslip_schemas.cloth import (
     ClothSimulation,
     ClothSpec,
     Own,
-    OwnName,
     TextureAxis,
-    name_schema,
 )
-from stickslip_schemas.jobs import SeedRule
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
+from stickslip_schemas.spec.fabrics import OwnName, name_schema
+from stickslip_schemas.spec.jobs import SeedRule
 
 AngularSpeed = Annotated[
     float,

@@ -4,11 +4,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
-from stickslip_schemas.base import Document, Float
-from stickslip_schemas.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.jobs import JobSpec, Quality, Render, SeedRule, Simulation
+from stickslip_schemas.base.document import Document, Float
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.jobs import JobSpec, Quality, Render, SeedRule, Simulation
 
 ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""

@@ -5,11 +5,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.base import Int
-from stickslip_schemas.certificate import CONTACT_PROTOCOLS
-from stickslip_schemas.cloth import (
+from stickslip_schemas.base.document import Int
+from stickslip_schemas.kinds.cloth.spec import (
     OWN_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
@@ -18,11 +15,12 @@ from stickslip_schemas.cloth import (
     ClothSpec,
     MuAxis,
     Own,
-    OwnName,
     TextureAxis,
-    name_schema,
 )
-from stickslip_schemas.jobs import SeedRule
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
+from stickslip_schemas.spec.fabrics import OwnName, name_schema
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 BONES, SKIN_VERTICES, SKIN_TRIANGLES = 5, 1442, 2880
 """Of the figure, as the simulation core makes it; a contract test compares the numbers."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from stickslip_schemas.keys import is_sha256
+from stickslip_schemas.base.keys import is_sha256
 
 ARTIFACTS = "artifacts"
 DATASETS = "datasets"

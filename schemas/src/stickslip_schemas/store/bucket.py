@@ -23,7 +23,7 @@ import obstore
 import obstore.exceptions
 import obstore.store
 
-from stickslip_schemas.keys import is_sha256, sha256
+from stickslip_schemas.base.keys import is_sha256, sha256
 from stickslip_schemas.store.base import (
     ARTIFACTS,
     DATASETS,

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from stickslip_schemas.keys import is_sha256, sha256
+from stickslip_schemas.base.keys import is_sha256, sha256
 from stickslip_schemas.store.base import (
     ARTIFACTS,
     DATASETS,

@@ -7,7 +7,7 @@ from fastapi import Request
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
-from stickslip_schemas.problems import ProblemCode, field_errors
+from stickslip_schemas.documents.problems import ProblemCode, field_errors
 
 from stickslip_services.api.problems import ProblemError
 

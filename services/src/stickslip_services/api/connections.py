@@ -9,7 +9,7 @@ import resource
 from contextlib import suppress
 from http import HTTPStatus
 
-from stickslip_schemas.problems import MEDIA_TYPE, ProblemCode
+from stickslip_schemas.documents.problems import MEDIA_TYPE, ProblemCode
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from stickslip_services.api.problems import problem_document

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as HttpScope
-from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.documents.problems import ProblemCode
 
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import problem_response

@@ -6,8 +6,8 @@ from pathlib import PurePosixPath
 
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.problems import ProblemError

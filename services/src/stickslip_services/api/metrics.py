@@ -6,8 +6,8 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, Info, gener
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import Connection, func, select
+from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 from stickslip_schemas.store import Store
-from stickslip_schemas.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
 from stickslip_services.database.database import Database

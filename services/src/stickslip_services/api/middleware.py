@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from stickslip_schemas.problems import ProblemCode
+from stickslip_schemas.documents.problems import ProblemCode
 
 from stickslip_services.api.problems import problem_response
 

@@ -6,13 +6,13 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, TypeAdapter
-from stickslip_schemas.certificate import CertificateUpload
+from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.problems import Problem
+from stickslip_schemas.documents.responses import JobPatch
+from stickslip_schemas.documents.tasks import task_adapter
+from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, ReportBatch, WorkerRegistration
+from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.manifest import Manifest
-from stickslip_schemas.problems import Problem
-from stickslip_schemas.responses import JobPatch
-from stickslip_schemas.tasks import task_adapter
-from stickslip_schemas.worker_api import Heartbeat, LeaseRequest, ReportBatch, WorkerRegistration
 
 from stickslip_services.api.bodies import body_components
 

@@ -10,7 +10,7 @@ from fastapi.exceptions import RequestValidationError
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match, Route
-from stickslip_schemas.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
+from stickslip_schemas.documents.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
 
 from stickslip_services import errors
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection
 from starlette.concurrency import run_in_threadpool
-from stickslip_schemas.events import EventName, JobProgressEvent
-from stickslip_schemas.responses import JobDetail
+from stickslip_schemas.documents.responses import EventName, JobDetail, JobProgressEvent
 
 from stickslip_services.database.database import Database
 from stickslip_services.queue.bell import Bell

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
-from stickslip_schemas.certificate import CertificateUpload
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.responses import CertificateEntry, Page
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.responses import CertificateEntry, Page
 from stickslip_schemas.store import Store
 
 from stickslip_services.clock import as_datetime

@@ -4,19 +4,19 @@ from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import Connection, Row, select
-from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.manifest import (
+from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
+from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
     BrokenSectionError,
     Contents,
+    FileEntry,
     Manifest,
     seal_text,
 )
-from stickslip_schemas.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry
 
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, make_page

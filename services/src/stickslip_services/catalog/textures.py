@@ -1,10 +1,10 @@
 """Textures of users: pictures in the store, which specs name by their digests."""
 
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import ARTIFACT
-from stickslip_schemas.pictures import UnfitPictureError, read_picture
-from stickslip_schemas.problems import FieldError
-from stickslip_schemas.responses import TextureEntry
+from stickslip_schemas.base.keys import ARTIFACT
+from stickslip_schemas.documents.problems import FieldError
+from stickslip_schemas.documents.responses import TextureEntry
+from stickslip_schemas.format.pictures import UnfitPictureError, read_picture
+from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
 
 from stickslip_services.errors import UnknownTextureError

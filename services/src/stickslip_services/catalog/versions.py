@@ -3,12 +3,20 @@
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, insert, select, update
-from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal, seal_text
-from stickslip_schemas.responses import DatasetRef
-from stickslip_schemas.samples import dataset_id
+from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.documents.responses import DatasetRef
+from stickslip_schemas.documents.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
+from stickslip_schemas.format.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    Contents,
+    Manifest,
+    check_seal,
+    seal_text,
+)
+from stickslip_schemas.plan.points import dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
-from stickslip_schemas.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 
 from stickslip_services.database.tables import dataset_versions, datasets
 

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
-from stickslip_schemas.cloth import PresetName
+from stickslip_schemas.documents.responses import CertificateEntry
+from stickslip_schemas.kinds.cloth.spec import PresetName
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET
-from stickslip_schemas.responses import CertificateEntry
 
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table

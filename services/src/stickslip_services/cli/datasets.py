@@ -12,8 +12,8 @@ import typer
 from pydantic import ValidationError
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
-from stickslip_schemas.manifest import MANIFEST_NAME, Contents, Manifest
-from stickslip_schemas.selection import Selection
+from stickslip_schemas.format.manifest import MANIFEST_NAME, Contents, Manifest
+from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.addresses import DEFAULT_URL, coordinator_url
 from stickslip_services.cli import wording

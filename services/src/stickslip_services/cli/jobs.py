@@ -5,11 +5,11 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 from rich.table import Table
-from stickslip_schemas.counting import count
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.layout import bytes_estimate
-from stickslip_schemas.responses import JobDetail
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.responses import JobDetail
+from stickslip_schemas.format.layout import bytes_estimate
+from stickslip_schemas.plan.counting import count
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli import wording

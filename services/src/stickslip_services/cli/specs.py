@@ -8,10 +8,10 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
-from stickslip_schemas.problems import field_errors
-from stickslip_schemas.scene_file import SceneFile
+from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.scene_file import SceneFile
 
 
 class SpecFileError(Exception):

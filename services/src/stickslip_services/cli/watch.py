@@ -8,9 +8,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
-from stickslip_schemas.events import DatasetPublishedEvent, JobProgressEvent, JobStateEvent, TaskStateEvent
-from stickslip_schemas.responses import Progress as JobProgress
-from stickslip_schemas.states import JobState, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobProgressEvent, JobStateEvent, TaskStateEvent
+from stickslip_schemas.documents.responses import Progress as JobProgress
 
 from stickslip_services.cli import wording
 from stickslip_services.cli.common import say

@@ -1,7 +1,7 @@
 """How the command line says things: durations, sizes, states, progress."""
 
-from stickslip_schemas.responses import DatasetRef, Eta, Job, Progress
-from stickslip_schemas.states import JobState, TaskState
+from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.documents.responses import DatasetRef, Eta, Job, Progress
 
 _COLORS = {
     JobState.planning: "yellow",

@@ -7,15 +7,15 @@ from typing import Any, Self, TypeVar
 
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
-from stickslip_schemas.certificate import Certificate, CertificateUpload
-from stickslip_schemas.events import JobStateEvent
-from stickslip_schemas.manifest import Contents, Manifest
-from stickslip_schemas.responses import (
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
+from stickslip_schemas.documents.responses import (
     CertificateEntry,
     Dataset,
     DatasetVersion,
     Job,
     JobDetail,
+    JobStateEvent,
     Page,
     Preview,
     SampleState,
@@ -23,7 +23,7 @@ from stickslip_schemas.responses import (
     Validation,
     WorkerEntry,
 )
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.format.manifest import Contents, Manifest
 from tenacity import AsyncRetrying
 
 from stickslip_services.addresses import coordinator_url

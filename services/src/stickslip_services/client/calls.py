@@ -10,30 +10,28 @@ from typing import Any, Generic, TypeVar
 
 import httpx
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.certificate import Certificate, CertificateUpload
-from stickslip_schemas.events import (
-    DatasetPublishedEvent,
-    EventName,
-    JobProgressEvent,
-    JobStateEvent,
-    TaskStateEvent,
-)
-from stickslip_schemas.manifest import Manifest
-from stickslip_schemas.problems import MEDIA_TYPE, Problem
-from stickslip_schemas.responses import (
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
+from stickslip_schemas.documents.problems import MEDIA_TYPE, Problem
+from stickslip_schemas.documents.responses import (
     CertificateEntry,
     Dataset,
+    DatasetPublishedEvent,
     DatasetVersion,
+    EventName,
     Job,
     JobDetail,
+    JobProgressEvent,
+    JobStateEvent,
     Page,
     Preview,
     SampleState,
+    TaskStateEvent,
     TextureEntry,
     Validation,
     WorkerEntry,
 )
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.format.manifest import Manifest
 from tenacity import retry_if_exception, stop_after_delay, wait_random_exponential
 
 T = TypeVar("T")

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Contents, Manifest
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import Contents, Manifest
+from stickslip_schemas.spec.arrays import ArrayLayout
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,10 +20,10 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
-from stickslip_schemas.chunks import CorruptChunkError, decode_chunk
-from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import (
+from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.format.chunks import CorruptChunkError, decode_chunk
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
@@ -31,12 +31,12 @@ from stickslip_schemas.manifest import (
     BrokenSealError,
     BrokenSectionError,
     Contents,
+    FileEntry,
     Manifest,
     check_seal,
 )
-from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection, part_files, sections_of
+from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files, sections_of
 from stickslip_schemas.store import sync, write_durably
-from stickslip_schemas.tasks import FileEntry
 
 from stickslip_services.client.calls import ClientError, UnreachableError, raise_for_problem
 from stickslip_services.client.http import Client

@@ -9,7 +9,7 @@ from pathlib import Path
 from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError
-from stickslip_schemas.manifest import MANIFEST_NAME
+from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import open_store
 
 from stickslip_services.database import migrate

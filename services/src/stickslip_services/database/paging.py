@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from stickslip_schemas.responses import Page
+from stickslip_schemas.documents.responses import Page
 
 MAX_PAGE_SIZE = 1000
 

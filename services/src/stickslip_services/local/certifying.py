@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from pydantic import ValidationError
-from stickslip_schemas.certificate import Certificate, CertificateUpload
+from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
 
 DOCUMENT_NAME = "certificate.json"
 PAGE_NAME = "certificate.html"

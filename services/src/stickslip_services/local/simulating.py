@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from stickslip_schemas.scene_file import SceneFile
+from stickslip_schemas.spec.scene_file import SceneFile
 
 
 class SimulateError(Exception):

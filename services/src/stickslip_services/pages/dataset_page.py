@@ -10,8 +10,8 @@ from html import escape
 from itertools import combinations, islice
 from typing import Any
 
-from stickslip_schemas.manifest import Contents, Manifest
-from stickslip_schemas.samples import grid
+from stickslip_schemas.format.manifest import Contents, Manifest
+from stickslip_schemas.plan.points import grid
 
 CELLS = 12
 """Most cells of a map along an axis. An axis with no more values than that has a cell for each."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.samples import grid
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.plan.points import grid
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.pages.dataset_page import Axis
 

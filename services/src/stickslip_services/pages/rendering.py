@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from stickslip_schemas.responses import StageProgress
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.responses import StageProgress
 
 STATIC = Path(__file__).parent / "static"
 

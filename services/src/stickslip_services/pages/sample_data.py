@@ -4,19 +4,18 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.chunks import (
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.format.chunks import (
     MISSING,
     decode_chunk,
     decode_shard_index,
     shard_index_size,
 )
-from stickslip_schemas.codecs import decode_sample
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Contents
+from stickslip_schemas.format.codecs import decode_sample
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import Contents, FileEntry, Rejection
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry, Rejection
 
 Array = npt.NDArray[np.generic]
 

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 from sqlalchemy import Connection, func, select, text, update
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks

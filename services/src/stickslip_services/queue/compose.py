@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, func, insert, select
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import Sha256
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base.states import Stage, TaskState
+from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
+from stickslip_schemas.format.manifest import section_samples
 from stickslip_schemas.kinds import stored_spec_adapter
-from stickslip_schemas.manifest import section_samples
-from stickslip_schemas.samples import dataset_id
-from stickslip_schemas.states import Stage, TaskState
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
-from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import dataset_versions, jobs, samples, task_dependencies, tasks

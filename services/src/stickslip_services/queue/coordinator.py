@@ -11,15 +11,12 @@ from dataclasses import InitVar, dataclass, field
 
 from sqlalchemy import Connection
 from stickslip_schemas import tracing
-from stickslip_schemas.certificate import CertificateUpload
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.kinds import stored_spec_adapter
-from stickslip_schemas.responses import CertificateEntry, JobDetail
-from stickslip_schemas.states import JobState, Reason
-from stickslip_schemas.store import Store, is_unavailable, open_store
-from stickslip_schemas.tasks import PublishOutput, PublishTask
-from stickslip_schemas.worker_api import (
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.responses import CertificateEntry, JobDetail
+from stickslip_schemas.documents.tasks import PublishOutput, PublishTask
+from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
     LeaseBatch,
@@ -30,6 +27,9 @@ from stickslip_schemas.worker_api import (
     WorkerRegistration,
     WorkerSession,
 )
+from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.store import Store, is_unavailable, open_store
 
 from stickslip_services.catalog.certificates import insert_certificate, store_certificate
 from stickslip_services.catalog.textures import check_textures

@@ -6,7 +6,7 @@ A task's share is the wall time of the call that made it over the tasks of that 
 from collections.abc import Mapping, Sequence
 
 from sqlalchemy import Connection, select
-from stickslip_schemas.states import Stage
+from stickslip_schemas.base.states import Stage
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import cost_groups

@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-from stickslip_schemas.responses import Eta
-from stickslip_schemas.states import Stage
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.documents.responses import Eta
 
 QUANTILE_80 = 1.2816
 MODEL_ERROR = 0.15  # f

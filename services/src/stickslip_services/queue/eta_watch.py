@@ -3,8 +3,8 @@
 from collections import Counter
 from collections.abc import Mapping
 
-from stickslip_schemas.responses import Job
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.states import JobState
+from stickslip_schemas.documents.responses import Job
 
 EVERY_SECONDS = 5.0
 """Time between two notes [s]."""

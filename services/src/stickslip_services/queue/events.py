@@ -6,10 +6,15 @@ Progress is not written: it is read from the counters when somebody watches.
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, insert, select, update
-from stickslip_schemas.base import Document
-from stickslip_schemas.events import DatasetPublishedEvent, EventName, JobStateEvent, TaskStateEvent
-from stickslip_schemas.responses import DatasetRef
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.documents.responses import (
+    DatasetPublishedEvent,
+    DatasetRef,
+    EventName,
+    JobStateEvent,
+    TaskStateEvent,
+)
 
 from stickslip_services.database.tables import events, jobs
 

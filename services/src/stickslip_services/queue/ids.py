@@ -2,8 +2,8 @@
 
 import secrets
 
-from stickslip_schemas.keys import is_sha256
-from stickslip_schemas.states import Stage
+from stickslip_schemas.base.keys import is_sha256
+from stickslip_schemas.base.states import Stage
 
 
 def new_id(prefix: str) -> str:

@@ -7,11 +7,11 @@ from types import MappingProxyType
 from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 from stickslip_schemas.kinds import stored_spec_adapter
-from stickslip_schemas.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, make_page

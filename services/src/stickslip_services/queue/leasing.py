@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
 from stickslip_schemas import tracing
-from stickslip_schemas.states import Stage, TaskState
-from stickslip_schemas.worker_api import Lease, LeaseState
+from stickslip_schemas.base.states import Stage, TaskState
+from stickslip_schemas.documents.worker_api import Lease, LeaseState
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared

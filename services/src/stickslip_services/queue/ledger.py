@@ -9,9 +9,8 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, case, select, update
-from stickslip_schemas.events import TaskStateEvent
-from stickslip_schemas.responses import DatasetRef
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.states import Stage
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.spec.jobs import JobSpec
 
 
 @dataclass(frozen=True, slots=True)

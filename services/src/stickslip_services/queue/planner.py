@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas import tracing
-from stickslip_schemas.builds import Builds
+from stickslip_schemas.base.states import JobState, Stage
 from stickslip_schemas.kinds import stored_spec_adapter
-from stickslip_schemas.states import JobState, Stage
+from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Database

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.samples import KeyedPoint, keyed_points, pack_key, publish_key
-from stickslip_schemas.states import Stage
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.plan.points import KeyedPoint, keyed_points, pack_key, publish_key
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.database import batches
 from stickslip_services.queue.plan import Plan, PlannedSample, PlannedTask, Terms

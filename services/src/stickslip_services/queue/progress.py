@@ -4,8 +4,8 @@ from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from sqlalchemy import Connection, Row, select
-from stickslip_schemas.responses import Progress, StageProgress
-from stickslip_schemas.states import JobState, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.documents.responses import Progress, StageProgress
 
 from stickslip_services.database.tables import job_counts, job_groups, job_stages, job_tasks, tasks
 from stickslip_services.queue.eta import Cost, Group, StageWork, estimate, pooled

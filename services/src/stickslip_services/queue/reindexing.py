@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import select, update
-from stickslip_schemas.keys import Sha256, sha256
-from stickslip_schemas.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
-from stickslip_schemas.samples import dataset_id
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.tasks import PublishOutput
+from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
+from stickslip_schemas.plan.points import dataset_id
 from stickslip_schemas.store import ShownVersion, Store, in_parallel
-from stickslip_schemas.tasks import PublishOutput
 
 from stickslip_services.catalog.versions import (
     commit_version,

@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, delete, select, update
-from stickslip_schemas.states import JobState
+from stickslip_schemas.base.states import JobState
 from stickslip_schemas.store import Store
 
 from stickslip_services.database.database import Database, batches

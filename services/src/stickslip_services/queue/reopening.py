@@ -12,8 +12,8 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 from sqlalchemy import Connection, bindparam, select, update
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.states import JobState, Stage, TaskState
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base.states import JobState, Stage, TaskState
 
 from stickslip_services.catalog.versions import find_committed
 from stickslip_services.database.database import batches, insert_rows

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from sqlalchemy import bindparam, delete, insert, select, update
-from stickslip_schemas.events import TaskStateEvent
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.states import Reason, Stage, TaskState
-from stickslip_schemas.tasks import PublishOutput, RenderOutput, TaskResult
-from stickslip_schemas.worker_api import Report, ReportVerdict
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base.states import Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import TaskStateEvent
+from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
+from stickslip_schemas.documents.worker_api import Report, ReportVerdict
 
 from stickslip_services.catalog.versions import ManifestSummary, commit_version, find_committed, find_reserved
 from stickslip_services.database.database import batches

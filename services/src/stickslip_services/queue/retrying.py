@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, select, text, update
-from stickslip_schemas.events import TaskStateEvent
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import TaskStateEvent
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared

@@ -1,8 +1,8 @@
 """Jobs that no connected worker can serve say so."""
 
 from sqlalchemy import Connection, select
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.states import JobState, Reason
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs

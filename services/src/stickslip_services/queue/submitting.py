@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, func, insert, select, update
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.states import JobState, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.database import batches, insert_rows
 from stickslip_services.database.prepared import Prepared

@@ -1,8 +1,8 @@
 """The rule that some kinds are made with certified presets only."""
 
 from sqlalchemy import Connection
-from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import registered
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.catalog.certificates import standing_certificate
 from stickslip_services.errors import PresetNotCertifiedError

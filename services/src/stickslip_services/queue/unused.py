@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import select
-from stickslip_schemas.keys import Sha256, is_sha256, sha256
-from stickslip_schemas.manifest import Contents, Manifest, seal_text
+from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
+from stickslip_schemas.format.manifest import Contents, Manifest, seal_text
 from stickslip_schemas.store import Store
 
 from stickslip_services.database.database import Database

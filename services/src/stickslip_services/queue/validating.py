@@ -1,12 +1,12 @@
 """What a job of a spec would be, told without making one: by arithmetic, so that a grid of a million is no work."""
 
 from sqlalchemy import Connection, func, select
-from stickslip_schemas.counting import count
-from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.responses import Validation
+from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.kinds import stored_spec_adapter
-from stickslip_schemas.layout import bytes_estimate
-from stickslip_schemas.responses import Validation
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.plan.counting import count
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import dataset_versions, jobs, tasks

@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, func, insert, select, text, update
-from stickslip_schemas import responses
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.states import Stage
-from stickslip_schemas.worker_api import WorkerRegistration
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.documents import responses
+from stickslip_schemas.documents.worker_api import WorkerRegistration
+from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.prepared import Prepared

@@ -17,9 +17,9 @@ from io import BytesIO
 from typing import Any, Literal
 
 import numpy as np
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import canonical_json, sha256
+from stickslip_schemas.base.keys import canonical_json, sha256
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_training.arrays import Array, Integers
 from stickslip_training.benchmark.cloth import ClothTask

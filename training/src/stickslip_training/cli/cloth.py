@@ -50,7 +50,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
     """Train a network that tells material and friction, on pictures rendered from simulations while it trains."""
-    from stickslip_schemas.keys import sha256
+    from stickslip_schemas.base.keys import sha256
 
     from stickslip_training.cloth.training import ClothTraining, load_friction, save_friction, train_friction
     from stickslip_training.engine.fit import EpochReport
@@ -269,7 +269,7 @@ def _warning(answer: dict[str, Any]) -> str:
 
 def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
     """Return what names the runs, and the runs of each split."""
-    from stickslip_schemas.keys import sha256
+    from stickslip_schemas.base.keys import sha256
 
     from stickslip_training.cloth.runs import load_runs, runs_of_dataset, split_runs
     from stickslip_training.cloth.training import INSTANTS
@@ -294,7 +294,7 @@ def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
 def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[list[str], RenderedClips]":
     """Return what names the clips, and those of the splits train and validation."""
     import numpy as np
-    from stickslip_schemas.keys import sha256
+    from stickslip_schemas.base.keys import sha256
 
     from stickslip_training.cloth.clips import clips_of_file, read_clips
     from stickslip_training.cloth.runs import load_runs, split_of_runs
@@ -322,7 +322,7 @@ def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[li
 
 
 def _split(name: str) -> Any:
-    from stickslip_schemas.samples import SPLITS
+    from stickslip_schemas.spec.jobs import SPLITS
 
     if name not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")

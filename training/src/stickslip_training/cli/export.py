@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
-from stickslip_schemas.selection import Selection
+from stickslip_schemas.format.selection import Selection
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.reader import DatasetReader

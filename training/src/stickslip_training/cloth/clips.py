@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from stickslip_schemas.cameras import load_rig
+from stickslip_schemas.spec.cameras import load_rig
 
 from stickslip_training.arrays import Array, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats, Integers
 from stickslip_training.cloth.crop import Cameras, holder_crops

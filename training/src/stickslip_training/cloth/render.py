@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
 

@@ -12,7 +12,7 @@ import safetensors
 import safetensors.torch
 import torch
 from numpy.typing import NDArray
-from stickslip_schemas.cameras import Camera, load_rig
+from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.store import write_durably
 from torch import nn
 

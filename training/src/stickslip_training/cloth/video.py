@@ -23,8 +23,8 @@ import numpy as np
 import torch
 from pydantic import ValidationError
 from scipy.optimize import least_squares
-from stickslip_schemas.cameras import Camera
-from stickslip_schemas.clips import shown_frames
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Floats

@@ -1,7 +1,7 @@
 """Check that the Zarr metadata of a dataset say what the contract says.
 
-The reader computes with `stickslip_schemas.layout` and not with the metadata, so the two must agree before anything is
-read: a chunk of another shape or codec would otherwise be nonsense that passes its checksum.
+The reader computes with `stickslip_schemas.format.layout` and not with the metadata, so the two must agree before
+anything is read: a chunk of another shape or codec would otherwise be nonsense that passes its checksum.
 """
 
 import json
@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.codecs import axes_order
+from stickslip_schemas.format.codecs import axes_order
+from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.data.errors import InvalidDatasetError
 

@@ -14,22 +14,20 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.chunks import (
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.format.chunks import (
     MISSING,
     CorruptChunkError,
     decode_chunk,
     decode_shard_index,
     shard_index_size,
 )
-from stickslip_schemas.codecs import decode_sample, empty_in_order, in_order_of_chunks
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import BrokenSectionError, Contents, Manifest
-from stickslip_schemas.samples import SPLITS
-from stickslip_schemas.selection import part_files
-from stickslip_schemas.tasks import FileEntry, Rejection
+from stickslip_schemas.format.codecs import decode_sample, empty_in_order, in_order_of_chunks
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry, Manifest, Rejection
+from stickslip_schemas.format.selection import part_files
+from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.jobs import SPLITS, JobSpec
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import (

@@ -8,8 +8,8 @@ of the three shows.
 from typing import Any
 
 from pydantic import ValidationError
-from stickslip_schemas.manifest import SEAL_NAME, BrokenSealError, check_seal
-from stickslip_schemas.selection import SELECTION_NAME, PartDocument, Selection
+from stickslip_schemas.format.manifest import SEAL_NAME, BrokenSealError, check_seal
+from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection
 
 from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError
 from stickslip_training.data.metadata import GROUP_METADATA, parse_metadata

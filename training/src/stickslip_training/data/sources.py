@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import unquote, urlsplit
 
-from stickslip_schemas.manifest import MANIFEST_NAME
-from stickslip_schemas.tasks import FileEntry
+from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
 
 from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.arrays import ArrayLayout, describe
-from stickslip_schemas.keys import sha256
-from stickslip_schemas.samples import SPLITS
-from stickslip_schemas.selection import Selection
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.format.selection import Selection
+from stickslip_schemas.spec.arrays import ArrayLayout, describe
+from stickslip_schemas.spec.jobs import SPLITS
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import CorruptDataError

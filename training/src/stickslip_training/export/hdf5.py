@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from stickslip_schemas.arrays import ArrayLayout, describe
+from stickslip_schemas.spec.arrays import ArrayLayout, describe
 
 from stickslip_training.export.content import Content, OnBytes
 

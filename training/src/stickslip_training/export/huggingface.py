@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.arrays import Array
 from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes

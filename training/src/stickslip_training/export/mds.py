@@ -8,7 +8,7 @@ index, which `StreamingDataset(validate_hash="sha256")` checks.
 from itertools import groupby
 from pathlib import Path
 
-from stickslip_schemas.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.export.content import DESCRIPTION, FILE_BYTES, MANIFEST_COPY, Content, OnBytes
 

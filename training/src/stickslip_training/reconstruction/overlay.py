@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
-from stickslip_schemas.cameras import Camera, read_rigs
+from stickslip_schemas.spec.cameras import Camera, read_rigs
 
 from stickslip_training.reconstruction.overlay import import_pillow, save_overlay
 from stickslip_training.reconstruction.pipeline import Reconstruction, ReconstructionError, reconstruct

@@ -18,7 +18,7 @@ from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction import curve

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from stickslip_schemas.tasks import RenderTask
+from stickslip_schemas.documents.tasks import RenderTask
 
 from stickslip_blender.build import blender_version, build_digest
 from stickslip_blender.device import described

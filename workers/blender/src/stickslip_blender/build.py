@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cache
 from importlib import metadata
 
-from stickslip_schemas.keys import content_key
-from stickslip_schemas.sources import UNCOUNTED, digests, sources
+from stickslip_schemas.base.keys import content_key
+from stickslip_schemas.plan.sources import UNCOUNTED, digests, sources
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.device import described

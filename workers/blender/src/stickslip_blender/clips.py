@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera, load_rig
-from stickslip_schemas.chunks import decode_chunk, encode_chunk
-from stickslip_schemas.keys import content_key, referred
-from stickslip_schemas.tasks import RenderOutput, TaskResult
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.base.keys import content_key, referred
+from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
+from stickslip_schemas.format.chunks import decode_chunk, encode_chunk
+from stickslip_schemas.spec.cameras import Camera, load_rig
+from stickslip_schemas.spec.fabrics import Texture
 
 from stickslip_blender.build import build_digest
 from stickslip_blender.engine import CLOTH_SAMPLING, ClothSampling, Sampling
@@ -34,8 +34,8 @@ from stickslip_blender.textures import own_texture, texture_image
 from stickslip_blender.workshop import Workshop, why_unfit
 
 if TYPE_CHECKING:
-    from stickslip_schemas.cloth import ClothRender
-    from stickslip_schemas.tasks import RenderTask
+    from stickslip_schemas.documents.tasks import RenderTask
+    from stickslip_schemas.kinds.cloth.spec import ClothRender
 
 GATE = 32.0
 """What composed pictures have to reach against direct ones, in means of 4 x 4 pixels of 8-bit sRGB [dB]."""

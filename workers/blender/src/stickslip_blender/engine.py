@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.jobs import Quality
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.device import CPU, device, use_device

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.geometry import FLOOR, Geometry
 from stickslip_blender.raster import Window, _raster, projected, see
 
 BACKGROUND, GROUND, CLOTH, PROP = range(4)
-"""Codes of the segmentation, in the order of `stickslip_schemas.cloth.SEGMENTS`."""
+"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.spec.SEGMENTS`."""
 
 Floats = npt.NDArray[np.float32]
 Halves = npt.NDArray[np.float16]

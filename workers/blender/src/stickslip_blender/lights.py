@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from stickslip_schemas.appearance import LampNumbers
+    from stickslip_schemas.spec.appearance import LampNumbers
 
 # azimuth, elevation [degree], power: what `drawn` trains on, and what no training light has.
 _RANGES: dict[str, tuple[tuple[float, float], ...]] = {

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.geometry import FLOOR, Geometry, mirrored
 from stickslip_blender.raster import Seen, Textures, Window, _raster, projected, see, see_albedo, window_about

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.engine import ClothSampling, Sampling, new_scene, set_sampling

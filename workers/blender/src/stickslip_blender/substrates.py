@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.raster import _raster
 
 if TYPE_CHECKING:
-    from stickslip_schemas.appearance import FloorNumbers
+    from stickslip_schemas.spec.appearance import FloorNumbers
 
 GRAIN_SIZE = 512
 """Side of the picture of a floor's grain [texels]."""

@@ -11,8 +11,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
-from stickslip_schemas.pictures import read_picture
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.format.pictures import read_picture
+from stickslip_schemas.spec.fabrics import Texture
 
 SIZE = 512
 """Side of a texture [texels]: 0.4 mm on the cloth, a seventh of a pixel."""

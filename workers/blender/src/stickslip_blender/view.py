@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.blender import import_bpy
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera, rig_digest
-from stickslip_schemas.chunks import encode_chunk
-from stickslip_schemas.codecs import encode_clip
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
+from stickslip_schemas.format.chunks import encode_chunk
+from stickslip_schemas.format.codecs import encode_clip
+from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.store import open_store, write_durably
-from stickslip_schemas.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
 
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
-    from stickslip_schemas.jobs import Render
+    from stickslip_schemas.spec.jobs import Render
 
     from stickslip_blender.clips import Trace
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.kinds import KINDS, kind_named
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import TaskResult
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import TaskResult
 
 from stickslip_workers.cloth import drop_labels, fabric_of, forces_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import TaskResult
 
 from stickslip_workers.cloth import fabric_of, kernel_level, result_of
 from stickslip_workers.kinds import Kind

@@ -5,9 +5,9 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import RecordRef, SimulateOutput, TaskResult
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import RecordRef, SimulateOutput, TaskResult
 
 from stickslip_workers.kinds import Kind
 from stickslip_workers.stages.records import Array, encode_records

@@ -3,8 +3,8 @@
 from typing import Any
 
 from pydantic import TypeAdapter
+from stickslip_schemas.documents.tasks import Task, TaskResult
 from stickslip_schemas.store import open_store
-from stickslip_schemas.tasks import Task, TaskResult
 
 from stickslip_workers import builds, progress
 from stickslip_workers.kinds import kind_names

@@ -4,9 +4,9 @@ import json
 from collections import Counter
 from typing import Any
 
-from stickslip_schemas.axes import AnyAxis, ListAxis
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import Manifest
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import Manifest
+from stickslip_schemas.spec.axes import AnyAxis, ListAxis
 
 from stickslip_workers.stages.preview import PREVIEW_NAME
 

@@ -3,11 +3,11 @@
 import warnings
 
 import numpy as np
-from stickslip_schemas.arrays import FORMAT, ArrayLayout, describe
-from stickslip_schemas.chunks import BLOSC_LEVEL
-from stickslip_schemas.codecs import axes_order, zstd_level
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.layout import layout, samples_per_file
+from stickslip_schemas.format.chunks import BLOSC_LEVEL
+from stickslip_schemas.format.codecs import axes_order, zstd_level
+from stickslip_schemas.format.layout import layout, samples_per_file
+from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout, describe
+from stickslip_schemas.spec.jobs import JobSpec
 
 
 def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: int) -> dict[str, bytes]:

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.chunks import check_chunk, encode_chunk, encode_shard, encode_trajectory
-from stickslip_schemas.layout import layout
+from stickslip_schemas.documents.tasks import PackOutput, PackSlot, PackTask, RecordRef, TaskResult
+from stickslip_schemas.format.chunks import check_chunk, encode_chunk, encode_shard, encode_trajectory
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import FileEntry
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import FileEntry, PackOutput, PackSlot, PackTask, RecordRef, TaskResult
 
 from stickslip_workers.stages.records import Array, Records
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.codecs import decode_sample
-from stickslip_schemas.jobs import JobSpec
-from stickslip_schemas.layout import layout
-from stickslip_schemas.samples import grid
+from stickslip_schemas.format.codecs import decode_sample
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.plan.points import grid
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.jobs import JobSpec
 
 PREVIEW_NAME = "preview.webp"
 SHOWN, FRAMES = 12, 20

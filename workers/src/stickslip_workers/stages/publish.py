@@ -7,33 +7,29 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.arrays import FORMAT, ArrayLayout
-from stickslip_schemas.chunks import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
-from stickslip_schemas.keys import canonical_json
-from stickslip_schemas.layout import layout, samples_per_file
-from stickslip_schemas.manifest import (
+from stickslip_schemas.base.keys import canonical_json
+from stickslip_schemas.documents.tasks import PublishOutput, PublishSection, PublishTask, TaskResult
+from stickslip_schemas.format.chunks import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
+from stickslip_schemas.format.layout import layout, samples_per_file
+from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
+    FileEntry,
     Manifest,
+    ManifestSection,
     Pictures,
+    Rejection,
     has_sections,
     seal_text,
     section_path,
     section_samples,
     with_manifest_digest,
 )
-from stickslip_schemas.samples import SPLITS, dataset_id
+from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
+from stickslip_schemas.spec.jobs import SPLITS
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
-from stickslip_schemas.tasks import (
-    FileEntry,
-    ManifestSection,
-    PublishOutput,
-    PublishSection,
-    PublishTask,
-    Rejection,
-    TaskResult,
-)
 
 from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, card

@@ -4,9 +4,9 @@ import time
 from collections.abc import Sequence
 from importlib import import_module
 
-from stickslip_schemas.states import Reason
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
 from stickslip_schemas.store import Store, in_parallel
-from stickslip_schemas.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
 
 from stickslip_workers.failures import failure
 

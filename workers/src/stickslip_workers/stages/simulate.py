@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
+from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
 from stickslip_schemas.store import Store
-from stickslip_schemas.tasks import SimulateTask, TaskResult
 
 from stickslip_workers.kinds import kind
 

@@ -3,8 +3,8 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request, Response
-from stickslip_schemas.certificate import CertificateUpload
-from stickslip_schemas.responses import CertificateEntry, Page
+from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.responses import CertificateEntry, Page
 
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.files import OPENAPI_HEADERS, serve

@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
-from stickslip_schemas.problems import MEDIA_TYPE
+from stickslip_schemas.documents.problems import MEDIA_TYPE
 
 from stickslip_services.database.paging import MAX_PAGE_SIZE, TOKEN_PATTERN, PageRequest
 

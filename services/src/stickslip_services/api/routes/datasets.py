@@ -6,10 +6,9 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Request, Response
-from stickslip_schemas.keys import is_sha256
-from stickslip_schemas.manifest import MANIFEST_NAME
-from stickslip_schemas.responses import Dataset, DatasetVersion, Page
-from stickslip_schemas.tasks import FileEntry
+from stickslip_schemas.base.keys import is_sha256
+from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
+from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
 
 from stickslip_services.api.files import OPENAPI_HEADERS, picture_format, serve
 from stickslip_services.api.routes.common import PageDep, coordinator_of, problem_responses

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from sqlalchemy import text
-from stickslip_schemas.base import Document
+from stickslip_schemas.base.document import Document
 
 from stickslip_services import __version__
 from stickslip_services.api.metrics import Metrics

@@ -3,10 +3,10 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.documents.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
 from stickslip_schemas.kinds import AnyJobSpec
-from stickslip_schemas.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
-from stickslip_schemas.states import TaskState
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.files import matches

@@ -13,12 +13,12 @@ import yaml
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 from sqlalchemy import Connection
-from stickslip_schemas.certificate import Certificate, Numbers, ProtocolReport
-from stickslip_schemas.jobs import JobSpec
+from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
+from stickslip_schemas.documents.responses import Dataset, DatasetVersion, JobDetail
 from stickslip_schemas.kinds import stored_spec_adapter
-from stickslip_schemas.responses import Dataset, DatasetVersion, JobDetail
-from stickslip_schemas.samples import SPLITS, grid
-from stickslip_schemas.states import JobState, TaskState
+from stickslip_schemas.plan.points import grid
+from stickslip_schemas.spec.jobs import SPLITS, JobSpec
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.problems import ProblemError

@@ -5,9 +5,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
-from stickslip_schemas.pictures import UnfitPictureError
-from stickslip_schemas.problems import FieldError, ProblemCode
-from stickslip_schemas.responses import TextureEntry
+from stickslip_schemas.documents.problems import FieldError, ProblemCode
+from stickslip_schemas.documents.responses import TextureEntry
+from stickslip_schemas.format.pictures import UnfitPictureError
 
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses

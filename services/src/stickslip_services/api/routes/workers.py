@@ -6,8 +6,8 @@ from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel
-from stickslip_schemas.responses import WorkerEntry
-from stickslip_schemas.worker_api import (
+from stickslip_schemas.documents.responses import WorkerEntry
+from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
     LeaseBatch,

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
+from stickslip_schemas.documents.tasks import RenderTask, TaskResult
 from stickslip_schemas.kinds import KINDS, kind_named
-from stickslip_schemas.tasks import RenderTask, TaskResult
 
 from stickslip_blender.workshop import Workshop
 

@@ -9,8 +9,8 @@ from stickslip_blender.holders import Holders
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
+    from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-    from stickslip_schemas.tasks import RenderTask, TaskResult
 
 
 def render(look: ClothDragRender, task: RenderTask, workshop: Workshop) -> TaskResult:

@@ -12,8 +12,8 @@ from stickslip_blender.holders import Holders
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
+    from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothRender
-    from stickslip_schemas.tasks import RenderTask, TaskResult
 
 
 def render(look: ClothOnClothRender, task: RenderTask, workshop: Workshop) -> TaskResult:

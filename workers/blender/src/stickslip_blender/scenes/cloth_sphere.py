@@ -13,8 +13,8 @@ from stickslip_blender.geometry import Faces, Prop
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
+    from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender
-    from stickslip_schemas.tasks import RenderTask, TaskResult
 
 RADIUS = 0.05
 """Of the sphere in the simulation [m]."""

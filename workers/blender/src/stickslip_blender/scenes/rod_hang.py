@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.cameras import Camera, load_rig
-from stickslip_schemas.jobs import Quality
+from stickslip_schemas.spec.cameras import Camera, load_rig
+from stickslip_schemas.spec.jobs import Quality
 
 from stickslip_blender.blender import import_bpy
 from stickslip_blender.color import Color, silicone_color, to_linear
@@ -29,8 +29,8 @@ from stickslip_blender.view import new_view, set_view
 from stickslip_blender.workshop import Workshop, why_unfit
 
 if TYPE_CHECKING:
+    from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.rod_hang import RodHangRender
-    from stickslip_schemas.tasks import RenderTask, TaskResult
 
 POINTS = 150
 RADIUS = 0.008  # [L], the default

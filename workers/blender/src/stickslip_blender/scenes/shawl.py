@@ -13,8 +13,8 @@ from stickslip_blender.geometry import Prop
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
+    from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.shawl import ShawlRender
-    from stickslip_schemas.tasks import RenderTask, TaskResult
 
 SUNK = 0.0005
 """How far inside the simulation's skin the figure is seen [m]: half the thickness of a cloth that lies on it."""

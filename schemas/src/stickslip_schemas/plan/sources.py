@@ -15,7 +15,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from stickslip_schemas.keys import sha256
+from stickslip_schemas.base.keys import sha256
 
 UNCOUNTED = ("stickslip_schemas.kinds", "stickslip_schemas.store", "stickslip_schemas.store.*")
 """What builds cut. The list of kinds decides on nothing by itself, and it would make every build depend on every kind.

@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from itertools import islice, product
 from typing import Any, NamedTuple, Protocol
 
-from stickslip_schemas.axes import axis_values
-from stickslip_schemas.base import Document
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.jobs import JobSpec, Render, SeedRule, Simulation, Splits
-from stickslip_schemas.keys import canonical_json, content_key, derived_seed, keyed_text, seed_of_key, sha256
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.keys import canonical_json, content_key, derived_seed, keyed_text, seed_of_key, sha256
 from stickslip_schemas.kinds import registered
-
-SPLITS = ("train", "validation", "test")
-"""Names of the splits, in the order of their numbers in the array `split`."""
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.spec.axes import axis_values
+from stickslip_schemas.spec.jobs import JobSpec, Render, SeedRule, Simulation, Splits
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base import Document, Float, Int
-from stickslip_schemas.cloth import OwnName, PresetName
-from stickslip_schemas.fabrics import FabricNumbers, Material
+from stickslip_schemas.base.document import Document, Float, Int
+from stickslip_schemas.kinds.cloth.spec import PresetName
+from stickslip_schemas.spec.fabrics import FabricNumbers, Material, OwnName
 
 MAX_FRAMES = 10_000
 """Of a scene."""

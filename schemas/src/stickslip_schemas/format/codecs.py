@@ -1,15 +1,15 @@
 """How the values of one sample are coded, by what they are: clips, trajectories, and all else.
 
 A clip is `transpose -> zstd(CLIP_LEVEL) -> crc32c`: the same row of all frames is together, for most of it is as it was
-in the frame before. The other two are in `stickslip_schemas.chunks`.
+in the frame before. The other two are in `stickslip_schemas.format.chunks`.
 """
 
 import threading
 
 import numpy as np
 
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.chunks import ZSTD_LEVEL, decode_chunk, decode_trajectory, encode_chunk, encode_trajectory
+from stickslip_schemas.format.chunks import ZSTD_LEVEL, decode_chunk, decode_trajectory, encode_chunk, encode_trajectory
+from stickslip_schemas.spec.arrays import ArrayLayout
 
 CLIP_LEVEL = 11
 """Of zstd, for clips: written once, read many times, and reading is as fast as at level 3."""

@@ -5,8 +5,8 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
-from stickslip_schemas.base import WHOLE, Document, Float
-from stickslip_schemas.cameras import Camera
+from stickslip_schemas.base.document import WHOLE, Document, Float
+from stickslip_schemas.spec.cameras import Camera
 
 CLIP_SIZE = 224
 """Width and height of a clip [px]."""
@@ -141,3 +141,10 @@ def _rotation(rvec: Row) -> tuple[Row, Row, Row]:
     R = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
     a, b, c = (tuple(row) for row in R.tolist())
     return a, b, c
+
+
+def shown_frames(count: int, instants: int) -> tuple[int, ...]:
+    """Return the instants that a clip of `count` frames shows of `instants`: the first, and then evenly spread."""
+    if not 1 <= count <= instants:
+        raise ValueError(f"frames must be from 1 to {instants}, and is {count}")
+    return tuple(position * instants // count for position in range(count))

@@ -4,11 +4,11 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from stickslip_schemas.base import Bool, Document, Float, Int
-from stickslip_schemas.builds import Builds
+from stickslip_schemas.base.document import Bool, Document, Float, Int
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.documents.tasks import Task, TaskResult
 from stickslip_schemas.kinds import KINDS, kind_named
-from stickslip_schemas.states import Stage
-from stickslip_schemas.tasks import Task, TaskResult
+from stickslip_schemas.plan.builds import Builds
 
 MAX_SLOTS = 100_000
 """The most tasks that one dispatcher may run at once."""

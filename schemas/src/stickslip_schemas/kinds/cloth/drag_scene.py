@@ -3,9 +3,9 @@
 from enum import StrEnum
 from typing import Annotated
 
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import quantity
-from stickslip_schemas.cloth import OwnName, name_schema
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import quantity
+from stickslip_schemas.spec.fabrics import OwnName, name_schema
 
 
 class Viewpoint(StrEnum):

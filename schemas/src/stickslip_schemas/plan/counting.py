@@ -7,10 +7,9 @@ from math import ceil, prod
 
 import numpy as np
 
-from stickslip_schemas.axes import AnyAxis, ListAxis, range_values
-from stickslip_schemas.base import Document
-from stickslip_schemas.jobs import JobSpec, SeedRule
-from stickslip_schemas.samples import SPLITS
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.spec.axes import AnyAxis, ListAxis, range_values
+from stickslip_schemas.spec.jobs import SPLITS, JobSpec, SeedRule
 
 
 @dataclass(frozen=True, slots=True)

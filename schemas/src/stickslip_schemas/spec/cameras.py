@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
 
-from stickslip_schemas.base import Document
-from stickslip_schemas.keys import content_key
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.keys import content_key
 
 __all__ = ["Camera", "Matrix3", "Vector3", "load_rig", "read_rigs", "rig_digest", "rig_names"]
 

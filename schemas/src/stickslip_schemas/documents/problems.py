@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from stickslip_schemas.hints import did_you_mean
+from stickslip_schemas.spec.fabrics import did_you_mean
 
 MEDIA_TYPE = "application/problem+json"
 

@@ -8,16 +8,12 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base import Bool, Document, Float
-from stickslip_schemas.keys import Sha256, canonical_json, content_key
+from stickslip_schemas.base.document import Bool, Document, Float
+from stickslip_schemas.base.keys import Sha256, canonical_json, content_key
 
 MAX_PAGE_CHARACTERS = 8 * 2**20
 
-CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
-"""What a certificate must have, too, where cloth touches itself or other cloth."""
-
 Numbers = tuple[Float | None, ...]
-
 
 _NOT_CONTENT: Any = {
     "environment": True,

@@ -1,15 +1,16 @@
 """What the coordinator answers to users."""
 
 from datetime import datetime
+from enum import StrEnum
 from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
-from stickslip_schemas.base import Document, Int
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.keys import ArtifactRef, Sha256
+from stickslip_schemas.base.document import Document, Int
+from stickslip_schemas.base.keys import ArtifactRef, Sha256
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.kinds import StoredJobSpec
-from stickslip_schemas.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.plan.builds import Builds
 
 T = TypeVar("T")
 
@@ -203,3 +204,42 @@ class Page(Document, Generic[T]):
 
     items: tuple[T, ...]
     next_page_token: str | None
+
+
+class EventName(StrEnum):
+    """The `event:` field."""
+
+    job_state = "job.state"
+    job_progress = "job.progress"
+    task_state = "task.state"
+    dataset_published = "dataset.published"
+
+
+class JobStateEvent(Document):
+    """The job is in another state. It is the last event where the state is terminal."""
+
+    state: JobState
+    reason: Reason | None
+    message: str
+
+
+class JobProgressEvent(Document):
+    """Tasks have ended."""
+
+    progress: Progress
+
+
+class TaskStateEvent(Document):
+    """A task came to an end worth telling: soft_failed, failed or rejected."""
+
+    task_id: str
+    stage: Stage
+    state: TaskState
+    reason: Reason
+    message: str
+
+
+class DatasetPublishedEvent(Document):
+    """A dataset version was committed."""
+
+    dataset: DatasetRef

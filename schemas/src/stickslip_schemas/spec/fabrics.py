@@ -3,12 +3,14 @@
 The numbers of the measured materials live with the simulation core; a contract test compares the names.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from enum import StrEnum
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, WithJsonSchema, model_validator
 
-from stickslip_schemas.base import Document, Float
+from stickslip_schemas.base.document import Document, Float
 
 
 class Material(StrEnum):
@@ -93,3 +95,38 @@ class FabricNumbers(Document):
                     f"young and thickness must give a plate rigidity from {low:g} to {high:g} N m, and it is {plate:g}"
                 )
         return self
+
+
+OwnName = Annotated[str, Field(pattern=MATERIAL_NAME)]
+
+
+def name_schema(built_in: Iterable[str]) -> WithJsonSchema:
+    """Say in the JSON schema which names are built in, and what one of the user's own looks like."""
+    return WithJsonSchema({"anyOf": [{"enum": list(map(str, built_in))}, {"type": "string", "pattern": MATERIAL_NAME}]})
+
+
+class Texture(StrEnum):
+    """Procedural cloth textures. Their order gives the codes of the label `texture`: add new ones at the end."""
+
+    checker = "checker"
+    dots = "dots"
+    stripes = "stripes"
+    plaid = "plaid"
+    gingham = "gingham"
+    herringbone = "herringbone"
+    houndstooth = "houndstooth"
+    floral = "floral"
+    argyle = "argyle"
+    camouflage = "camouflage"
+    chevron = "chevron"
+    terrazzo = "terrazzo"
+
+
+HELD_OUT_TEXTURES = (Texture.argyle, Texture.camouflage, Texture.chevron, Texture.terrazzo)
+"""To test with: a network that is to cope with a new texture is not trained with these [thesis, 4.5.1]."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return `; did you mean ...?` with the known word that is most like `word`, or nothing where none is."""
+    close = get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -2,7 +2,7 @@
 
 Labels are a few large chunks; curves are one chunk per shard group; pictures, clips and meshes are one chunk per
 sample, and the chunks of a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for
-those of clips and trajectories: see `stickslip_schemas.codecs`.
+those of clips and trajectories: see `stickslip_schemas.format.codecs`.
 """
 
 from dataclasses import dataclass, field, fields

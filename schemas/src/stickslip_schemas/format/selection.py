@@ -12,13 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError
 
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.base import Document
-from stickslip_schemas.keys import Sha256
-from stickslip_schemas.layout import layout
-from stickslip_schemas.manifest import GROUP_NAME, Contents
-from stickslip_schemas.samples import SPLITS
-from stickslip_schemas.tasks import FileEntry
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import GROUP_NAME, Contents, FileEntry
+from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.jobs import SPLITS
 
 SELECTION_NAME = "selection.json"
 """The file that says which part of a version a directory holds; it is not in a directory that holds all of it."""

@@ -11,19 +11,19 @@ these files shows.
 import json
 import re
 from collections.abc import Callable, Iterator
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.arrays import ArrayLayout
-from stickslip_schemas.base import Document
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.cameras import Camera
-from stickslip_schemas.jobs import JobSpec, Quality
-from stickslip_schemas.keys import Sha256, sha256
+from stickslip_schemas.base.document import Document, Int
+from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.format.layout import samples_per_file
 from stickslip_schemas.kinds import StoredJobSpec
-from stickslip_schemas.layout import samples_per_file
-from stickslip_schemas.tasks import FileEntry, ManifestSection, Rejection
+from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.jobs import JobSpec, Quality
 
 MANIFEST_NAME = "manifest.json"
 GROUP_NAME = "zarr.json"
@@ -54,6 +54,38 @@ def section_path(number: int) -> str:
 
 
 _SHARD = re.compile(r"[^/]+/c/(\d{1,18})(?:/|$)")
+
+
+class FileEntry(Document):
+    """A file of a dataset: its path inside the dataset, its digest and its size in bytes."""
+
+    path: str = Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$")
+    sha256: Sha256
+    size: Int = Field(ge=0)
+
+
+class Rejection(Document):
+    """Why a slot is empty."""
+
+    slot: Int = Field(ge=0)
+    sample_key: Sha256
+    reason: Reason
+    message: str
+    labels: dict[str, Any] = Field(description="the parameters of the sample")
+
+
+class ManifestSection(Document):
+    """What a version has of consecutive shards: their samples and the files of their arrays that are no labels."""
+
+    first: Int = Field(ge=0, description="slot of the first sample")
+    sample_keys: tuple[Sha256, ...] = Field(min_length=1, description="by slot")
+    rejections: tuple[Rejection, ...]
+    files: tuple[FileEntry, ...]
+
+    @property
+    def end(self) -> int:
+        """The slot after the last one."""
+        return self.first + len(self.sample_keys)
 
 
 class BrokenSectionError(ValueError):

@@ -1,35 +1,26 @@
 """What the kinds of cloth have in common: materials, presets, clips, and the arrays of a trajectory."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
-from pydantic import Field, ValidationError, WithJsonSchema, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.appearance import CLIP_SIZE, Calibration, FloorNumbers, LampNumbers
-from stickslip_schemas.arrays import NAN, ArrayLayout
-from stickslip_schemas.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
-from stickslip_schemas.base import Bool, Document, Float, Int
-from stickslip_schemas.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.clips import shown_frames
-from stickslip_schemas.fabrics import MATERIAL_NAME, FabricNumbers, Material
-from stickslip_schemas.hints import did_you_mean
-from stickslip_schemas.jobs import JobSpec, Quality, Render, Simulation
-from stickslip_schemas.keys import ArtifactRef, Sha256, referred
-from stickslip_schemas.states import Stage
-from stickslip_schemas.textures import Texture
+from stickslip_schemas.base.document import Bool, Document, Float, Int
+from stickslip_schemas.base.keys import ArtifactRef, Sha256, referred
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.spec.appearance import CLIP_SIZE, Calibration, FloorNumbers, LampNumbers, shown_frames
+from stickslip_schemas.spec.arrays import NAN, ArrayLayout
+from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import FabricNumbers, Material, OwnName, Texture, did_you_mean, name_schema
+from stickslip_schemas.spec.jobs import JobSpec, Quality, Render, Simulation
 
 Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
 Factor = Annotated[
     float, quantity("Factor"), Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric")
 ]
-OwnName = Annotated[str, Field(pattern=MATERIAL_NAME)]
-
-
-def name_schema(built_in: Iterable[str]) -> WithJsonSchema:
-    """Say in the JSON schema which names are built in, and what one of the user's own looks like."""
-    return WithJsonSchema({"anyOf": [{"enum": list(map(str, built_in))}, {"type": "string", "pattern": MATERIAL_NAME}]})
 
 
 MaterialName = Annotated[OwnName, quantity("Material"), name_schema(Material)]

@@ -6,11 +6,12 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from stickslip_schemas.base import Bool, Document, Float, Int
-from stickslip_schemas.builds import Builds
-from stickslip_schemas.keys import Sha256, referred
+from stickslip_schemas.base.document import Bool, Document, Float, Int
+from stickslip_schemas.base.keys import Sha256, referred
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.format.manifest import FileEntry, ManifestSection, Rejection
 from stickslip_schemas.kinds import AnyRender, AnySimulation, StoredJobSpec
-from stickslip_schemas.states import Reason
+from stickslip_schemas.plan.builds import Builds
 
 # --- where bytes are ------------------------------------------------------------------------------------------
 
@@ -28,14 +29,6 @@ class ChunkRef(Document):
     digest: Sha256
     offset: Int = Field(ge=0)
     length: Int = Field(gt=0)
-
-
-class FileEntry(Document):
-    """A file of a dataset: its path inside the dataset, its digest and its size in bytes."""
-
-    path: str = Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$")
-    sha256: Sha256
-    size: Int = Field(ge=0)
 
 
 # --- simulate -------------------------------------------------------------------------------------------------
@@ -90,16 +83,6 @@ class RenderOutput(Document):
 # --- pack and publish -----------------------------------------------------------------------------------------
 
 
-class Rejection(Document):
-    """Why a slot is empty."""
-
-    slot: Int = Field(ge=0)
-    sample_key: Sha256
-    reason: Reason
-    message: str
-    labels: dict[str, Any] = Field(description="the parameters of the sample")
-
-
 class PackSlot(Document):
     """One slot of a shard: where its data lie, or that it was rejected."""
 
@@ -132,20 +115,6 @@ class PackOutput(Document):
     stage: Literal["pack"] = "pack"
     files: tuple[FileEntry, ...] = Field(description="of the arrays that are no labels")
     labels: Sha256 = Field(description="artifact: a shard whose chunks are the labels, in the order of the layout")
-
-
-class ManifestSection(Document):
-    """What a version has of consecutive shards: their samples and the files of their arrays that are no labels."""
-
-    first: Int = Field(ge=0, description="slot of the first sample")
-    sample_keys: tuple[Sha256, ...] = Field(min_length=1, description="by slot")
-    rejections: tuple[Rejection, ...]
-    files: tuple[FileEntry, ...]
-
-    @property
-    def end(self) -> int:
-        """The slot after the last one."""
-        return self.first + len(self.sample_keys)
 
 
 class PublishSection(ManifestSection):

@@ -11,12 +11,12 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.arrays import COMMON_ARRAYS, ArrayLayout
-from stickslip_schemas.axes import MAX_SAMPLES, AnyAxis, Seed
-from stickslip_schemas.base import Document, Float, Int
-from stickslip_schemas.cameras import Camera
-from stickslip_schemas.keys import Sha256, content_key, derived_seed
-from stickslip_schemas.states import Stage
+from stickslip_schemas.base.document import Document, Float, Int
+from stickslip_schemas.base.keys import Sha256, content_key, derived_seed
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
+from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, Seed
+from stickslip_schemas.spec.cameras import Camera
 
 D = TypeVar("D", bound=Document)
 
@@ -237,3 +237,11 @@ class JobSpec(Document):
         if self.sample_count > MAX_SAMPLES:
             raise ValueError(f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}")
         return self
+
+
+SPLITS = ("train", "validation", "test")
+"""Names of the splits, in the order of their numbers in the array `split`."""
+
+
+CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
+"""What a certificate must have, too, where cloth touches itself or other cloth."""

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, field
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stickslip_schemas.base import WHOLE, Document
+from stickslip_schemas.base.document import WHOLE, Document
 
 MAX_SAMPLES = 1_000_000
 """The most samples that one job may ask for."""

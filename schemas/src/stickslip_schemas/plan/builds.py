@@ -1,7 +1,7 @@
 """Which code makes the data: the builds that enter every content key."""
 
-from stickslip_schemas.base import Document
-from stickslip_schemas.keys import Sha256, content_key
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.keys import Sha256, content_key
 
 
 class Builds(Document):

@@ -1,9 +1,9 @@
 """Which arrays the dataset of a spec has."""
 
-from stickslip_schemas import arrays
-from stickslip_schemas.arrays import COMMON_ARRAYS, FORMAT_1, ArrayLayout
-from stickslip_schemas.jobs import JobSpec
 from stickslip_schemas.kinds import registered
+from stickslip_schemas.spec import arrays
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS, FORMAT_1, ArrayLayout
+from stickslip_schemas.spec.jobs import JobSpec
 
 
 def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:

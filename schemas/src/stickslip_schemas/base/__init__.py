@@ -1,0 +1,1 @@
+"""The base of every document, content keys and states."""

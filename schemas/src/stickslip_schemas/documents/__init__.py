@@ -1,0 +1,1 @@
+"""The messages between components: tasks, results, answers, events, problems, certificates."""

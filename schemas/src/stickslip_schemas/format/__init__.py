@@ -1,0 +1,1 @@
+"""How a dataset is stored: arrays, chunks, shards and the manifest."""
