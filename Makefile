@@ -5,7 +5,7 @@ PY = .venv/bin/python
 BLENDER_PY = .venv-blender/bin/python
 PIP_FLAGS = --quiet --disable-pip-version-check
 
-SOURCES = $(addsuffix /src,schemas services training workers workers/blender) sim_core/python examples benchmarks tools
+SOURCES = $(addsuffix /src,schemas services testing training workers workers/blender) sim_core/python examples benchmarks tools
 # One by one: test modules of different components have the same names. The other tests are not typed.
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml

@@ -27,7 +27,7 @@ from stickslip_schemas.store import (
 from zarr.abc.store import Store as ZarrStore
 
 if TYPE_CHECKING:
-    from stickslip_schemas.testing_s3 import Proxy
+    from stickslip_testing.s3 import Proxy
 
 NOWHERE = sha256(b"nobody has published this")
 LARGE = np.random.default_rng(1).bytes(5_000_000)
@@ -65,7 +65,7 @@ def server() -> Iterator["Proxy"]:
     """A real S3 server behind a proxy."""
     pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    from stickslip_schemas.testing_s3 import s3_proxy
+    from stickslip_testing.s3 import s3_proxy
 
     with s3_proxy() as proxy:
         yield proxy
@@ -76,7 +76,7 @@ def bucket(proxy: "Proxy", name: str, monkeypatch: pytest.MonkeyPatch) -> Place:
     import obstore.store
     import stickslip_schemas.store.bucket
     from stickslip_schemas.store.bucket import BucketStore
-    from stickslip_schemas.testing_s3 import make_bucket, no_fault, variables
+    from stickslip_testing.s3 import make_bucket, no_fault, variables
 
     proxy.fault = no_fault
     monkeypatch.setattr(stickslip_schemas.store.bucket, "PATIENCE", 5.0)

@@ -15,7 +15,7 @@ pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[ser
 import obstore
 import obstore.exceptions
 from stickslip_schemas.store.bucket import BucketStore
-from stickslip_schemas.testing_s3 import Proxy, make_bucket, no_fault, s3_proxy, variables
+from stickslip_testing.s3 import Proxy, make_bucket, no_fault, s3_proxy, variables
 
 SMALL = np.random.default_rng(1).bytes(100_000)
 LARGE = np.random.default_rng(2).bytes(3_000_000)

@@ -18,8 +18,8 @@ from stickslip_services.settings import Settings
 from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, start_server
 
 if TYPE_CHECKING:
-    from stickslip_schemas.testing_s3 import Proxy
     from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.s3 import Proxy
 
 _buckets = itertools.count()
 
@@ -51,7 +51,7 @@ def s3() -> Iterator["Proxy"]:
     """An S3 server behind a proxy, started with the first test that needs it."""
     pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    from stickslip_schemas.testing_s3 import s3_proxy
+    from stickslip_testing.s3 import s3_proxy
 
     with s3_proxy() as proxy:
         yield proxy
@@ -60,7 +60,7 @@ def s3() -> Iterator["Proxy"]:
 @pytest.fixture
 def bucket(s3: "Proxy", monkeypatch: pytest.MonkeyPatch) -> str:
     """The place of an empty store in a bucket, which processes find by their environment."""
-    from stickslip_schemas.testing_s3 import make_bucket, no_fault, variables
+    from stickslip_testing.s3 import make_bucket, no_fault, variables
 
     s3.fault = no_fault
     for variable, value in variables(s3).items():

@@ -33,8 +33,8 @@ from stickslip_services.settings import Settings
 from stickslip_services.testing import rods, wait_until
 
 if TYPE_CHECKING:
-    from stickslip_schemas.testing_s3 import Proxy
     from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.s3 import Proxy
 
 KILLS = int(os.environ.get("STICKSLIP_KILLS", "30"))
 PATIENCE = 300.0

@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
 
 import obstore.store
-from stickslip_schemas.testing_s3 import Proxy, no_fault
+from stickslip_testing.s3 import Proxy, no_fault
 
 REFUSAL = r"store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3:/lab/store'"
 

@@ -15,7 +15,7 @@ pytest.importorskip("obstore", reason="obstore is not installed: pip install 'st
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
 
 import obstore.store
-from stickslip_schemas.testing_s3 import make_bucket, s3_proxy, variables
+from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 
 
 @pytest.fixture(scope="module")
