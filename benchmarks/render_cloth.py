@@ -1,4 +1,4 @@
-"""What a frame of cloth costs in CPU time and how far it is from 256 samples, by quality: one trace for many textures.
+"""CPU time and distance from 256 samples of a frame of cloth, by quality, with one shading for many textures.
 
 Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
@@ -12,7 +12,7 @@ squared error of 8-bit sRGB over the pixels that the cloth covers by half or mor
 CPU time is a median over frames, per frame and texture, with eight textures.
 
 --look says what hem, thickness, translucency and creases cost, and --ground-truth what all its arrays cost, written to
-a store too: both against a trace and its composition, in turns, so that other work on the machine slows both alike.
+a store too: both against a shading and its composition, in turns, so that other work on the machine slows both alike.
 
 --clip makes what a render process makes of a task, 8 clips of 30 frames in a store, says how much of its time is not
 Blender's, and writes the clips to a file.
@@ -121,11 +121,11 @@ class Bench:
         """Return the pictures of all textures, the seconds of Cycles and those of all the rest."""
         shot, floor = self.set_up(view)
         placed = time.process_time()
-        trace = self.stage.trace(shot, sampling, seed=7)
+        shading = self.stage.shading(shot, sampling, seed=7)
         traced = time.process_time()
         camera = self.rig[view.view]
-        pictures = np.empty((len(TEXTURES), *trace.shape), dtype=np.uint8)
-        self.stage.composer.compose(trace, shot.points, camera, view.substrate, floor, self.textures, pictures)
+        pictures = np.empty((len(TEXTURES), *shading.shape), dtype=np.uint8)
+        self.stage.composer.compose(shading, shot.points, camera, view.substrate, floor, self.textures, pictures)
         ended = time.process_time()
         return pictures, traced - placed, ended - traced + self._per_frame(view)
 
@@ -199,7 +199,7 @@ def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Vi
 
 
 def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
-    """Print what a trace and its composition cost with a plain sheet, and with all that makes it look like cloth."""
+    """Print what a shading and its composition cost with a plain sheet, and with all that makes it look like cloth."""
     full, plain = bench.look, replace(bench.look, hem=0.0, translucency=0.0)
     seconds: dict[str, list[float]] = {"plain": [], "full": []}
     for _ in range(3):
@@ -218,7 +218,7 @@ def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
 
 
 def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
-    """Print what depth, segmentation, normals, texture coordinates and flow cost, besides a trace and its pictures."""
+    """Print the cost of depth, segmentation, normals, texture coordinates and flow, and of a shading."""
     pictures, known, written = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         workshop = Workshop(folder)
@@ -237,7 +237,7 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
     of_trace, of_all = (100 * np.median(part / whole) for part in (np.array(known), np.add(known, written)))
     print(
         f"ground truth: {1e3 * np.median(known):.0f} ms a frame, {of_trace:.1f} % of the "
-        f"{1e3 * np.median(whole):.0f} ms of a trace and its eight pictures; {of_all:.1f} % with writing it",
+        f"{1e3 * np.median(whole):.0f} ms of a shading and its eight pictures; {of_all:.1f} % with writing it",
         flush=True,
     )
 

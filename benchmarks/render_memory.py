@@ -61,7 +61,7 @@ def main() -> None:
             crease_seed=number,
         )
         clip = renderer.clip(look, small(camera), track)
-        clip.clips(clip.trace(), [texture_image(list(Texture)[number % len(Texture)])])
+        clip.clips(clip.shading(), [texture_image(list(Texture)[number % len(Texture)])])
         if number + 1 == WARM_UP:
             begun = resident()
     ended = resident()

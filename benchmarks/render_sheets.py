@@ -82,13 +82,13 @@ class Studio:
         )
         (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
         clip = self._renderer.clip(document, camera, track[list(document.instants)])
-        trace = clip.trace()
-        videos, _ = clip.clips(trace, [texture_image(texture) for texture in textures])
+        shading = clip.shading()
+        videos, _ = clip.clips(shading, [texture_image(texture) for texture in textures])
         if close:
             boxes = [_around(camera.project(positions)[0]) for positions in track[list(document.instants)]]
-            return [_resized(video, CLOSE, boxes) for video in videos], trace.gate_db
+            return [_resized(video, CLOSE, boxes) for video in videos], shading.gate_db
         whole = [(0, 0, camera.width, camera.height)] * len(document.instants)
-        return [_resized(video, SIDE, whole) for video in videos], trace.gate_db
+        return [_resized(video, SIDE, whole) for video in videos], shading.gate_db
 
 
 def _around(pixels: npt.NDArray[np.float64]) -> tuple[int, int, int, int]:

@@ -3,7 +3,7 @@
     $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz CLIPS.npz [--clips 24] [--seed 0] [--only RUN ...]
 
 RUNS.npz is of `cloth_runs.py --pack`. Only the instants of `--instants` are rendered. Every clip has a viewpoint and a
-light of its own and is rendered with `--textures` textures, from one trace; the runs, or those of `--only`, take turns.
+light of its own. One shading serves its `--textures` textures. The runs, or those of `--only`, take turns.
 """
 
 import argparse
@@ -27,7 +27,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("runs", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--clips", type=int, default=24, help="traces; clips are so many times the textures")
+    parser.add_argument("--clips", type=int, default=24, help="shadings; clips are so many times the textures")
     parser.add_argument("--textures", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, nargs="+", help="numbers of the runs; all, if not given")
@@ -73,7 +73,7 @@ def main() -> None:
                 }
             )
             made = renderer.clip(look, cameras[view.value], positions[run][frames])
-            videos += list(made.clips(made.trace(), [texture_image(texture) for texture in chosen])[0])
+            videos += list(made.clips(made.shading(), [texture_image(texture) for texture in chosen])[0])
             if args.segmentation:
                 seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
             for texture in chosen:

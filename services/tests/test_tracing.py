@@ -15,7 +15,7 @@ HOST = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 def test_without_a_collector_nothing_is_traced(coordinator: Coordinator, worker: PretendWorker) -> None:
     coordinator.submit(parsed(rods()), None, traceparent=HOST)
     assert not tracing.is_on()
-    assert {lease.trace for lease in worker.lease()} == {None}
+    assert {lease.traceparent for lease in worker.lease()} == {None}
     with tracing.span("nothing") as span:
         assert span.traceparent is None
         span.note(job="none")

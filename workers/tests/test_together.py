@@ -1,11 +1,11 @@
-"""Renders that share a trace are put together, and their result is taken apart again."""
+"""Renders that share a shading are put together, and their result is taken apart again."""
 
 import pytest
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
-from stickslip_workers.together import apart, together, trace_of
+from stickslip_workers.together import apart, shading_of, together
 
 RECORD = RecordRef(digest="d" * 64, row=0)
 
@@ -28,22 +28,22 @@ def chunk(number: int) -> ChunkRef:
 
 
 def test_only_the_texture_may_differ() -> None:
-    same = trace_of(clip("dots"))
-    assert trace_of(clip("plaid", preview=True)) == same
+    same = shading_of(clip("dots"))
+    assert shading_of(clip("plaid", preview=True)) == same
     others = [clip("dots", light_seed=2), clip("dots", viewpoint="right"), clip("dots", creases=0.5)]
     others.append(clip("dots", ground_truth=("depth",)))
     others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
-    assert same not in {trace_of(task) for task in others}
-    with pytest.raises(ValueError, match="renders of one trace"):
+    assert same not in {shading_of(task) for task in others}
+    with pytest.raises(ValueError, match="renders of one shading"):
         together([clip("dots"), others[0]])
 
 
 def test_a_rod_shares_nothing() -> None:
     rod = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=1)
     task = RenderTask(render=rod, record=RECORD)
-    assert trace_of(task) is None
+    assert shading_of(task) is None
     assert together([task]) is task
-    with pytest.raises(ValueError, match="renders of one trace"):
+    with pytest.raises(ValueError, match="renders of one shading"):
         together([task, task])
 
 

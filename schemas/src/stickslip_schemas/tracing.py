@@ -118,7 +118,7 @@ def record_task(lease: Lease, result: TaskResult, seconds: float, *, worker: str
     failure = result.message[:500] if result.outcome == "failed" else ""
     record(
         lease.task.stage,
-        parent=lease.trace,
+        parent=lease.traceparent,
         seconds=seconds,
         failure=failure,
         task=lease.task_id,

@@ -287,7 +287,7 @@ def test_every_function_that_renders_is_in_the_build(
 def test_a_clip_has_the_same_bytes_however_its_trace_was_made(
     actor: RenderActor, store: DirectoryStore, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Alone; with others; from a trace in the store; by an actor that has rendered something else."""
+    """Alone; with others; from a shading in the store; by an actor that has rendered something else."""
     cloth = trajectory()
     alone = _output(actor.render(_clip(cloth, frames=1)))
     other = RenderActor(str(store.root))
@@ -297,7 +297,7 @@ def test_a_clip_has_the_same_bytes_however_its_trace_was_made(
     assert several.clips[Texture.plaid] == alone.chunks["video"]
     assert set(several.previews) == {"floral", "plaid"}
     third = RenderActor(str(store.root))
-    monkeypatch.setattr(ClothStage, "trace", None)  # from here on nothing can be traced
+    monkeypatch.setattr(ClothStage, "shading", None)  # from here on nothing can be traced
     later = _output(third.render(_clip(cloth, frames=1, textures=["plaid", "dots"])))
     third.close()
     assert later.clips[Texture.plaid] == alone.chunks["video"]
@@ -308,13 +308,13 @@ def test_nothing_is_traced_again_for_another_texture(
     actor: RenderActor, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traced: list[int] = []
-    trace = ClothStage.trace
+    shading = ClothStage.shading
 
     def count(self: ClothStage, *arguments: Any) -> Any:
         traced.append(1)
-        return trace(self, *arguments)
+        return shading(self, *arguments)
 
-    monkeypatch.setattr(ClothStage, "trace", count)
+    monkeypatch.setattr(ClothStage, "shading", count)
     cloth = trajectory()
     clips = [_output(actor.render(_clip(cloth, frames=2, texture=texture))).chunks for texture in ("dots", "checker")]
     assert len(traced) == 2

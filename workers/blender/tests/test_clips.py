@@ -44,7 +44,7 @@ def _render(renderer: ClothRenderer, sheet: Any, *textures: Texture, **look: Any
     document = ClothDragRender.model_validate(LOOK | look)
     (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
     clip = renderer.clip(document, camera, sheet.track[list(document.instants)])
-    return clip.clips(clip.trace(), [texture_image(texture) for texture in textures or (Texture.gingham,)])[0]
+    return clip.clips(clip.shading(), [texture_image(texture) for texture in textures or (Texture.gingham,)])[0]
 
 
 def test_a_repeat_has_the_same_bytes(renderer: ClothRenderer, sheet: Any) -> None:
@@ -74,7 +74,7 @@ clips.GATE = float(sys.argv[3])
 renderer = ClothRenderer(sheet["triangles"], sheet["rest"], Holders)
 import_bpy().context.scene.render.threads = 2
 clip = renderer.clip(look, load_rig("drag")[0], sheet["track"][[0, 3]])
-video, labels = clip.clips(clip.trace(), [texture_image(Texture.gingham)])
+video, labels = clip.clips(clip.shading(), [texture_image(Texture.gingham)])
 print(hashlib.sha256(video.tobytes()).hexdigest(), labels["composed"])
 """
 
@@ -103,7 +103,7 @@ def test_what_stands_still_has_the_same_bytes_in_every_frame(renderer: ClothRend
     """The levels of clips, which are not rounded, depend on their own frame alone."""
     look, picture = ClothDragRender.model_validate(LOOK), texture_image(Texture.floral)
     clip = renderer.clip(look, load_rig("drag")[0], np.repeat(sheet.track[:1], 2, axis=0))
-    (video,), _ = clip.clips(clip.trace(), [picture])
+    (video,), _ = clip.clips(clip.shading(), [picture])
     assert np.array_equal(video[0], video[1])
 
 
@@ -172,11 +172,11 @@ def test_the_lamp_follows_the_cloth(renderer: ClothRenderer, sheet: Any) -> None
 def test_noise_is_still_in_a_clip_and_differs_between_clips(renderer: ClothRenderer, sheet: Any) -> None:
     still = ClothDragRender.model_validate(LOOK)
     clip = renderer.clip(still, load_rig("drag")[0], np.repeat(sheet.track[:1], 2, axis=0))
-    (first, second), again = clip.trace().light, clip.trace().light
+    (first, second), again = clip.shading().light, clip.shading().light
     assert np.array_equal(first, second)
     assert np.array_equal(again[0], first)
     object.__setattr__(clip, "seed", still.light_seed + 1)
-    assert not np.array_equal(clip.trace().light[0], first)
+    assert not np.array_equal(clip.shading().light[0], first)
 
 
 def test_what_is_not_the_cloth_is_refused(renderer: ClothRenderer, sheet: Any) -> None:

@@ -42,7 +42,7 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, substrate: str) -> Non
     )
     renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
     clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(frame=4, window=16))
-    trace = clip.trace()
+    shading = clip.shading()
     renderer.close()
-    assert trace.gate_db > 36.0
-    assert trace.composed
+    assert shading.gate_db > 36.0
+    assert shading.composed

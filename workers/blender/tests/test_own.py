@@ -100,7 +100,7 @@ def _colored(frame: Clip) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]
 def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
     actor: RenderActor, store: DirectoryStore, record: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its upper edge is the held one. It shares its trace with textures that are built in."""
+    """Its upper edge is the held one. It shares its shading with textures that are built in."""
     image = f"sha256:{store.publish(_png(_flag()))}"
     alone = _output(actor, _task(record, texture="my-flag", image=image))
     frame = _frame(store, alone)
@@ -108,7 +108,7 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
     assert red.sum() > 300
     assert blue.sum() > 300
     assert np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean() - 10  # the cloth hangs from its upper edge
-    monkeypatch.setattr(ClothStage, "trace", None)  # from here on nothing can be traced
+    monkeypatch.setattr(ClothStage, "shading", None)  # from here on nothing can be traced
     both = _output(actor, _task(record, textures=["dots", image]))
     assert both.clips[image] == alone.chunks["video"]
     assert not np.array_equal(_frame(store, both, "dots"), frame)
@@ -194,7 +194,7 @@ def test_what_is_drawn_from_is_in_the_trace_and_pictures_are_not() -> None:
     finish = {"albedo": [0.1, 0.2], "roughness": [0.5, 0.6]}
     first = ClothDragRender.model_validate(plain)
     other = ClothDragRender.model_validate(plain | {"texture": "mine", "image": f"sha256:{'1' * 64}"})
-    assert first.trace == other.trace
+    assert first.shading == other.shading
     assert (first.variant, other.variant) == ("plaid", f"sha256:{'1' * 64}")
     for more in ({"lamp": lamp}, {"finish": finish}, {"camera": load_rig("drag")[1].model_dump(mode="json")}):
-        assert ClothDragRender.model_validate(plain | more).trace != first.trace
+        assert ClothDragRender.model_validate(plain | more).shading != first.shading

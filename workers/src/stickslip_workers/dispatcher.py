@@ -43,7 +43,7 @@ from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
 from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
 from stickslip_workers.stages.run import AnyTask, with_damaged_inputs
-from stickslip_workers.together import apart, together, trace_of
+from stickslip_workers.together import apart, shading_of, together
 
 log = logging.getLogger(__name__)
 
@@ -73,10 +73,10 @@ MOST_AHEAD = 16
 the coordinator about 10 ms whatever it asks for."""
 
 RENDERS_TOGETHER = 12
-"""Renders of one trace that one call makes at most; so many are leased ahead, for they cost little more than one."""
+"""Renders of one shading that one call makes at most; so many are leased ahead, for they cost little more than one."""
 
 SHORT_SECONDS = 0.5
-"""Renders that share no trace are given to a process several at once, if they take so long together [s]: a call costs
+"""Renders that share no shading are given to a process several at once, if they take so long together [s]: a call costs
 the dispatcher, Ray and the process some milliseconds."""
 
 LARGEST_BATCH = max(kind(name).batch for name in kind_names())
@@ -98,7 +98,7 @@ class Assignment:
     """Work that a process is at: one task, a batch of simulations, or renders."""
 
     parts: list[list[Lease]]
-    """Tasks that have one answer together: all simulations, or renders of one trace."""
+    """Tasks that have one answer together: all simulations, or renders of one shading."""
     stage: Stage
     process: Process
     started_at: float
@@ -168,7 +168,7 @@ class Dispatcher:
         self._alone: set[str] = set()
         """Tasks that were in a call that failed: they are not put together with others again."""
         self._renders_share = False
-        """Whether the last renders that were leased share traces."""
+        """Whether the last renders that were leased share shadings."""
         self._next_lease = 0.0
         self._was_clogged = False
         self._stopping = False
@@ -367,11 +367,13 @@ class Dispatcher:
         return parts
 
     def _may_share_a_call(self, lease: Lease) -> bool:
-        """Tell whether a task is a render that shares no trace, and has not been in a call that failed."""
-        return isinstance(lease.task, RenderTask) and trace_of(lease.task) is None and lease.task_id not in self._alone
+        """Tell whether a task is a render that shares no shading, and has not been in a call that failed."""
+        return (
+            isinstance(lease.task, RenderTask) and shading_of(lease.task) is None and lease.task_id not in self._alone
+        )
 
     def _renders_at_once(self) -> int:
-        """Return how many renders that share no trace are short enough to be one call."""
+        """Return how many renders that share no shading are short enough to be one call."""
         each = max(self._part_seconds.get(Stage.render, SHORT_SECONDS), 1e-3)
         return min(max(int(SHORT_SECONDS / each), 1), MOST_AHEAD)
 
@@ -381,8 +383,8 @@ class Dispatcher:
         if stage is Stage.simulate:
             return -(-len(queue) // LARGEST_BATCH)
         if stage is Stage.render:
-            traces = [trace_of(task) for task in _renders(queue)]
-            return -(-traces.count(None) // self._renders_at_once()) + len(set(traces) - {None})
+            shadings = [shading_of(task) for task in _renders(queue)]
+            return -(-shadings.count(None) // self._renders_at_once()) + len(set(shadings) - {None})
         return len(queue)
 
     def _assign(self, parts: list[list[Lease]], stage: Stage, process: Process) -> None:
@@ -504,7 +506,7 @@ class Dispatcher:
         for lease in batch.leases:
             self._queues[Stage(lease.task.stage)].append(lease)
             if isinstance(lease.task, RenderTask):
-                self._renders_share = trace_of(lease.task) is not None
+                self._renders_share = shading_of(lease.task) is not None
         return bool(batch.leases)
 
     def _wanted(self) -> dict[Stage, int]:
@@ -587,10 +589,10 @@ class Dispatcher:
 
 
 def _next_batch(queue: deque[Lease]) -> list[Lease]:
-    """Take what one process can do together from `queue`: simulations of a kind, renders of a trace, or one task."""
+    """Take what one process can do together from `queue`: simulations of a kind, renders of a shading, or one task."""
     batch = [queue.popleft()]
-    if isinstance(batch[0].task, RenderTask) and (trace := trace_of(batch[0].task)) is not None:
-        others = [lease for lease in queue if isinstance(lease.task, RenderTask) and trace_of(lease.task) == trace]
+    if isinstance(batch[0].task, RenderTask) and (shading := shading_of(batch[0].task)) is not None:
+        others = [lease for lease in queue if isinstance(lease.task, RenderTask) and shading_of(lease.task) == shading]
         batch += others[: RENDERS_TOGETHER - 1]
         for lease in batch[1:]:
             queue.remove(lease)

@@ -1,4 +1,4 @@
-"""Renders that share a trace are made in one call: tasks are put together, and the result is taken apart again."""
+"""Renders that share a shading are made in one call: tasks are put together, and the result is taken apart again."""
 
 from collections.abc import Sequence
 
@@ -8,18 +8,18 @@ from stickslip_schemas.documents.tasks import RenderOutput, RenderTask, TaskResu
 from stickslip_workers.failures import failure
 
 
-def trace_of(task: RenderTask) -> str | None:
-    """Return a text that is the same for renders that share a trace; None where a render shares none."""
-    shared = task.render.trace
-    return None if shared is None else canonical_json({"trace": shared, "record": task.record.model_dump()})
+def shading_of(task: RenderTask) -> str | None:
+    """Return a text that is the same for renders that share a shading; None where a render shares none."""
+    shared = task.render.shading
+    return None if shared is None else canonical_json({"shading": shared, "record": task.record.model_dump()})
 
 
 def together(tasks: Sequence[RenderTask]) -> RenderTask:
-    """Return one task for several renders of one trace; a single task stays as it is."""
+    """Return one task for several renders of one shading; a single task stays as it is."""
     if len(tasks) == 1:
         return tasks[0]
-    if len({trace_of(task) for task in tasks}) != 1 or trace_of(tasks[0]) is None:
-        raise ValueError("tasks must be renders of one trace to be made together")
+    if len({shading_of(task) for task in tasks}) != 1 or shading_of(tasks[0]) is None:
+        raise ValueError("tasks must be renders of one shading to be made together")
     textures = tuple(dict.fromkeys(task.render.variant for task in tasks))
     return tasks[0].model_copy(update={"textures": textures, "preview": any(task.preview for task in tasks)})
 

@@ -53,7 +53,7 @@ class SimulateOutput(Document):
 
 
 class RenderTask(Document):
-    """Make the pictures of one sample, or of all samples that share a trace; `preview` asks for small ones, too."""
+    """Make the pictures of one sample, or of all samples that share a shading; `preview` asks for small ones, too."""
 
     stage: Literal["render"] = "render"
     render: AnyRender

@@ -60,8 +60,9 @@ class Lease(Document):
     limit_seconds: Float | None = Field(
         default=None, gt=0, description="end the call after this time; null: nothing like it has been measured [s]"
     )
-    trace: str | None = Field(
-        default=None, description="W3C traceparent of the span that the job was submitted in; null: nobody traces"
+    traceparent: str | None = Field(
+        default=None,
+        description="W3C traceparent of the job's submission; null where no spans are exported",
     )
     task: Task
 

@@ -64,7 +64,7 @@ class Render(Document):
     quality: Quality
 
     @property
-    def trace(self) -> dict[str, Any] | None:
+    def shading(self) -> dict[str, Any] | None:
         """What renders have in common that can be made together, as JSON; None where none can."""
         return None
 

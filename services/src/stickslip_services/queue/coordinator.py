@@ -63,7 +63,7 @@ from stickslip_services.queue.jobs import (
     resume_job,
     runnable_jobs,
     show_job,
-    trace_of,
+    traceparent_of,
     unplanned_jobs,
 )
 from stickslip_services.queue.leasing import (
@@ -178,7 +178,7 @@ class Coordinator:
             return answer
 
     def _submit(
-        self, spec: JobSpec, idempotency_key: str | None, priority: int, trace: str | None
+        self, spec: JobSpec, idempotency_key: str | None, priority: int, traceparent: str | None
     ) -> JobDetail | Replay:
         print_ = fingerprint(spec)
         plan: Plan | None = None
@@ -200,7 +200,7 @@ class Coordinator:
                 check_quota(connection, this_project(), spec.sample_count)
                 now = self.clock()
                 with ledger(connection, now) as book:
-                    job = insert_job(book, spec, priority=priority, project=this_project(), trace=trace)
+                    job = insert_job(book, spec, priority=priority, project=this_project(), traceparent=traceparent)
                     self._enqueue(book, job, terms, plan if at_once else None)
                 shown = self.show(connection, job)
                 note(
@@ -377,8 +377,8 @@ class Coordinator:
     def _trace_commit(self, task_id: str, seconds: float) -> None:
         if tracing.is_on():
             with self.database.read() as connection:
-                trace = trace_of(connection, task_id)
-            tracing.record("commit", parent=trace, seconds=seconds, task=task_id)
+                traceparent = traceparent_of(connection, task_id)
+            tracing.record("commit", parent=traceparent, seconds=seconds, task=task_id)
 
     def _delete_lists(self, task_id: str) -> None:
         with suppress(OSError):

@@ -187,9 +187,9 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     return row
 
 
-def trace_of(connection: Connection, task: str) -> str | None:
+def traceparent_of(connection: Connection, task: str) -> str | None:
     """Return the traceparent of the job that a task is charged to; None where it has none."""
-    query = select(jobs.c.trace).join(tasks, tasks.c.job == jobs.c.seq).where(tasks.c.key == task_key(task))
+    query = select(jobs.c.traceparent).join(tasks, tasks.c.job == jobs.c.seq).where(tasks.c.key == task_key(task))
     return connection.scalar(query)
 
 

@@ -183,14 +183,14 @@ def grant_leases(
 def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
     """Return what the worker is told of the tasks that it has been granted; see `compose_tasks`."""
     composed = compose_tasks(connection, [grant.task for grant in grants], publish)
-    traces = _traces_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
+    traceparents = _traceparents_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
     return tuple(
         Lease(
             task_id=grant.task_id,
             token=grant.token,
             attempt=grant.attempt,
             limit_seconds=grant.limit_seconds,
-            trace=traces.get(grant.job),
+            traceparent=traceparents.get(grant.job),
             task=composed[grant.task.seq],
         )
         for grant in grants
@@ -364,7 +364,7 @@ def _is_started(lease: LeaseState, task: HeldTask) -> bool:
     return lease.started or task.state is TaskState.running
 
 
-def _traces_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
+def _traceparents_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
     """Return the traceparents of the jobs that have one, by `seq`."""
-    rows = connection.execute(select(jobs.c.seq, jobs.c.trace).where(jobs.c.seq.in_(job_seqs)))
-    return {seq: trace for seq, trace in rows if trace is not None}
+    rows = connection.execute(select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_(job_seqs)))
+    return {seq: traceparent for seq, traceparent in rows if traceparent is not None}

@@ -73,7 +73,7 @@ class Planner:
             with collector_at_rest():
                 if not self._goes_on(row):
                     self._pieces = self._begin(row, packed)
-                with tracing.span("plan", parent=row.trace, job=row.id, first=row.planned):
+                with tracing.span("plan", parent=row.traceparent, job=row.id, first=row.planned):
                     piece = next(self._pieces)
                     self._write(row.seq, piece)
         except Exception as error:

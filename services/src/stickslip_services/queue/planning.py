@@ -74,7 +74,7 @@ def _piece(
     plan = Plan(spec, shards[0][1][0].slot)
     tasks_by_key = plan.tasks
     packs: dict[bytes, PlannedTask] = {}
-    renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by trace: those that can be made together
+    renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by shading: those that can be made together
     for shard, members in shards:
         last: dict[bytes, None] = {}  # an ordered set: a grid may have one sample in two slots
         for point in members:

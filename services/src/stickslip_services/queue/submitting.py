@@ -37,14 +37,16 @@ _ADD_GROUPS = Prepared(
 )
 
 
-def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "", trace: str | None = None) -> int:
+def insert_job(
+    book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "", traceparent: str | None = None
+) -> int:
     """Write a job down, without its tasks; return its `seq`."""
     result = book.connection.execute(
         insert(jobs).values(
             id=new_id("job"),
             name=spec.name,
             project=project,
-            trace=trace,
+            traceparent=traceparent,
             kind=spec.kind,
             spec=spec.model_dump_json(),
             sample_count=spec.sample_count,

@@ -1,6 +1,6 @@
 """Clips of cloth: from a render task to a result, for every scene of cloth.
 
-One trace serves all textures (`stickslip_blender.multiplexed`) where an image gate finds it good enough. The gate
+One shading serves all textures (`stickslip_blender.multiplexed`) where an image gate finds it good enough. The gate
 renders one frame directly, with one texture, and compares means of 4 x 4 pixels: they have little sampling noise left,
 and all that is wrong with the composition. Where it fails, every clip is rendered directly.
 """
@@ -44,14 +44,14 @@ GATE_TEXTURE = Texture.floral
 _GATE_SAMPLES = 16
 _BLOCK = 4
 
-_KEPT_TRACES = 4
-"""Traces that a process keeps: 9 MB each at 30 frames."""
+_KEPT_SHADINGS = 4
+"""Shadings that a process keeps: 9 MB each at 30 frames."""
 
 Clip = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Trace:
+class Shading:
     """The light of one clip, for all textures."""
 
     light: npt.NDArray[np.float16]
@@ -116,11 +116,11 @@ class ClipRenderer:
     seed: int
     labels: dict[str, Any]
 
-    def trace(self) -> Trace:
+    def shading(self) -> Shading:
         """Trace all frames once, and try on the middle one what composing makes of it."""
-        light = np.stack([self.stage.trace(shot, self.sampling, self.seed) for shot in self.shots])
+        light = np.stack([self.stage.shading(shot, self.sampling, self.seed) for shot in self.shots])
         middle = len(self.shots) // 2
-        return Trace(light, self._gate(self.shots[middle], light[middle]))
+        return Shading(light, self._gate(self.shots[middle], light[middle]))
 
     def _gate(self, shot: Shot, light: npt.NDArray[np.float16]) -> float:
         picture = grained(texture_image(GATE_TEXTURE), self.fabric)
@@ -134,7 +134,7 @@ class ClipRenderer:
         self._compose(light, shot, Textures([picture]), composed)
         return block_decibels(composed[0][window.slices], direct)
 
-    def clips(self, trace: Trace, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
+    def clips(self, shading: Shading, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
         """Return the clips of textures, and labels that they share.
 
         Textures: pictures as `texture_image` returns them; clips: shape (textures, frames, height, width, 3).
@@ -144,15 +144,15 @@ class ClipRenderer:
         camera = self.camera
         videos = np.empty((len(pictures), len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
         sights = []
-        for number, (shot, light) in enumerate(zip(self.shots, trace.light, strict=True)):
+        for number, (shot, light) in enumerate(zip(self.shots, shading.light, strict=True)):
             sights.append(self._compose(light, shot, packed, videos[:, number]))
-            if not trace.composed:
+            if not shading.composed:
                 videos[:, number] = list(self._direct(shot, pictures))
         labels = self.labels | {
             "frame_share": float(np.mean([sight.frame_share for sight in sights])),
             "visible_share": float(np.mean([sight.visible_share for sight in sights])),
-            "gate_db": trace.gate_db,
-            "composed": trace.composed,
+            "gate_db": shading.gate_db,
+            "composed": shading.composed,
         }
         return videos, labels
 
@@ -206,10 +206,10 @@ def render_clips(
         lambda: ClothRenderer(triangles, rest, make, workshop.scratch),
     )
     clip = renderer.clip(look, camera, track[list(look.instants)])
-    trace = _trace(clip, look, task, workshop)
+    shading = _shading(clip, look, task, workshop)
     known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}
     wanted = task.textures or (look.variant,)
-    videos, labels = clip.clips(trace, [_picture(name, workshop) for name in wanted])
+    videos, labels = clip.clips(shading, [_picture(name, workshop) for name in wanted])
     if not task.textures:
         preview = workshop.store.publish(moving(videos[0])) if task.preview else None
         chunks = {"video": workshop.clip(videos[0]), **known}
@@ -231,31 +231,31 @@ def _picture(texture: str, workshop: Workshop) -> Clip:
     return texture_image(Texture(texture)) if digest is None else own_texture(workshop.store.read(digest))
 
 
-def _trace(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Trace:
-    """Return the trace of a clip: one that was made before, if it is still kept, or a new one."""
-    light = {name: value for name, value in look.trace.items() if name != "ground_truth"}
+def _shading(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Shading:
+    """Return the shading of a clip: one that was made before, if it is still kept, or a new one."""
+    light = {name: value for name, value in look.shading.items() if name != "ground_truth"}
     shared = {"record": task.record.model_dump(), "look": light, "build": build_digest(look.kind)}
-    key = content_key("trace", shared)
-    kept = workshop.traces
+    key = content_key("shading", shared)
+    kept = workshop.shadings
     if key not in kept:
-        stored = workshop.kept_trace(key)
+        stored = workshop.kept_shading(key)
         if stored is None:
-            kept[key] = clip.trace()
-            workshop.keep_trace(key, _packed(kept[key]))
+            kept[key] = clip.shading()
+            workshop.keep_shading(key, _packed(kept[key]))
         else:
             kept[key] = _unpacked(stored, (len(clip.shots), clip.camera.height, clip.camera.width, 3))
-        while len(kept) > _KEPT_TRACES:
+        while len(kept) > _KEPT_SHADINGS:
             kept.popitem(last=False)
     kept.move_to_end(key)
     return kept[key]
 
 
-def _packed(trace: Trace) -> bytes:
-    """Return a trace as bytes: the gate's verdict, and the light."""
-    return np.float64(trace.gate_db).tobytes() + encode_chunk(trace.light)
+def _packed(shading: Shading) -> bytes:
+    """Return a shading as bytes: the gate's verdict, and the light."""
+    return np.float64(shading.gate_db).tobytes() + encode_chunk(shading.light)
 
 
-def _unpacked(data: bytes, shape: tuple[int, ...]) -> Trace:
+def _unpacked(data: bytes, shape: tuple[int, ...]) -> Shading:
     light = np.empty(shape, dtype=np.float16)
     decode_chunk(data[8:], light)
-    return Trace(light, float(np.frombuffer(data[:8])[0]))
+    return Shading(light, float(np.frombuffer(data[:8])[0]))

@@ -1,4 +1,4 @@
-"""One trace for many textures.
+"""One shading for many textures.
 
 The cloth is traced once with the base colour ALBEDOS. Lamp and floor are grey, so red, green and blue are three samples
 of the light that a pixel sends to the camera, as a function of the cloth's albedo a:
@@ -30,7 +30,7 @@ from stickslip_blender.raster import Seen, Textures, Window, _raster, projected,
 from stickslip_blender.substrates import Substrate
 
 ALBEDOS = (0.0, 0.5, 0.9)
-"""The cloth's base colour in a trace."""
+"""The cloth's base colour in a shading."""
 
 TOLERANCE: int = _raster.TOLERANCE
 """How far the pixels of a clip may be from their exact values [8-bit levels]; raster/composition.hpp chooses them."""
@@ -83,14 +83,14 @@ class Sight:
 
 
 class Composer:
-    """Makes pictures of textures from traces of one cloth."""
+    """Makes pictures of textures from shadings of one cloth."""
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
 
     def compose(
         self,
-        trace: npt.NDArray[np.float16],
+        shading: npt.NDArray[np.float16],
         points: npt.NDArray[np.float64],
         camera: Camera,
         substrate: Substrate,
@@ -98,7 +98,7 @@ class Composer:
         textures: Textures,
         pictures: npt.NDArray[np.uint8],
     ) -> Sight:
-        """Compose one frame's trace (height, width, 3) with all textures, into `pictures`.
+        """Compose one frame's shading (height, width, 3) with all textures, into `pictures`.
 
         Points: all vertices of the stage at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
         8-bit sRGB, chosen as in `settled`, shape (textures, height, width, 3).
@@ -110,7 +110,7 @@ class Composer:
         if substrate.mirrors:
             reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
         _raster.compose(
-            np.ascontiguousarray(trace).view(np.uint16),
+            np.ascontiguousarray(shading).view(np.uint16),
             ALBEDOS[1:],
             sight.overall.ravel(),
             sight.coverage,

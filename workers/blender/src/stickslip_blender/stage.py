@@ -91,7 +91,7 @@ class ClothStage:
         self._lamp.data.energy = _LAMP_POWER * light.power
         self._floor.set(substrate)
 
-    def trace(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
+    def shading(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
         """Trace one instant for all textures: linear light at ALBEDOS, shape (height, width, 3).
 
         Seed: of the noise; the same in all frames of a clip, so that what is left of it does not flicker.

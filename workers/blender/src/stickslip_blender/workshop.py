@@ -22,13 +22,13 @@ from stickslip_schemas.store import open_store, write_durably
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
     from stickslip_schemas.spec.jobs import Render
 
-    from stickslip_blender.clips import Trace
+    from stickslip_blender.clips import Shading
 
 FRAME_MARGIN = 1.0
 """How far inside the frame a rod or a cloth has to stay [px]."""
 
-TRACE_BYTES = 4 * 2**30
-"""Room that the traces kept in a store may take: about 500 clips of 30 frames."""
+SHADING_BYTES = 4 * 2**30
+"""Room that the shadings kept in a store may take: about 500 clips of 30 frames."""
 _DIGEST_BYTES = 32
 
 Array = npt.NDArray[Any]
@@ -53,8 +53,8 @@ class Workshop:
 
     def __init__(self, store: str, scratch: str | None = None) -> None:
         self.store = open_store(store)
-        self.traces: OrderedDict[str, Trace] = OrderedDict()
-        """The last traces of cloth, by what they depend on: clips that differ in their texture share one."""
+        self.shadings: OrderedDict[str, Shading] = OrderedDict()
+        """The last shadings of cloth, by what they depend on: clips that differ in their texture share one."""
         self.scratch = scratch
         """Folder for frames on their way out of Blender; None: memory."""
         self._renderer: tuple[object, Renderer] | None = None
@@ -66,9 +66,9 @@ class Workshop:
             self._renderer[1].close()
             self._renderer = None
 
-    def kept_trace(self, key: str) -> bytes | None:
-        """Return a trace that any process kept in the store; None where there is none, or a damaged one."""
-        path = self._trace_path(key)
+    def kept_shading(self, key: str) -> bytes | None:
+        """Return a shading that any process kept in the store; None where there is none, or a damaged one."""
+        path = self._shading_path(key)
         if path is None:
             return None
         try:
@@ -79,26 +79,26 @@ class Workshop:
         digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
         return body if hashlib.sha256(body).digest() == digest else None
 
-    def keep_trace(self, key: str, data: bytes) -> None:
-        """Keep a trace in the store for textures to come; the oldest are deleted where all take too much room.
+    def keep_shading(self, key: str, data: bytes) -> None:
+        """Keep a shading in the store for textures to come; the oldest are deleted where all take too much room.
 
         No result depends on it: where it cannot be written, only time is lost.
         """
-        path = self._trace_path(key)
+        path = self._shading_path(key)
         if path is None:
             return
         with suppress(OSError):
             write_durably(path, hashlib.sha256(data).digest() + data)
             files = sorted(path.parent.glob("[0-9a-f]*"), key=lambda file: file.stat().st_mtime)
-            room = TRACE_BYTES - sum(file.stat().st_size for file in files)
+            room = SHADING_BYTES - sum(file.stat().st_size for file in files)
             for file in files[:-1]:
                 if room >= 0:
                     break
                 room += file.stat().st_size
                 file.unlink(missing_ok=True)
 
-    def _trace_path(self, key: str) -> Path | None:
-        return None if self.store.cache is None else self.store.cache / "traces" / key
+    def _shading_path(self, key: str) -> Path | None:
+        return None if self.store.cache is None else self.store.cache / "shadings" / key
 
     def record(self, record: RecordRef, *names: str) -> list[Array]:
         """Return one row of arrays of an artifact."""

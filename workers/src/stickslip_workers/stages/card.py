@@ -113,7 +113,7 @@ def _pictures(manifest: Manifest) -> list[str]:
         text += f" They were rendered on a GPU ({pictures.device})."
     if pictures.gate_db is not None:
         text += (
-            f" One trace serves all textures; the image gate found {pictures.gate_db:.1f} dB or more. "
+            f" One shading serves all textures; the image gate found {pictures.gate_db:.1f} dB or more. "
             f"Samples that it had rendered directly instead: {len(pictures.direct_slots)}."
         )
     if pictures.frame_share is not None:

@@ -156,7 +156,7 @@ class ClothSimulation(Simulation):
 class ClothRender(Render):
     """How a cloth is seen: all that its clip depends on besides its trajectory and the build.
 
-    Everything but the texture decides on the trace; clips that differ only in their texture share it.
+    Everything but the texture decides on the shading; clips that differ only in their texture share it.
     """
 
     material: str
@@ -175,13 +175,13 @@ class ClothRender(Render):
     crease_seed: Seed
 
     @property
-    def trace(self) -> dict[str, Any]:
-        """What the trace depends on, as JSON: all but the texture."""
+    def shading(self) -> dict[str, Any]:
+        """What the shading depends on, as JSON: all but the texture."""
         return self.model_dump(mode="json", exclude={"texture", "image"})
 
     @property
     def variant(self) -> str:
-        """The texture, which no trace depends on: a name that is built in, or a reference to a picture."""
+        """The texture, which no shading depends on: a name that is built in, or a reference to a picture."""
         return self.image or self.texture
 
 
@@ -256,7 +256,7 @@ class ClothSpec(JobSpec):
         description="arrays of what is known of every pixel: depth, segmentation, normals, uv, flow",
         json_schema_extra={
             "uniqueItems": True,
-            "x-cost": "all five: 3 % more CPU time of a trace, 3.8 MB a sample of 30 frames",
+            "x-cost": "all five: 3 % more CPU time of a shading, 3.8 MB a sample of 30 frames",
         },
     )
     creases: Float = Field(

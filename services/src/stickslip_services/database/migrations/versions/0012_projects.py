@@ -20,13 +20,13 @@ def upgrade() -> None:
     )
     op.add_column("api_keys", sa.Column("project", sa.String(), nullable=False, server_default=""))
     op.add_column("jobs", sa.Column("project", sa.String(), nullable=False, server_default=""))
-    op.add_column("jobs", sa.Column("trace", sa.String()))
+    op.add_column("jobs", sa.Column("traceparent", sa.String()))
 
 
 def downgrade() -> None:
     """Undo."""
     with op.batch_alter_table("jobs", schema=None) as batch_op:
-        batch_op.drop_column("trace")
+        batch_op.drop_column("traceparent")
         batch_op.drop_column("project")
     with op.batch_alter_table("api_keys", schema=None) as batch_op:
         batch_op.drop_column("project")
