@@ -44,7 +44,7 @@ def reference() -> str:
         [
             HEAD,
             *(part for kind in KINDS.values() for part in _kind(kind)),
-            *(part for own in OWN for part in _own(*own)),
+            *(part for entry in CUSTOM for part in _custom(*entry)),
         ]
     )
 
@@ -74,7 +74,7 @@ def _kind(kind: Any) -> Iterator[str]:
     yield ""
 
 
-OWN: tuple[tuple[str, str, type[Document]], ...] = (
+CUSTOM: tuple[tuple[str, str, type[Document]], ...] = (
     ("materials", "fabric", FabricNumbers),
     ("viewpoints", "camera", Calibration),
     ("lamps", "lamp", LampNumbers),
@@ -83,10 +83,10 @@ OWN: tuple[tuple[str, str, type[Document]], ...] = (
 """What a spec may define: its key, what one entry is, and the model of an entry."""
 
 
-def _own(key: str, what: str, model: type[Document]) -> Iterator[str]:
+def _custom(key: str, what: str, model: type[Document]) -> Iterator[str]:
     schema = model.model_json_schema()
     meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
-    yield f"## A {what} of your own\n"
+    yield f"## Custom {what}s\n"
     yield f"An entry of `{key}` names a {what} and gives its numbers. {meaning}\n"
     yield "| key | values | default | meaning | cost |"
     yield "|---|---|---|---|---|"
@@ -95,7 +95,7 @@ def _own(key: str, what: str, model: type[Document]) -> Iterator[str]:
     yield ""
 
 
-_MAPPINGS = ("textures", *(key for key, _, _ in OWN))
+_MAPPINGS = ("textures", *(key for key, _, _ in CUSTOM))
 
 
 def _field_row(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:

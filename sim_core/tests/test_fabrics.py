@@ -8,11 +8,11 @@ import pytest
 from stickslip_sim_core import (
     PRESETS,
     Cloth,
+    custom_fabric,
     drop_and_drag,
     fabric,
     fabric_names,
     isotropic,
-    own_fabric,
     preset_named,
 )
 from stickslip_sim_core.cloth import meshes
@@ -90,18 +90,18 @@ class TestOwnFabric:
     TABLE = np.tile([100.0, 10.0, 80.0, 20.0], (6, 1))
 
     def test_table(self) -> None:
-        own = own_fabric("own", 0.2, stretching=self.TABLE, bending=(2e-5, 1e-5, 5e-6), damping=0.1)
+        own = custom_fabric("own", 0.2, stretching=self.TABLE, bending=(2e-5, 1e-5, 5e-6), damping=0.1)
         assert (own.stretching == self.TABLE).all()
         assert (own.rigidity == np.diag([2e-5, 1e-5, 5e-6])).all()
         assert own.damping == 0.1
-        assert (own_fabric("own", 0.2, stretching=self.TABLE, bending=own.rigidity).rigidity == own.rigidity).all()
+        assert (custom_fabric("own", 0.2, stretching=self.TABLE, bending=own.rigidity).rigidity == own.rigidity).all()
 
     def test_young(self) -> None:
         """A plate of E, nu, h: Y = E h and D = E h^3 / (12 (1 - nu^2))."""
-        own = own_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4)
+        own = custom_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4)
         assert own.stretching[0, 0] == pytest.approx(1e6 * 4e-4 / (1.0 - 0.09))
         assert own.rigidity[0, 0] == pytest.approx(1e6 * 4e-4**3 / 12.0 / (1.0 - 0.09))
-        softer = own_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4, bending=(1e-6, 1e-6, 4e-7))
+        softer = custom_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4, bending=(1e-6, 1e-6, 4e-7))
         assert softer.rigidity[0, 0] == 1e-6
 
     def test_scaled(self) -> None:
@@ -152,7 +152,7 @@ class TestOwnFabric:
     def test_refusals(self, numbers: dict[str, object], message: str) -> None:
         good = {"name": "own", "density": 0.2, "stretching": self.TABLE, "bending": (1e-5, 1e-5, 1e-5)}
         with pytest.raises(ValueError, match=message):
-            own_fabric(**{**good, **numbers})  # type: ignore[arg-type]
+            custom_fabric(**{**good, **numbers})  # type: ignore[arg-type]
 
     def test_factors(self) -> None:
         with pytest.raises(ValueError, match="bending: must be a finite factor > 0, got 0"):

@@ -41,7 +41,7 @@ def test_exported_names() -> None:
         "isotropic",
         "natural_curvature",
         "other_minima",
-        "own_fabric",
+        "custom_fabric",
         "plane",
         "preset_named",
         "reach",

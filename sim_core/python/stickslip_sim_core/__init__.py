@@ -1,7 +1,7 @@
 """The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python face."""
 
 from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
-from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
+from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, Surface, box, cylinder, plane, sphere
 from stickslip_sim_core.motions import Keyframes, MovingMesh, read_moving_mesh
@@ -52,7 +52,7 @@ __all__ = [
     "isotropic",
     "natural_curvature",
     "other_minima",
-    "own_fabric",
+    "custom_fabric",
     "plane",
     "preset_named",
     "reach",

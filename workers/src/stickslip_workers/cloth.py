@@ -68,9 +68,9 @@ def fabric_of(simulation: "ClothSimulation") -> "Fabric":
 
 def named_fabric(name: str, numbers: "FabricNumbers | None") -> "Fabric":
     """Return the measured fabric of a name, or the user's own if there are numbers."""
-    from stickslip_sim_core.cloth import fabric, own_fabric
+    from stickslip_sim_core.cloth import custom_fabric, fabric
 
-    return fabric(name) if numbers is None else own_fabric(name, **numbers.model_dump())
+    return fabric(name) if numbers is None else custom_fabric(name, **numbers.model_dump())
 
 
 class DraggedRun(ClothRun, Protocol):

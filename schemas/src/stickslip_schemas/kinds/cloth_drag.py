@@ -9,16 +9,16 @@ from stickslip_schemas.base.document import Float
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, Viewpoint, ViewpointName
 from stickslip_schemas.kinds.cloth.spec import (
-    OWN_LOOKS,
+    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     SELF_FRICTION,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
+    Custom,
     Lighting,
     LightingAxis,
-    Own,
     Substrate,
     SubstrateAxis,
     TextureAxis,
@@ -26,7 +26,7 @@ from stickslip_schemas.kinds.cloth.spec import (
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis
-from stickslip_schemas.spec.fabrics import OwnName
+from stickslip_schemas.spec.fabrics import CustomName
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 
@@ -34,16 +34,16 @@ class ClothDragAxes(ClothAxes):
     """What a clip of dragged cloth depends on."""
 
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or one of your own under `viewpoints`"
+        description="camera of the rig, or a custom one under `viewpoints`"
     )
     lighting: LightingAxis | None = Field(
-        default=None, description="which lamps to draw from, or one of your own under `lamps`; by default `drawn`"
+        default=None, description="which lamps to draw from, or a custom one under `lamps`; by default `drawn`"
     )
     substrate: SubstrateAxis | None = Field(
-        default=None, description="finishes of the floor, or one of your own under `substrates`; by default `matt`"
+        default=None, description="finishes of the floor, or a custom one under `substrates`; by default `matt`"
     )
 
 
@@ -75,10 +75,10 @@ class ClothDragSpec(ClothSpec):
     instants = 300
     instants_per_second = 2.4
     rig = "drag"
-    own = OWN_LOOKS | {
-        "viewpoint": Own("viewpoints", "camera", tuple(Viewpoint)),
-        "lighting": Own("lamps", "lamp", tuple(Lighting)),
-        "substrate": Own("substrates", "finish", tuple(Substrate)),
+    custom = CUSTOM_LOOKS | {
+        "viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint)),
+        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
+        "substrate": Custom("substrates", "finish", tuple(Substrate)),
     }
 
     kind: Literal["cloth_drag"]
@@ -93,16 +93,16 @@ class ClothDragSpec(ClothSpec):
             "each other, and up to 1.7 times where it folds over itself, as camel-ponte-roma does"
         },
     )
-    lamps: dict[OwnName, LampNumbers] = Field(
+    lamps: dict[CustomName, LampNumbers] = Field(
         default_factory=dict,
         max_length=64,
-        description="lamps of your own, by the names that the axis `lighting` uses",
+        description="custom lamps, by the names that the axis `lighting` uses",
         json_schema_extra={"additionalProperties": False},
     )
-    substrates: dict[OwnName, FloorNumbers] = Field(
+    substrates: dict[CustomName, FloorNumbers] = Field(
         default_factory=dict,
         max_length=64,
-        description="floors of your own, by the names that the axis `substrate` uses",
+        description="custom floors, by the names that the axis `substrate` uses",
         json_schema_extra={"additionalProperties": False},
     )
 

@@ -7,17 +7,17 @@ from pydantic import Field
 from stickslip_schemas.base.document import Float
 from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, Viewpoint, ViewpointName
 from stickslip_schemas.kinds.cloth.spec import (
-    OWN_LOOKS,
+    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     SELF_FRICTION,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
+    Custom,
     Lighting,
     LightingAxis,
     MaterialAxis,
-    Own,
     Substrate,
     TextureAxis,
     codes,
@@ -25,7 +25,7 @@ from stickslip_schemas.kinds.cloth.spec import (
 from stickslip_schemas.spec.appearance import LampNumbers
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis
-from stickslip_schemas.spec.fabrics import FabricNumbers, Material, OwnName
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 
@@ -33,16 +33,16 @@ class ClothOnClothAxes(ClothAxes):
     """What a clip of cloth that is dragged over cloth depends on; `mu` is the friction between the two."""
 
     substrate_material: MaterialAxis = Field(
-        description="fabric of the stretched cloth, a measured one, or one of your own under `materials`"
+        description="fabric of the stretched cloth, a measured one, or a custom one under `materials`"
     )
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or one of your own under `viewpoints`"
+        description="camera of the rig, or a custom one under `viewpoints`"
     )
     lighting: LightingAxis | None = Field(
-        default=None, description="which lamps to draw from, or one of your own under `lamps`; by default `drawn`"
+        default=None, description="which lamps to draw from, or a custom one under `lamps`; by default `drawn`"
     )
 
 
@@ -55,7 +55,7 @@ class ClothOnClothSimulation(ClothSimulation):
     kind: Literal["cloth_on_cloth"] = "cloth_on_cloth"
     substrate_material: str
     substrate_fabric: FabricNumbers | None = Field(
-        description="the numbers of a stretched cloth of the user's own; null: a measured one"
+        description="numbers of a custom stretched cloth; null: a measured one"
     )
     self_friction: float
 
@@ -79,10 +79,10 @@ class ClothOnClothSpec(ClothSpec):
     instants = 300
     instants_per_second = 2.4
     rig = "drag"
-    own = OWN_LOOKS | {
-        "substrate_material": Own("materials", "substrate_fabric", tuple(Material)),
-        "viewpoint": Own("viewpoints", "camera", tuple(Viewpoint)),
-        "lighting": Own("lamps", "lamp", tuple(Lighting)),
+    custom = CUSTOM_LOOKS | {
+        "substrate_material": Custom("materials", "substrate_fabric", tuple(Material)),
+        "viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint)),
+        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
     }
 
     kind: Literal["cloth_on_cloth"]
@@ -90,10 +90,10 @@ class ClothOnClothSpec(ClothSpec):
     self_friction: Float = Field(
         default=SELF_FRICTION, ge=0, le=10, description="friction coefficient of each of the two with itself"
     )
-    lamps: dict[OwnName, LampNumbers] = Field(
+    lamps: dict[CustomName, LampNumbers] = Field(
         default_factory=dict,
         max_length=64,
-        description="lamps of your own, by the names that the axis `lighting` uses",
+        description="custom lamps, by the names that the axis `lighting` uses",
         json_schema_extra={"additionalProperties": False},
     )
 

@@ -6,18 +6,18 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from stickslip_schemas.kinds.cloth.spec import (
-    OWN_LOOKS,
+    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
-    Own,
+    Custom,
     TextureAxis,
 )
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
 from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.spec.fabrics import OwnName, name_schema
+from stickslip_schemas.spec.fabrics import CustomName, name_schema
 from stickslip_schemas.spec.jobs import SeedRule
 
 AngularSpeed = Annotated[
@@ -43,7 +43,7 @@ class SphereViewpoint(StrEnum):
     high = "high"
 
 
-ViewpointName = Annotated[OwnName, quantity("SphereViewpoint"), name_schema(SphereViewpoint)]
+ViewpointName = Annotated[CustomName, quantity("SphereViewpoint"), name_schema(SphereViewpoint)]
 
 
 class ClothSphereAxes(ClothAxes):
@@ -51,10 +51,10 @@ class ClothSphereAxes(ClothAxes):
 
     angular_speed: AngularSpeedAxis = Field(description="of the sphere about its vertical axis [rad/s]")
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or one of your own under `viewpoints`"
+        description="camera of the rig, or a custom one under `viewpoints`"
     )
 
 
@@ -85,7 +85,7 @@ class ClothSphereSpec(ClothSpec):
     instants = 150
     instants_per_second = 15.0
     rig = "sphere-3"
-    own = OWN_LOOKS | {"viewpoint": Own("viewpoints", "camera", tuple(SphereViewpoint))}
+    custom = CUSTOM_LOOKS | {"viewpoint": Custom("viewpoints", "camera", tuple(SphereViewpoint))}
 
     kind: Literal["cloth_sphere"]
     axes: ClothSphereAxes

@@ -7,19 +7,19 @@ from pydantic import Field
 
 from stickslip_schemas.base.document import Int
 from stickslip_schemas.kinds.cloth.spec import (
-    OWN_LOOKS,
+    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
+    Custom,
     MuAxis,
-    Own,
     TextureAxis,
 )
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
 from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.spec.fabrics import OwnName, name_schema
+from stickslip_schemas.spec.fabrics import CustomName, name_schema
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 BONES, SKIN_VERTICES, SKIN_TRIANGLES = 5, 1442, 2880
@@ -48,7 +48,7 @@ class ShawlViewpoint(StrEnum):
     high = "high"
 
 
-ViewpointName = Annotated[OwnName, quantity("ShawlViewpoint"), name_schema(ShawlViewpoint)]
+ViewpointName = Annotated[CustomName, quantity("ShawlViewpoint"), name_schema(ShawlViewpoint)]
 
 
 class ShawlAxes(ClothAxes):
@@ -58,10 +58,10 @@ class ShawlAxes(ClothAxes):
     self_friction: MuAxis = Field(description="friction coefficient of the shawl with itself")
     swing: SwingAxis | None = Field(default=None, description="size of the figure's motion; by default 1")
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or one of your own under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or one of your own under `viewpoints`"
+        description="camera of the rig, or a custom one under `viewpoints`"
     )
 
 
@@ -95,7 +95,7 @@ class ShawlSpec(ClothSpec):
     instants = 150
     instants_per_second = 15.0
     rig = "shawl-3"
-    own = OWN_LOOKS | {"viewpoint": Own("viewpoints", "camera", tuple(ShawlViewpoint))}
+    custom = CUSTOM_LOOKS | {"viewpoint": Custom("viewpoints", "camera", tuple(ShawlViewpoint))}
 
     kind: Literal["shawl"]
     axes: ShawlAxes

@@ -41,7 +41,7 @@ class _Ranges(Document):
 
 
 class LampNumbers(_Ranges):
-    """A lamp of your own.
+    """A custom lamp.
 
     Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation.
     """
@@ -56,7 +56,7 @@ class LampNumbers(_Ranges):
 
 
 class FloorNumbers(_Ranges):
-    """A floor of your own.
+    """A custom floor.
 
     Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation. The image gate says how
     well a floor can be composed, and clips are rendered directly where it cannot.
@@ -76,7 +76,7 @@ class FloorNumbers(_Ranges):
 
 
 class Calibration(Document):
-    """A camera of your own, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
+    """A custom camera, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
 
     The world's z axis points up from the floor, which is z = 0. A dragged cloth stays within x = -0.1 to 0.4, y = -0.1
     to 0.1 and z = 0 to 0.25 m. A clip shows the largest square in the middle of the image, scaled to 224 x 224 pixels.

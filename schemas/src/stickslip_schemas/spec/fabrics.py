@@ -43,7 +43,7 @@ PLATE_BOUNDS = (1e-11, 1.0)
 
 
 class FabricNumbers(Document):
-    """The constitutive numbers of a fabric of your own.
+    """The constitutive numbers of a custom fabric.
 
     Give the resistance to stretching either as `stretching`, a table, or as `young`, `poisson` and `thickness`. Give
     the resistance to bending as `bending`. With `young` you may leave it out: it is then that of a plate of this
@@ -97,11 +97,11 @@ class FabricNumbers(Document):
         return self
 
 
-OwnName = Annotated[str, Field(pattern=MATERIAL_NAME)]
+CustomName = Annotated[str, Field(pattern=MATERIAL_NAME)]
 
 
 def name_schema(built_in: Iterable[str]) -> WithJsonSchema:
-    """Say in the JSON schema which names are built in, and what one of the user's own looks like."""
+    """Return the JSON schema of a name: a built-in one, or the pattern of custom ones."""
     return WithJsonSchema({"anyOf": [{"enum": list(map(str, built_in))}, {"type": "string", "pattern": MATERIAL_NAME}]})
 
 

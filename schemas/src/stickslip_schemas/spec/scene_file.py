@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from stickslip_schemas.base.document import Document, Float, Int
 from stickslip_schemas.kinds.cloth.spec import PresetName
-from stickslip_schemas.spec.fabrics import FabricNumbers, Material, OwnName
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material
 
 MAX_FRAMES = 10_000
 """Of a scene."""
@@ -94,7 +94,7 @@ class Held(Document):
 class Sheet(Document):
     """A piece of cloth, flat at the start."""
 
-    material: OwnName = Field(description="a measured fabric, or one of your own under `materials`")
+    material: CustomName = Field(description="a measured fabric, or a custom one under `materials`")
     mesh: Annotated[Grid | Unstructured, Field(discriminator="type")]
     origin: Vector = Field(description="where its middle starts [m]")
     turn: Turn = Field(
@@ -102,7 +102,7 @@ class Sheet(Document):
         description="how it lies, as a rotation vector [rad]; without it the warp is along x and the weft along y",
     )
     thickness: Float = Field(default=5e-4, ge=1e-5, le=0.05, description="[m]")
-    holders: dict[OwnName, Held] = Field(default_factory=dict)
+    holders: dict[CustomName, Held] = Field(default_factory=dict)
 
 
 class Plane(Document):
@@ -162,7 +162,7 @@ Body = Annotated[Plane | Sphere | Cylinder | Box | MeshBody, Field(discriminator
 class Pair(Document):
     """The friction of two things: two sheets, a sheet and a body, or a sheet with itself."""
 
-    between: tuple[OwnName, OwnName]
+    between: tuple[CustomName, CustomName]
     mu: Friction = Field(description="coefficient of friction")
 
 
@@ -174,9 +174,9 @@ class SceneFile(Document):
     frame_rate: Float = Field(default=30.0, gt=0, le=10_000, description="frames that are kept, a second")
     gravity: Vector = Field(default=(0.0, 0.0, -9.81), description="[m/s^2]")
     preset: PresetName = Field(default=PresetName.certified, description="named settings of the solver")
-    materials: dict[OwnName, FabricNumbers] = Field(default_factory=dict, max_length=64)
-    sheets: dict[OwnName, Sheet] = Field(min_length=1, max_length=64)
-    bodies: dict[OwnName, Body] = Field(default_factory=dict, max_length=64)
+    materials: dict[CustomName, FabricNumbers] = Field(default_factory=dict, max_length=64)
+    sheets: dict[CustomName, Sheet] = Field(min_length=1, max_length=64)
+    bodies: dict[CustomName, Body] = Field(default_factory=dict, max_length=64)
     friction: tuple[Pair, ...] = Field(default=(), description="of each two that may touch")
     default_friction: Friction | None = Field(
         default=None, description="of pairs that `friction` does not name; null: it must name them all"

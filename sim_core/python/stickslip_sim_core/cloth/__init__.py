@@ -1,6 +1,6 @@
 """Pieces of cloth: what they are made of, their meshes, and the solver that steps them."""
 
-from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_names, isotropic, own_fabric
+from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, box, plane, sphere
 
@@ -16,7 +16,7 @@ __all__ = [
     "fabric",
     "fabric_names",
     "isotropic",
-    "own_fabric",
+    "custom_fabric",
     "plane",
     "preset_named",
     "sphere",

@@ -88,7 +88,7 @@ class Fabric:
         )
 
 
-def own_fabric(
+def custom_fabric(
     name: str,
     density: float,
     *,

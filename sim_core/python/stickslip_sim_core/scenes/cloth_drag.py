@@ -29,7 +29,7 @@ def drop_and_drag(
     other, both drawn from `seed`, until the drop ends, and set upright within the second after.
 
     Args:
-        fabric: One of `fabric_names()`, or one of your own.
+        fabric: One of `fabric_names()`, or a custom one.
         mu: Coefficient of friction between cloth and floor, 0 ... 10.
         preset: Solver settings, or their name.
         vertices: Vertices a side of the mesh, at least 5.

@@ -40,7 +40,7 @@ def drop_on_cloth(
     """Lower a square of cloth onto a stretched one and drag it to and fro: see `drop_and_drag`.
 
     Args:
-        fabric: Of the dragged cloth: one of `fabric_names()`, or one of your own.
+        fabric: Of the dragged cloth: one of `fabric_names()`, or a custom one.
         substrate: Of the stretched cloth, whose warp is along x; it lies on a floor.
         mu: Coefficient of friction between the two, 0 ... 10.
         self_friction: Of each with itself, 0 ... 10.

@@ -139,7 +139,7 @@ def rotating_sphere(
     The cloth falls from rest, flat and centred, and drapes over the sphere until its hem lies on the floor.
 
     Args:
-        fabric: One of `fabric_names()`, or one of your own.
+        fabric: One of `fabric_names()`, or a custom one.
         mu: Coefficient of friction between cloth and sphere, 0 ... 10.
         mu_floor: Between cloth and floor; None is `mu`.
         speed: Angular speed of the sphere about its vertical axis [rad/s], -20 ... 20.

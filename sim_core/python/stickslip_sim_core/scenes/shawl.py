@@ -131,7 +131,7 @@ def shawl_on_figure(
     """Lay a shawl over a figure's shoulders and let the figure move.
 
     Args:
-        fabric: One of `fabric_names()`, or one of your own.
+        fabric: One of `fabric_names()`, or a custom one.
         mu: Coefficient of friction of the cloth with figure and floor, 0 ... 10.
         self_friction: Of the cloth with itself, 0 ... 10.
         swing: Size of the figure's motion, 0 ... 2; see `character.bones`.

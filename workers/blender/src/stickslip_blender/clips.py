@@ -30,7 +30,7 @@ from stickslip_blender.preview import moving
 from stickslip_blender.raster import Textures
 from stickslip_blender.stage import ClothStage, Shot
 from stickslip_blender.substrates import drawn_substrate, floor_factor
-from stickslip_blender.textures import own_texture, texture_image
+from stickslip_blender.textures import custom_texture, texture_image
 from stickslip_blender.workshop import Workshop, why_unfit
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ def render_clips(
 def _picture(texture: str, workshop: Workshop) -> Clip:
     """Return the picture of a texture that is built in, or that a user has put into the store."""
     digest = referred(texture)
-    return texture_image(Texture(texture)) if digest is None else own_texture(workshop.store.read(digest))
+    return texture_image(Texture(texture)) if digest is None else custom_texture(workshop.store.read(digest))
 
 
 def _shading(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Shading:

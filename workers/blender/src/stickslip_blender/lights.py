@@ -39,10 +39,10 @@ class Light:
         return list(astuple(self))
 
 
-def drawn_light(name: str, seed: int, own: LampNumbers | None = None) -> Light:
-    """Draw a lamp from a named range, or from one of the user's own."""
-    if own is not None:
-        ranges: tuple[tuple[float, float], ...] = (own.azimuth, own.elevation, own.power)
+def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Light:
+    """Draw a lamp from a named range, or from a custom one."""
+    if custom is not None:
+        ranges: tuple[tuple[float, float], ...] = (custom.azimuth, custom.elevation, custom.power)
     elif name in _RANGES:
         ranges = _RANGES[name]
     else:

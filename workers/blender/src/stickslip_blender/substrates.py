@@ -68,13 +68,13 @@ def substrate_names() -> tuple[str, ...]:
     return (*_ranges(), "any")
 
 
-def drawn_substrate(name: str, seed: int, own: FloorNumbers | None = None) -> Substrate:
-    """Draw a substrate of a finish, or of one of the user's own."""
-    if own is None and name not in substrate_names():
+def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) -> Substrate:
+    """Draw a substrate of a finish, or of a custom one."""
+    if custom is None and name not in substrate_names():
         raise ValueError(f"substrate must be one of {', '.join(substrate_names())}; got {name!r}")
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     finish = str(random.choice(["matt", *HARD])) if name == "any" else name
-    ranges = _ranges()[finish] if own is None else own.model_dump()
+    ranges = _ranges()[finish] if custom is None else custom.model_dump()
     color = np.array(ranges.get("tint", (1.0, 1.0, 1.0)))
     if finish == "cloth":
         color = 0.15 + 0.85 * random.random(3)

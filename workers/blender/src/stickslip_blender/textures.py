@@ -35,8 +35,8 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     return mean
 
 
-def own_texture(data: bytes) -> npt.NDArray[np.uint8]:
-    """Return the picture in a file of the user's own, as `texture_image` does; its upper edge is the held one.
+def custom_texture(data: bytes) -> npt.NDArray[np.uint8]:
+    """Return the picture in a file of a user, as `texture_image` does; its upper edge is the held one.
 
     Raises:
         UnfitPictureError: It is no picture that a cloth can be printed with.

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
 from stickslip_schemas.spec.axes import quantity
-from stickslip_schemas.spec.fabrics import OwnName, name_schema
+from stickslip_schemas.spec.fabrics import CustomName, name_schema
 
 
 class Viewpoint(StrEnum):
@@ -31,7 +31,7 @@ class Viewpoint(StrEnum):
     elevation_plus_15 = "elevation-plus-15"
 
 
-ViewpointName = Annotated[OwnName, quantity("Viewpoint"), name_schema(Viewpoint)]
+ViewpointName = Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]
 
 TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
 HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)

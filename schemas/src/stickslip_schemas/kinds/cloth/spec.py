@@ -14,7 +14,7 @@ from stickslip_schemas.spec.appearance import CLIP_SIZE, Calibration, FloorNumbe
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
 from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import FabricNumbers, Material, OwnName, Texture, did_you_mean, name_schema
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean, name_schema
 from stickslip_schemas.spec.jobs import JobSpec, Quality, Render, Simulation
 
 Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
@@ -23,8 +23,8 @@ Factor = Annotated[
 ]
 
 
-MaterialName = Annotated[OwnName, quantity("Material"), name_schema(Material)]
-TextureName = Annotated[OwnName, quantity("Texture"), name_schema(Texture)]
+MaterialName = Annotated[CustomName, quantity("Material"), name_schema(Material)]
+TextureName = Annotated[CustomName, quantity("Texture"), name_schema(Texture)]
 
 _TAGGED = Field(discriminator="type")
 MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], _TAGGED, SHORTHAND]
@@ -77,13 +77,13 @@ class GroundTruth(StrEnum):
 SEGMENTS = ("background", "floor", "cloth", "prop")
 """Names of the codes of the array `segmentation`: add new ones at the end."""
 
-LightingName = Annotated[OwnName, quantity("Lighting"), name_schema(Lighting)]
-SubstrateName = Annotated[OwnName, quantity("Substrate"), name_schema(Substrate)]
+LightingName = Annotated[CustomName, quantity("Lighting"), name_schema(Lighting)]
+SubstrateName = Annotated[CustomName, quantity("Substrate"), name_schema(Substrate)]
 LightingAxis = Annotated[ListAxis[LightingName], SHORTHAND]
 SubstrateAxis = Annotated[ListAxis[SubstrateName], SHORTHAND]
 
 
-class Own(NamedTuple):
+class Custom(NamedTuple):
     """Where the spec defines what an axis of names may name besides what is built in."""
 
     key: str
@@ -112,11 +112,11 @@ class PresetName(StrEnum):
     thesis_low_big_dt = "thesis-low-big-dt"
 
 
-OWN_LOOKS = {
-    "material": Own("materials", "fabric", tuple(Material)),
-    "texture": Own("textures", "image", tuple(Texture)),
+CUSTOM_LOOKS = {
+    "material": Custom("materials", "fabric", tuple(Material)),
+    "texture": Custom("textures", "image", tuple(Texture)),
 }
-"""What specs of all kinds of cloth may add: see `ClothSpec.own`."""
+"""What specs of all kinds of cloth may add: see `ClothSpec.custom`."""
 
 PICTURE_DECIBELS = {Quality.preview: 34.8, Quality.draft: 38.9, Quality.standard: 40.9, Quality.high: 43.1}
 """PSNR of the cloth's pixels by quality [dB]: `benchmarks/render_cloth.py` measures it."""
@@ -125,7 +125,7 @@ PICTURE_DECIBELS = {Quality.preview: 34.8, Quality.draft: 38.9, Quality.standard
 class ClothAxes(Document):
     """What the material of a cloth and its friction may be."""
 
-    material: MaterialAxis = Field(description="a measured fabric, or one of your own under `materials`")
+    material: MaterialAxis = Field(description="a measured fabric, or a custom one under `materials`")
     mu: MuAxis = Field(description="friction coefficient between cloth and floor")
     density: FactorAxis | None = Field(default=None, description="factors of the fabric's mass per area")
     bending: FactorAxis | None = Field(default=None, description="factors of the fabric's rigidity against bending")
@@ -140,9 +140,7 @@ class ClothSimulation(Simulation):
     """A cloth trajectory: all that it depends on besides the build."""
 
     material: str
-    fabric: FabricNumbers | None = Field(
-        description="the numbers of a material of the user's own; null: a measured one"
-    )
+    fabric: FabricNumbers | None = Field(description="numbers of a custom material; null: a measured one")
     density: float = 1.0
     bending: float = 1.0
     stretching: float = 1.0
@@ -161,13 +159,13 @@ class ClothRender(Render):
 
     material: str
     texture: str
-    image: ArtifactRef | None = Field(default=None, description="of a texture of the user's own; null: built in")
+    image: ArtifactRef | None = Field(default=None, description="picture of a custom texture; null: a built-in one")
     viewpoint: str
-    camera: Camera | None = Field(default=None, description="of a viewpoint of the user's own; null: one of the rig")
+    camera: Camera | None = Field(default=None, description="of a custom viewpoint; null: a camera of the rig")
     lighting: str = Lighting.drawn.value
-    lamp: LampNumbers | None = Field(default=None, description="lighting of the user's own; null: built in")
+    lamp: LampNumbers | None = Field(default=None, description="custom lighting; null: built-in")
     substrate: str = Substrate.matt.value
-    finish: FloorNumbers | None = Field(default=None, description="of a substrate of the user's own; null: built in")
+    finish: FloorNumbers | None = Field(default=None, description="custom substrate; null: a built-in one")
     creases: float = 0.0
     instants: tuple[int, ...] = Field(description="which instants of the trajectory the frames of the clip show")
     ground_truth: tuple[GroundTruth, ...] = ()
@@ -194,25 +192,25 @@ class ClothSpec(JobSpec):
     instants_per_second: ClassVar[float]
     rig: ClassVar[str]
     """The cameras; their names are those of the viewpoints."""
-    own: ClassVar[Mapping[str, Own]]
+    custom: ClassVar[Mapping[str, Custom]]
     """By axis of names, what the user may add to it."""
 
-    materials: dict[OwnName, FabricNumbers] = Field(
+    materials: dict[CustomName, FabricNumbers] = Field(
         default_factory=dict,
-        description="fabrics of your own, by the names that the axis `material` uses",
+        description="custom fabrics, by the names that the axis `material` uses",
         json_schema_extra={"additionalProperties": False},
     )
-    textures: dict[OwnName, ArtifactRef] = Field(
+    textures: dict[CustomName, ArtifactRef] = Field(
         default_factory=dict,
         max_length=64,
-        description="textures of your own, by the names that the axis `texture` uses: `sha256:` and the digest that "
+        description="custom textures, by the names that the axis `texture` uses: `sha256:` and the digest that "
         "`stickslip upload` prints",
         json_schema_extra={"additionalProperties": False},
     )
-    viewpoints: dict[OwnName, Calibration] = Field(
+    viewpoints: dict[CustomName, Calibration] = Field(
         default_factory=dict,
         max_length=64,
-        description="cameras of your own, by the names that the axis `viewpoint` uses",
+        description="custom cameras, by the names that the axis `viewpoint` uses",
         json_schema_extra={"additionalProperties": False},
     )
     preset: PresetName = Field(
@@ -278,25 +276,25 @@ class ClothSpec(JobSpec):
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         """Return the fields that a value of an axis sets: what the user has defined brings its numbers along."""
-        if axis not in self.own:
+        if axis not in self.custom:
             return {axis: value}
-        _, field, _ = self.own[axis]
-        given = self._own(axis).get(value)
+        _, field, _ = self.custom[axis]
+        given = self._defined(axis).get(value)
         if isinstance(given, Calibration):
             given = given.camera(value)
         return {axis: value, field: given.model_dump(mode="json") if isinstance(given, Document) else given}
 
-    def _own(self, axis: str) -> dict[str, Any]:
-        defined: dict[str, Any] = getattr(self, self.own[axis].key)
+    def _defined(self, axis: str) -> dict[str, Any]:
+        defined: dict[str, Any] = getattr(self, self.custom[axis].key)
         return defined
 
     def names(self, axis: str) -> tuple[str, ...]:
         """Return the names that an axis may use, the built-in ones first: they are the codes of the label."""
-        return (*map(str, self.own[axis].built_in), *self._own(axis))
+        return (*map(str, self.custom[axis].built_in), *self._defined(axis))
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        """The pictures of the user's own textures."""
+        """Pictures of the custom textures."""
         return {f"/textures/{name}": digest for name, image in self.textures.items() if (digest := referred(image))}
 
     def simulation_settings(self) -> dict[str, Any]:
@@ -336,8 +334,8 @@ class ClothSpec(JobSpec):
     @model_validator(mode="after")
     def _known_names(self) -> Self:
         unknown = []
-        for axis, (key, _, built_in) in self.own.items():
-            for name in self._own(axis):
+        for axis, (key, _, built_in) in self.custom.items():
+            for name in self._defined(axis):
                 if name in built_in:
                     raise ValueError(f"{key} must not redefine what is built in, and {name!r} is")
             known = self.names(axis)
@@ -389,8 +387,8 @@ class ClothSpec(JobSpec):
             *self._ground_truth_arrays(),
             codes("texture", self.names("texture")),
             codes("viewpoint", self.names("viewpoint")),
-            codes("lighting", self.names("lighting") if "lighting" in self.own else tuple(Lighting)),
-            codes("substrate", self.names("substrate") if "substrate" in self.own else tuple(Substrate)),
+            codes("lighting", self.names("lighting") if "lighting" in self.custom else tuple(Lighting)),
+            codes("substrate", self.names("substrate") if "substrate" in self.custom else tuple(Substrate)),
             ArrayLayout("light_seed", "int32", (), (), "seed of the lamp, the floor and the noise", fill=-1),
             ArrayLayout(
                 "light",

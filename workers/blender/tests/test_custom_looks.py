@@ -13,7 +13,7 @@ from stickslip_blender.actor import RenderActor
 from stickslip_blender.lights import drawn_light
 from stickslip_blender.stage import ClothStage
 from stickslip_blender.substrates import drawn_substrate
-from stickslip_blender.textures import SIZE, own_texture, texture_image
+from stickslip_blender.textures import SIZE, custom_texture, texture_image
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult, input_digests, task_adapter
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
@@ -129,8 +129,8 @@ def test_a_picture_that_is_gone_is_an_error(actor: RenderActor, record: str) -> 
 
 def test_a_built_in_texture_as_a_file_is_the_texture() -> None:
     drawn = texture_image(Texture.floral)
-    assert np.array_equal(own_texture(_png(np.flipud(drawn))), drawn)
-    assert own_texture(_png(_flag())).shape == (SIZE, SIZE, 3)
+    assert np.array_equal(custom_texture(_png(np.flipud(drawn))), drawn)
+    assert custom_texture(_png(_flag())).shape == (SIZE, SIZE, 3)
 
 
 def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
