@@ -17,7 +17,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from stickslip_services.client.pulling import verify
+from stickslip_services.client.verifying import verify
 from stickslip_training.data.errors import DatasetError
 from stickslip_training.data.reader import DatasetReader
 

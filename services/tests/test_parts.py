@@ -8,8 +8,10 @@ import pytest
 from stickslip_schemas.format.selection import SELECTION_NAME, Selection
 from stickslip_services.cli import app
 from stickslip_services.client.comparing import differences
+from stickslip_services.client.errors import ForeignFilesError, SelectionError
 from stickslip_services.client.http import Client
-from stickslip_services.client.pulling import ForeignFilesError, SelectionError, pull, verify
+from stickslip_services.client.pulling import pull
+from stickslip_services.client.verifying import verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, rods, serving

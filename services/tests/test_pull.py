@@ -8,16 +8,17 @@ import httpx
 import pytest
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.manifest import Contents, Manifest, seal_text, with_manifest_digest
-from stickslip_services.client.http import Client, ProblemError, UnexpectedError, UnreachableError
-from stickslip_services.client.pulling import (
+from stickslip_services.client.errors import (
     DamagedError,
     ForeignFilesError,
+    ProblemError,
+    UnexpectedError,
+    UnreachableError,
     UnsafePathError,
-    pull,
-    refuse_foreign_files,
-    safe_path,
-    verify,
 )
+from stickslip_services.client.http import Client
+from stickslip_services.client.pulling import pull, refuse_foreign_files
+from stickslip_services.client.verifying import safe_path, verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_services.testing import PretendWorker, rods, serving

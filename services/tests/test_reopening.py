@@ -9,7 +9,7 @@ from sqlalchemy import select, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackOutput, RecordRef, RenderOutput, SimulateOutput, TaskResult
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.client.pulling import verify
+from stickslip_services.client.verifying import verify
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator

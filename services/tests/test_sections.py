@@ -1,6 +1,5 @@
 """Versions whose manifest has sections: served, pulled, checked, compared, found again and collected like others."""
 
-import asyncio
 import json
 import random
 from collections.abc import Iterator
@@ -14,9 +13,10 @@ from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 from stickslip_services.cli import app
-from stickslip_services.client.aio import AsyncClient
+from stickslip_services.client.errors import ForeignFilesError
 from stickslip_services.client.http import Client
-from stickslip_services.client.pulling import ForeignFilesError, pull, verify
+from stickslip_services.client.pulling import pull
+from stickslip_services.client.verifying import verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
@@ -86,11 +86,7 @@ def test_a_pull_brings_the_sections_and_a_second_one_nothing(
             pull(client, dataset, 1, tmp_path / "other")
         keys = list(contents.sample_keys())
 
-    async def read() -> Contents:
-        async with AsyncClient(url) as client:
-            return await client.contents(dataset, 1)
-
-    assert list(asyncio.run(read()).sample_keys()) == keys
+        assert list(client.contents(dataset, 1).sample_keys()) == keys
     assert CliRunner().invoke(app, ["datasets", "diff", dataset, str(tmp_path / "d"), "--url", url]).exit_code == 0
 
 

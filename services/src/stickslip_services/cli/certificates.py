@@ -12,7 +12,8 @@ from stickslip_schemas.kinds.rod_hang import ROD_PRESET
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client.http import Client, UnreachableError
+from stickslip_services.client.errors import UnreachableError
+from stickslip_services.client.http import Client
 from stickslip_services.local import certifying
 
 PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))

@@ -19,9 +19,12 @@ from stickslip_services.addresses import DEFAULT_URL, coordinator_url
 from stickslip_services.cli import wording
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client import pulling
 from stickslip_services.client.comparing import differences
-from stickslip_services.client.http import Client, ClientError
+from stickslip_services.client.errors import ClientError
+from stickslip_services.client.http import Client
+from stickslip_services.client.pulling import pull
+from stickslip_services.client.verifying import safe_path
+from stickslip_services.client.verifying import verify as find_faults
 
 ArraysOption = Annotated[
     str | None, typer.Option(help="arrays to take, with commas between; labels always come; without, all")
@@ -83,7 +86,7 @@ def pull_dataset(
         columns = (BarColumn(bar_width=32), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
         with Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
             row = bar.add_task("pull", total=None)
-            done = pulling.pull(
+            done = pull(
                 client,
                 name,
                 version,
@@ -127,7 +130,7 @@ def _contents(client: Client, dataset: str) -> Contents:
     path = Path(dataset) / MANIFEST_NAME
     try:
         manifest = Manifest.model_validate_json(path.read_bytes())
-        return Contents(manifest, lambda file: pulling.safe_path(Path(dataset), file.path).read_bytes())
+        return Contents(manifest, lambda file: safe_path(Path(dataset), file.path).read_bytes())
     except ValidationError as error:
         raise ClientError(f"{path} is no manifest: {str(error).splitlines()[0]}") from error
 
@@ -203,7 +206,7 @@ def _resolve(client: Client, dataset: str) -> tuple[str, int]:
 def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled")]) -> None:
     """Check every file of a dataset against its manifest; exit with 1 if anything is wrong."""
     screen = console()
-    faults = pulling.verify(target)
+    faults = find_faults(target)
     if not faults:
         screen.print(f"{escape(str(target))}: every file is there, and no byte has changed")
         return

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from stickslip_services.cli.specs import SpecFileError
-from stickslip_services.client.calls import ClientError, ProblemError, UnreachableError
+from stickslip_services.client.errors import ClientError, ProblemError, UnreachableError
 from stickslip_services.errors import (
     DatabaseRefusedError,
     NotFoundError,

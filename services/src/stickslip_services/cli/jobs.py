@@ -26,7 +26,8 @@ from stickslip_services.cli.common import (
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.cli.specs import check_spec, read_spec
 from stickslip_services.cli.watch import GOOD, watch
-from stickslip_services.client.http import Client, UnreachableError
+from stickslip_services.client.errors import UnreachableError
+from stickslip_services.client.http import Client
 
 SHOWN_REJECTS = 50
 

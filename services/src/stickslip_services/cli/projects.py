@@ -9,7 +9,7 @@ import typer
 
 from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client.calls import ClientError
+from stickslip_services.client.errors import ClientError
 from stickslip_services.installed import require_server
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ import typer
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client.http import Client, ClientError
+from stickslip_services.client.errors import ClientError
+from stickslip_services.client.http import Client
 
 
 @shows_errors

@@ -1,12 +1,11 @@
-"""The clients of a coordinator, and downloading; they need nothing of the server."""
+"""The client of a coordinator, and downloads. It needs no package of the server."""
 
-from stickslip_services.client.aio import AsyncClient
-from stickslip_services.client.calls import ClientError, ProblemError, UnexpectedError, UnreachableError
+from stickslip_services.client.errors import ClientError, ProblemError, UnexpectedError, UnreachableError
 from stickslip_services.client.http import Client
-from stickslip_services.client.pulling import pull, verify
+from stickslip_services.client.pulling import pull
+from stickslip_services.client.verifying import verify
 
 __all__ = [
-    "AsyncClient",
     "Client",
     "ClientError",
     "ProblemError",

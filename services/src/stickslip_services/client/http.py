@@ -1,5 +1,9 @@
-"""A client of the coordinator: typed answers, problems as exceptions, patience while a coordinator restarts."""
+"""The HTTP client of a coordinator: typed answers, problems as exceptions, retries while the coordinator restarts."""
 
+import json
+import os
+import secrets
+import ssl
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -7,46 +11,57 @@ from typing import Any, Self, TypeVar
 
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
+from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
 from stickslip_schemas.documents.responses import (
     CertificateEntry,
     Dataset,
+    DatasetPublishedEvent,
     DatasetVersion,
+    EventName,
     Job,
     JobDetail,
+    JobProgressEvent,
     JobStateEvent,
     Page,
     Preview,
     SampleState,
+    TaskStateEvent,
     TextureEntry,
     Validation,
     WorkerEntry,
 )
 from stickslip_schemas.format.manifest import Contents, Manifest
-from tenacity import Retrying
+from tenacity import Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
 from stickslip_services.addresses import coordinator_url
-from stickslip_services.client import calls
-from stickslip_services.client.calls import (
-    PATIENCE_SECONDS,
-    STREAM_TIMEOUT,
-    Call,
-    ClientError,
-    Event,
-    ProblemError,
-    UnexpectedError,
-    UnreachableError,
-    raise_for_problem,
-)
-
-__all__ = ["Client", "ClientError", "Event", "ProblemError", "UnexpectedError", "UnreachableError"]
+from stickslip_services.client.errors import UnexpectedError, UnreachableError, raise_for_problem
 
 T = TypeVar("T")
 
+Event = JobStateEvent | JobProgressEvent | TaskStateEvent | DatasetPublishedEvent
+
+_EVENTS: Mapping[str, type[Event]] = {
+    EventName.job_state: JobStateEvent,
+    EventName.job_progress: JobProgressEvent,
+    EventName.task_state: TaskStateEvent,
+    EventName.dataset_published: DatasetPublishedEvent,
+}
+
+PAGE_SIZE = "200"
+
+PATIENCE_SECONDS = 60.0
+"""How long a failed request is repeated [s]."""
+SILENCE_SECONDS = 60.0
+"""Read timeout of an event stream [s]; the coordinator sends a keep-alive every 15 s."""
+
 
 class Client:
-    """Speaks to one coordinator; use it as a context manager."""
+    """A client of one coordinator, and a context manager that closes its connections.
+
+    Its methods block. Asynchronous programs call them in a thread: `await asyncio.to_thread(client.submit, spec)`.
+    """
 
     def __init__(
         self,
@@ -57,15 +72,31 @@ class Client:
         transport: httpx.BaseTransport | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Speak to the coordinator at `url`, with an API key.
+        """Make a client of the coordinator at `url` that authenticates with an API key.
 
-        Without `url`, it is STICKSLIP_URL or this machine; without `key`, that in STICKSLIP_KEY, if there is one.
+        Args:
+            url: Defaults to STICKSLIP_URL, then to this machine.
+            key: Defaults to STICKSLIP_KEY; without either, requests carry no key.
+            patience: How long a failed request is repeated [s].
+            transport: Transport of httpx, for tests.
+            sleep: Waits between attempts, for tests.
         """
         self.url = coordinator_url(url)
         self.patience = patience
         self._sleep = sleep
         self._was_answered = False
-        self._http = httpx.Client(**calls.connection_options(self.url, key), transport=transport)
+        key = key or os.environ.get("STICKSLIP_KEY")
+        # trust_env is off because a proxy of the environment is for the internet. SSL_CERT_FILE still applies: only
+        # this machine may trust the authority of the coordinator's certificate.
+        authorities = os.environ.get("SSL_CERT_FILE") if self.url.startswith("https") else None
+        self._http = httpx.Client(
+            base_url=self.url,
+            timeout=httpx.Timeout(60.0, connect=5.0),
+            headers={} if key is None else {"Authorization": f"Bearer {key}"},
+            verify=ssl.create_default_context(cafile=authorities) if authorities else True,
+            trust_env=False,
+            transport=transport,
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -80,51 +111,55 @@ class Client:
     # --- jobs -----------------------------------------------------------------------------------------------------
 
     def validate(self, spec: Mapping[str, Any]) -> Validation:
-        """Ask what a job would be."""
-        return self._ask(calls.validate(spec))
+        """Validate a spec and count its samples and tasks, without submitting it."""
+        return self._call(Validation, "POST", "/v1/jobs:validate", json=spec)
 
     def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0) -> JobDetail:
-        """Submit a job. A request with the same key makes one job however often it is sent; without, a key is made."""
-        return self._ask(calls.submit(spec, idempotency_key, priority))
+        """Submit a job. Requests with the same idempotency key make one job; by default each call has a new key."""
+        headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
+        query = {"priority": str(priority)} if priority else {}
+        return self._call(JobDetail, "POST", "/v1/jobs", json=spec, headers=headers, params=query)
 
     def upload_texture(self, picture: bytes) -> TextureEntry:
-        """Upload a PNG or JPEG file as a texture, for specs to name under `textures`."""
-        return self._ask(calls.upload_texture(picture))
+        """Upload a PNG or JPEG file as a texture, which specs name under `textures`."""
+        media_type = "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
+        return self._call(TextureEntry, "POST", "/v1/textures", content=picture, headers={"Content-Type": media_type})
 
     def job(self, job_id: str) -> JobDetail:
         """Return a job."""
-        return self._ask(calls.job(job_id))
+        return self._call(JobDetail, "GET", f"/v1/jobs/{job_id}")
 
     def jobs(self) -> Iterator[Job]:
         """Yield all jobs, newest first."""
-        return self._items(calls.jobs())
+        return self._items(Page[Job], "/v1/jobs")
 
     def samples(self, job_id: str, *, state: TaskState | None = None) -> Iterator[SampleState]:
         """Yield the samples of a job by slot."""
-        return self._items(calls.samples(job_id, state))
+        query = {} if state is None else {"state": str(state)}
+        return self._items(Page[SampleState], f"/v1/jobs/{job_id}/samples", query)
 
     def previews(self, job_id: str) -> list[Preview]:
         """Return the previews of a job."""
-        return self._ask(calls.previews(job_id))
+        return self._call(list[Preview], "GET", f"/v1/jobs/{job_id}/previews")
 
     def prioritise(self, job_id: str, priority: int) -> JobDetail:
-        """Give a job another priority: tasks of the job with the highest number come first."""
-        return self._ask(calls.prioritise(job_id, priority))
+        """Set the priority of a job: tasks of the job with the highest number run first."""
+        return self._call(JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority})
 
     def cancel(self, job_id: str) -> JobDetail:
         """Cancel a job."""
-        return self._ask(calls.change(job_id, "cancel"))
+        return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
 
     def pause(self, job_id: str) -> JobDetail:
-        """Pause a job: nothing more is started for it."""
-        return self._ask(calls.change(job_id, "pause"))
+        """Pause a job: running tasks finish, and no further task starts."""
+        return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:pause")
 
     def resume(self, job_id: str) -> JobDetail:
-        """Let a paused job go on."""
-        return self._ask(calls.change(job_id, "resume"))
+        """Resume a paused job."""
+        return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
 
     def events(self, job_id: str) -> Iterator[Event]:
-        """Follow a job until it ends, across lost connections and restarts of the coordinator."""
+        """Yield the events of a job until it ends, across lost connections and restarts of the coordinator."""
         last_id = ""
         waited = 0.0
         while True:
@@ -132,12 +167,12 @@ class Client:
                 for message in self._stream(job_id, last_id):
                     waited = 0.0
                     last_id = message.id or last_id
-                    event = calls.read_event(message.event, message.data)
+                    event = _read_event(message)
                     if event is not None:
                         yield event
                     if isinstance(event, JobStateEvent) and event.state.is_terminal:
                         return
-                reason = "the event stream ends before the job does"
+                reason = "the event stream ended before the job"
             except httpx.TransportError as error:
                 reason = str(error) or type(error).__name__
             if waited >= self.patience:
@@ -146,8 +181,9 @@ class Client:
             waited += 1.0
 
     def _stream(self, job_id: str, last_id: str) -> Iterator[ServerSentEvent]:
-        path, headers = f"/v1/jobs/{job_id}/events", calls.event_headers(last_id)
-        with self._http.stream("GET", path, headers=headers, timeout=STREAM_TIMEOUT) as response:
+        headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_id} if last_id else {})
+        timeout = httpx.Timeout(SILENCE_SECONDS, connect=5.0)
+        with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
             if response.status_code == 503:
                 raise httpx.ReadError("the coordinator is busy")
             if not response.is_success:
@@ -159,58 +195,68 @@ class Client:
 
     def datasets(self) -> Iterator[Dataset]:
         """Yield all datasets, newest first."""
-        return self._items(calls.datasets())
+        return self._items(Page[Dataset], "/v1/datasets")
 
     def dataset(self, dataset: str) -> Dataset:
         """Return a dataset."""
-        return self._ask(calls.dataset(dataset))
+        return self._call(Dataset, "GET", f"/v1/datasets/{dataset}")
 
     def version(self, dataset: str, version: int) -> DatasetVersion:
         """Return a version of a dataset."""
-        return self._ask(calls.version(dataset, version))
+        return self._call(DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}")
 
     def contents(self, dataset: str, version: int) -> Contents:
-        """Return what the manifest of a version lists; sections of a large one are asked for when they are needed."""
+        """Return what the manifest of a version lists; sections of a large one are fetched on demand."""
         root = f"/v1/datasets/{dataset}/versions/{version}/files/"
         manifest, _ = self.manifest(dataset, version)
         return Contents(manifest, lambda file: self.request("GET", root + file.path).content)
 
     def manifest(self, dataset: str, version: int) -> tuple[Manifest, bytes]:
         """Return the manifest of a version, and its bytes."""
-        call = calls.manifest(dataset, version)
-        response = self.request(call.method, call.path)
-        return call.read(response), response.content
+        response = self.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
+        return _parsed(Manifest, response), response.content
 
     def workers(self) -> list[WorkerEntry]:
         """Return the workers."""
-        return self._ask(calls.workers())
+        return self._call(list[WorkerEntry], "GET", "/v1/workers")
 
     # --- certificates ---------------------------------------------------------------------------------------------
 
     def certificates(self) -> Iterator[CertificateEntry]:
         """Yield all certificates, newest first."""
-        return self._items(calls.certificates())
+        return self._items(Page[CertificateEntry], "/v1/certificates")
 
     def certificate(self, digest: str) -> Certificate:
         """Return a certificate."""
-        return self._ask(calls.certificate(digest))
+        return self._call(Certificate, "GET", f"/v1/certificates/{digest}")
 
     def certificate_page(self, digest: str) -> str:
-        """Return the page of a certificate, HTML."""
+        """Return the page of a certificate as HTML."""
         return self.request("GET", f"/v1/certificates/{digest}/page").text
 
     def register(self, upload: CertificateUpload) -> CertificateEntry:
-        """Register a certificate; sent twice it is there once."""
-        return self._ask(calls.register(upload))
+        """Register a certificate. Registering it again changes nothing."""
+        headers = {"Content-Type": "application/json"}
+        content = upload.model_dump_json()
+        return self._call(CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers)
 
     # --- HTTP -----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request, again where it did not come through; raise ClientError.
+        """Send a request, and repeat it while the connection fails or the coordinator is busy.
 
-        Every request of this client may be sent twice: what changes something is idempotent or has a key.
+        Repeating is safe: requests that change something are idempotent or carry an idempotency key.
+
+        Raises:
+            ClientError: The request failed.
         """
-        attempts = Retrying(**calls.retry_options(self.patience, lambda: self._was_answered), sleep=self._sleep)
+        attempts = Retrying(
+            retry=retry_if_exception(self._may_pass),
+            wait=wait_random_exponential(multiplier=0.25, max=3),
+            stop=stop_after_delay(self.patience),
+            reraise=True,
+            sleep=self._sleep,
+        )
         try:
             return attempts(self._send, method, path, **options)
         except httpx.TransportError as error:
@@ -219,8 +265,14 @@ class Client:
             raise_for_problem(error.response)
             raise UnexpectedError(f"{self.url} answered with status {error.response.status_code}") from error
 
+    def _may_pass(self, error: BaseException) -> bool:
+        """Return whether repeating a request may help: a coordinator that has answered before may be restarting."""
+        if isinstance(error, httpx.ConnectError) and not self._was_answered:
+            return False
+        return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
+
     def stream(self, path: str, headers: Mapping[str, str]) -> AbstractContextManager[httpx.Response]:
-        """Open a download; the caller handles errors of the connection."""
+        """Open a download; the caller handles connection errors."""
         return self._http.stream("GET", path, headers=headers)
 
     def _send(self, method: str, path: str, **options: Any) -> httpx.Response:
@@ -231,11 +283,34 @@ class Client:
         raise_for_problem(response)
         return response
 
-    def _ask(self, call: Call[T]) -> T:
-        return call.read(self.request(call.method, call.path, **call.options))
+    def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
+        """Send a request and return its answer as a model."""
+        return _parsed(answer, self.request(method, path, **options))
 
-    def _items(self, call: Call[Page[T]]) -> Iterator[T]:
-        answer: Page[T] | None = None
-        while (following := calls.next_page(call, answer)) is not None:
-            answer = self._ask(following)
-            yield from answer.items
+    def _items(self, answer: type[Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:
+        """Yield the items of all pages of a list."""
+        token: str | None = ""
+        while token is not None:
+            params = {"page_size": PAGE_SIZE, **(query or {})} | ({"page_token": token} if token else {})
+            page = self._call(answer, "GET", path, params=params)
+            yield from page.items
+            token = page.next_page_token
+
+
+def _parsed(answer: type[T], response: httpx.Response) -> T:
+    """Return the document of a response; raise UnexpectedError."""
+    try:
+        return TypeAdapter(answer).validate_json(response.content)
+    except ValidationError as error:
+        raise UnexpectedError(f"{response.url} sent an unexpected answer: {error}") from error
+
+
+def _read_event(message: ServerSentEvent) -> Event | None:
+    """Return an event, None for one that only newer versions know; raise UnexpectedError."""
+    model = _EVENTS.get(message.event)
+    if model is None:
+        return None
+    try:
+        return model.model_validate(json.loads(message.data))
+    except ValueError as error:
+        raise UnexpectedError(f"the event {message.event} has unexpected data: {error}") from error

@@ -1,0 +1,64 @@
+"""Errors of the client.
+
+ClientError
+├── ProblemError        the coordinator answered with a problem document
+├── UnreachableError    the coordinator did not answer
+├── UnexpectedError     the answer is not one of a coordinator of this version
+├── UnsafePathError     a manifest names a file outside its dataset
+├── ForeignFilesError   the target directory holds files of something else
+├── DamagedError        received bytes differ from the manifest
+└── SelectionError      the dataset has no such array or label
+"""
+
+import httpx
+from pydantic import ValidationError
+from stickslip_schemas.documents.problems import MEDIA_TYPE, Problem
+
+
+class ClientError(Exception):
+    """Base of all errors that the client raises."""
+
+
+class ProblemError(ClientError):
+    """The coordinator refused the request; `problem` is its problem document [RFC 9457]."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem.detail)
+        self.problem = problem
+
+
+class UnreachableError(ClientError):
+    """The coordinator does not answer."""
+
+
+class UnexpectedError(ClientError):
+    """The answer is not one of a coordinator of this version."""
+
+
+class UnsafePathError(ClientError):
+    """A manifest names a file outside its dataset."""
+
+
+class ForeignFilesError(ClientError):
+    """The directory holds files that do not belong to the dataset."""
+
+
+class DamagedError(ClientError):
+    """Received bytes differ from what the manifest lists."""
+
+
+class SelectionError(ClientError):
+    """The dataset has no such array or label."""
+
+
+def raise_for_problem(response: httpx.Response) -> None:
+    """Raise ProblemError or UnexpectedError unless a response, whose body has been read, reports success."""
+    if response.is_success:
+        return
+    if response.headers.get("content-type", "").startswith(MEDIA_TYPE):
+        try:
+            problem = Problem.model_validate_json(response.content)
+        except ValidationError as error:
+            raise UnexpectedError(f"{response.url} answered with an invalid problem document") from error
+        raise ProblemError(problem)
+    raise UnexpectedError(f"{response.url} answered with status {response.status_code}; is it a coordinator?")

@@ -1,0 +1,183 @@
+"""Verification of a dataset directory: its seal, its files, and nothing else beside them."""
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.format.chunks import CorruptChunkError, decode_chunk
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import (
+    MANIFEST_NAME,
+    SEAL_NAME,
+    SEALED_NAMES,
+    BrokenSealError,
+    BrokenSectionError,
+    Contents,
+    FileEntry,
+    Manifest,
+    check_seal,
+)
+from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files, sections_of
+
+from stickslip_services.client.errors import DamagedError, UnsafePathError
+
+CONNECTIONS = 4
+"""Files that are read or downloaded at once."""
+PART = ".part"
+"""Suffix of a file that is being downloaded."""
+EVERYTHING = Selection()
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault of a file of a dataset directory."""
+
+    path: str
+    fault: Literal["missing", "size", "sha256", "extra", "manifest", "seal", "sample_key", "selection"]
+    detail: str
+
+
+def read_part(target: Path) -> PartDocument:
+    """Return the part of a version that a directory holds; raise FileNotFoundError if it holds all of it."""
+    try:
+        return PartDocument.model_validate_json((target / SELECTION_NAME).read_bytes())
+    except ValidationError as error:
+        raise DamagedError(f"{target / SELECTION_NAME} is damaged: {str(error).splitlines()[0]}") from error
+
+
+def read_label(target: Path, manifest: Manifest, name: str) -> npt.NDArray[Any]:
+    """Return a label of all slots, (slots,) or (slots, n), from the verified files of a directory."""
+    array = next(array for array in layout(manifest.spec) if array.name == name)
+    numbers = range(-(-manifest.sample_count // manifest.samples_per_file(array)))
+    content = b"".join(bytes(decode_chunk((target / array.shard_path(number)).read_bytes())) for number in numbers)
+    return np.frombuffer(content, dtype=array.dtype).reshape(-1, *array.shape)[: manifest.sample_count]
+
+
+def safe_path(target: Path, path: str) -> Path:
+    """Return the path of a file of a manifest; raise UnsafePathError if it is not inside `target`.
+
+    Existing symbolic links are followed for the check, so a link that leads out of `target` is refused, too.
+    """
+    parts = PurePosixPath(path).parts
+    if not parts or path.startswith("/") or any(part in ("..", ".") for part in path.split("/")) or "\\" in path:
+        raise UnsafePathError(f"the manifest names the file {path!r}, which leaves the dataset; nothing was written")
+    whole = target.joinpath(*parts)
+    if not whole.resolve().is_relative_to(target.resolve()):
+        raise UnsafePathError(f"the file {path!r} would be written outside {target}; nothing was written")
+    if path in (*SEALED_NAMES, SELECTION_NAME) or path.endswith(PART):
+        raise UnsafePathError(f"the manifest names the file {path!r}, which is a reserved name")
+    return whole
+
+
+def verify(target: Path) -> list[Fault]:
+    """Return the faults of the dataset in `target`, by path; an intact dataset has none."""
+    sealed: dict[str, bytes] = {}
+    for name in SEALED_NAMES:
+        try:
+            sealed[name] = (target / name).read_bytes()
+        except FileNotFoundError:
+            return [Fault(name, "missing", "not there: no dataset, or a pull that was not finished")]
+        except OSError as error:
+            return [Fault(name, "missing", f"cannot be read: {error.strerror}")]
+    try:
+        check_seal(*(sealed[name] for name in SEALED_NAMES))
+        manifest = Manifest.model_validate_json(sealed[MANIFEST_NAME])
+    except ValidationError as error:
+        return [Fault(MANIFEST_NAME, "manifest", str(error).splitlines()[0])]
+    except BrokenSealError as error:
+        return [Fault(SEAL_NAME, "seal", str(error))]
+    contents = Contents(manifest, lambda file: safe_path(target, file.path).read_bytes())
+    try:
+        selection = read_part(target)
+        if selection.manifest != sha256(sealed[MANIFEST_NAME]):
+            return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {selection.manifest}")]
+        needed = part_files(contents, selection.selection, None)
+        if faults := _faults(target, needed):  # the other files of a part follow from its labels
+            return sorted(faults, key=lambda fault: fault.path)
+        label = partial(read_label, target, manifest)
+        numbers = sections_of(contents, selection.selection, label)
+        chosen = selection.selection
+    except FileNotFoundError:
+        label, chosen, numbers = None, EVERYTHING, list(range(max(1, len(manifest.sections))))
+    except (DamagedError, ValueError) as error:
+        return [Fault(SELECTION_NAME, "selection", str(error))]
+    # A damaged section lists no files.
+    sections = [manifest.sections[number] for number in numbers] if manifest.sections else []
+    if faults := _faults(target, sections):
+        return sorted(faults, key=lambda fault: fault.path)
+    there = set(files_below(target))
+    try:
+        wanted = {file.path: file for file in part_files(contents, chosen, label)}
+        for path in there:  # files outside the part, of an earlier pull
+            if path not in wanted and (file := contents.file(path)) is not None:
+                wanted[path] = file
+    except (OSError, BrokenSectionError) as error:
+        return [Fault(MANIFEST_NAME, "manifest", str(error))]
+    faults = _faults(target, list(wanted.values()))
+    for path in there:
+        if path not in wanted and path not in (*SEALED_NAMES, SELECTION_NAME):
+            faults.append(Fault(path, "extra", "not in the manifest"))
+    if not faults:
+        faults = _sample_key_faults(target, contents, numbers)
+    return sorted(faults, key=lambda fault: fault.path)
+
+
+def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        return [fault for fault in pool.map(lambda file: _fault(target, file), files) if fault is not None]
+
+
+def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int]) -> list[Fault]:
+    """Compare the array `sample_key` with the keys that the sections of the manifest list."""
+    manifest = contents.manifest
+    array = next(array for array in layout(manifest.spec) if array.name == "sample_key")
+    try:
+        stored = read_label(target, manifest, "sample_key")
+    except (OSError, CorruptChunkError) as error:
+        return [Fault(array.name, "sample_key", str(error))]
+    faults = []
+    for number in numbers:
+        section = contents.section(number)
+        if stored[section.first : section.end].tobytes() != bytes.fromhex("".join(section.sample_keys)):
+            path = array.shard_path(section.first // manifest.samples_per_file(array))
+            slots = f"slots {section.first} to {section.end - 1}"
+            faults.append(Fault(path, "sample_key", f"{slots} have other keys than the manifest says"))
+    return faults
+
+
+def _fault(target: Path, file: FileEntry) -> Fault | None:
+    try:
+        path = safe_path(target, file.path)
+        size = path.stat().st_size
+        if size != file.size:
+            return Fault(file.path, "size", f"{size} bytes, and should have {file.size}")
+        digest = file_digest(path)
+    except UnsafePathError as error:
+        return Fault(file.path, "manifest", str(error))
+    except FileNotFoundError:
+        return Fault(file.path, "missing", "not there")
+    except OSError as error:
+        return Fault(file.path, "missing", f"cannot be read: {error.strerror}")
+    return None if digest == file.sha256 else Fault(file.path, "sha256", f"{digest}, and should be {file.sha256}")
+
+
+def files_below(target: Path) -> Iterator[str]:
+    """Yield the paths of all files below a directory, relative to it."""
+    for directory, _, names in os.walk(target):
+        for name in names:
+            yield (Path(directory) / name).relative_to(target).as_posix()
+
+
+def file_digest(path: Path) -> Sha256:
+    """Return the SHA-256 digest of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

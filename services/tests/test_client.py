@@ -1,0 +1,71 @@
+"""The client: a job from its spec to its files, also from asynchronous programs, and restarts of the coordinator."""
+
+import asyncio
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStateEvent
+from stickslip_services.client import Client, ProblemError, UnreachableError, pull, verify
+from stickslip_services.coordinator import make_app
+from stickslip_services.settings import Settings
+from stickslip_services.testing import PretendWorker, rods, serving
+
+
+@pytest.fixture
+def app(settings: Settings) -> FastAPI:
+    return make_app(settings)
+
+
+def test_a_job_from_its_spec_to_its_files(app: FastAPI, tmp_path: Path) -> None:
+    coordinator = app.state.coordinator
+    with serving(app) as url, Client(url) as client:
+        worker = PretendWorker(coordinator, coordinator.store).register()
+        assert client.validate(rods()).sample_count == 4
+        job = client.submit(rods(), idempotency_key="mine")
+        assert client.submit(rods(), idempotency_key="mine").id == job.id
+        other, another = client.submit(rods(gamma=(5.0,))), client.submit(rods(gamma=(5.0,)))
+        assert other.id != another.id  # by default each call has a new key
+        client.cancel(other.id)
+        assert [shown.id for shown in client.jobs()] == [another.id, other.id, job.id]
+        worker.work()
+        events = list(client.events(job.id))
+        assert isinstance(events[-1], JobStateEvent)
+        (made,) = [event for event in events if isinstance(event, DatasetPublishedEvent)]
+        assert len(list(client.samples(job.id))) == len(client.previews(job.id)) == 4
+        pulled = pull(client, made.dataset.dataset, 1, tmp_path / "dataset")
+        assert pulled.downloaded_files == pulled.files
+        with pytest.raises(ProblemError, match="there is no job"):
+            client.job("job-0")
+    assert verify(tmp_path / "dataset") == []
+
+
+def test_asynchronous_programs_call_the_client_in_threads(app: FastAPI) -> None:
+    async def use(url: str) -> None:
+        with Client(url) as client:
+            specs = [rods(gamma=(value,)) for value in (5.0, 6.0, 7.0)]
+            made = await asyncio.gather(*(asyncio.to_thread(client.submit, spec) for spec in specs))
+            assert {job.id for job in made} == {job.id for job in await asyncio.to_thread(list, client.jobs())}
+
+    with serving(app) as url:
+        asyncio.run(use(url))
+
+
+def test_a_missing_coordinator_is_reported_at_once_and_a_restart_is_waited_for() -> None:
+    answers = iter([httpx.Response(200, json=[]), httpx.ConnectError("gone"), httpx.Response(200, json=[])])
+    slept: list[float] = []
+
+    def handler(_: httpx.Request) -> httpx.Response:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    with Client("http://127.0.0.1:9", patience=60, sleep=slept.append) as client, pytest.raises(UnreachableError):
+        client.workers()
+    assert slept == []
+    with Client(transport=httpx.MockTransport(handler), sleep=slept.append) as client:
+        assert client.workers() == []
+        assert client.workers() == []
+    assert len(slept) == 1
