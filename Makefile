@@ -12,12 +12,10 @@ PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
 CORE_SOURCES = $(shell find sim_core/src sim_core/cmake -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
 RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
   $(addprefix workers/blender/,CMakeLists.txt pyproject.toml)
-# reconstruction.py calls render_rod_set.py with Blender's interpreter. reader.py, bit_flips.py and interrupted_pull.py need a dataset.
-# rod_families.py is imported, cloth_grid.py and cloth_contact.py take half an hour, and the others need what others write, or train.
-# render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
-BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py rod_families.py cloth_grid.py cloth_contact.py curvature_methods.py \
-  natural_from_pictures.py clip_codecs.py render_cloth.py render_memory.py render_peers.py render_sheets.py \
-  render_silhouettes.py render_trajectory.py reader.py bit_flips.py interrupted_pull.py),$(wildcard benchmarks/*.py))
+# reconstruction.py calls render_rod_set.py with Blender's interpreter, reader.py needs a dataset, cloth_contact.py takes half an
+# hour. render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
+BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_contact.py render_cloth.py render_trajectory.py \
+  reader.py),$(wildcard benchmarks/*.py))
 CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
 
 .PHONY: setup demo test test-parts test-service test-whole test-blender check docs bench constraints clean

@@ -6,7 +6,7 @@ Draws rods from the thesis's ranges (seeded), renders them in Blender's interpre
 pictures alone, and prints errors in per cent of the length. The error of a rod is the mean distance of points at the
 same arc length. --views keeps the pictures, or takes them from there if the file exists. --save writes `true` and
 `reconstructed` (rods, 150, 3) over L, with verdicts, parameters and true strains: data for a model of reconstruction
-noise. --varying takes rods whose natural curvature varies along their length (rod_families.py).
+noise. --varying takes rods whose natural curvature varies along their length.
 """
 
 import argparse
@@ -24,9 +24,8 @@ for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another
 
 import numpy as np  # noqa: E402
 import numpy.typing as npt  # noqa: E402
-from rod_families import RANGES, varying_rods  # noqa: E402
 from stickslip_schemas.spec.cameras import load_rig  # noqa: E402
-from stickslip_sim_core import solve_rods  # noqa: E402
+from stickslip_sim_core import solve_general_rods, solve_rods  # noqa: E402
 from stickslip_training.reconstruction import Reconstruction, Verdict, reconstruct  # noqa: E402
 from stickslip_training.reconstruction.hull import moving_cylinder, visual_hull  # noqa: E402
 from stickslip_training.reconstruction.overlay import save_overlay  # noqa: E402
@@ -38,8 +37,11 @@ Floats = npt.NDArray[np.float64]
 HERE = Path(__file__).parent
 RIG = "rod-4"
 RADIUS = 0.008  # [L], the renderer's default
+RANGES = {"gamma": (100.0, 1300.0), "phi0": (0.2, 12.0), "phi1": (6.0, 20.0)}  # [thesis, 5.4.1]
 # Where rods coil at their free end, twice over: most of the thesis's own few hard ones lie in this corner.
 HARD_RANGES = {"gamma": (50.0, 200.0), "phi0": (0.2, 4.0), "phi1": (15.0, 30.0)}
+DEVIATION = np.array([2.0, 2.0, 3.0])  # of the first added cosine of twist, bend1 and bend2 [rad]; of the k-th, a k-th
+WAVES = 3
 BAD = 0.005  # [L]: a mean error above it, or a largest error above four times it, is a failure
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -62,16 +64,20 @@ class Judged:
 def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats]:
     """Return rods of a family that lie in all four frames: centrelines, strains and what they are made from."""
     random, rig = np.random.Generator(np.random.PCG64(seed)), load_rig(RIG)
+    ranges = HARD_RANGES if family == "hard" else RANGES
+    made = {name: random.uniform(*bounds, 2 * count) for name, bounds in ranges.items()}
     if family == "varying":
-        drawn = varying_rods(2 * count, random)
-        made = {"gamma": drawn.gamma, "natural": drawn.natural}
-        lines, strains = drawn.centerline, drawn.strains
+        k, s = np.arange(1, WAVES + 1)[:, None], np.linspace(0.0, 1.0, 150)
+        amplitudes = DEVIATION / k * random.normal(size=(2 * count, WAVES, 3))
+        mean = np.stack([made["phi0"], 0 * made["phi0"], made["phi1"]], axis=1)
+        natural = mean[:, None] + np.einsum("nki,ks->nsi", amplitudes, np.cos(np.pi * k * s))
+        made = {"gamma": made["gamma"], "natural": natural}
+        solution = solve_general_rods(natural, made["gamma"])
     else:
-        ranges = HARD_RANGES if family == "hard" else RANGES
-        made = {name: random.uniform(*bounds, 2 * count) for name, bounds in ranges.items()}
         solution = solve_rods(*made.values())
-        lines, strains = solution.centerline, solution.curvature
-    kept = [i for i, line in enumerate(lines) if all(camera.in_frame(line, RADIUS) for camera in rig)][:count]
+    lines, strains = solution.centerline, solution.curvature
+    seen = [all(camera.in_frame(line, RADIUS) for camera in rig) for line in lines]
+    kept = np.flatnonzero(np.array(seen) & solution.stable)[:count]
     return {"centerline": lines[kept], "strains": strains[kept], **{name: row[kept] for name, row in made.items()}}
 
 
