@@ -6,7 +6,7 @@ RUN apt-get update \
  && apt-get install --yes --no-install-recommends binutils \
  && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
-COPY constraints.txt ./
+COPY VERSION constraints.txt ./
 COPY schemas schemas
 COPY services services
 # The constraints fix the version of every package.

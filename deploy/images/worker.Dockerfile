@@ -6,7 +6,7 @@ RUN apt-get update \
  && apt-get install --yes --no-install-recommends g++ \
  && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
-COPY constraints.txt constraints-blender.txt ./
+COPY VERSION constraints.txt constraints-blender.txt ./
 COPY schemas schemas
 COPY sim_core sim_core
 COPY workers workers

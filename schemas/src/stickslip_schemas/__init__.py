@@ -1,3 +1,1 @@
 """The contract of stickslip: what its parts say to each other. See the modules, one concept each."""
-
-__version__ = "0.1.0"

@@ -1,3 +1,5 @@
 """The coordinator of stickslip with its durable queue, the HTTP client and the command line."""
 
-__version__ = "0.1.0"
+from importlib.metadata import version
+
+__version__ = version("stickslip-services")

@@ -1,3 +1,5 @@
 """Read stickslip datasets and train on them. See the modules, one concept each; `reader` needs no torch."""
 
-__version__ = "0.1.0"
+from importlib.metadata import version
+
+__version__ = version("stickslip-training")

@@ -1,0 +1,79 @@
+"""What a release needs: one version, licences, complete metadata, and wheels that install into a bare environment."""
+
+import os
+import subprocess
+import sys
+import tomllib
+import venv
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[1]
+VERSION = (ROOT / "VERSION").read_text().strip()
+DISTRIBUTIONS = ("schemas", "sim_core", "services", "training", "workers", "workers/blender")
+PURE = ("schemas", "services", "training", "workers")
+PROJECTS = {name: tomllib.loads((ROOT / name / "pyproject.toml").read_text()) for name in DISTRIBUTIONS}
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_every_distribution_has_complete_metadata(name: str) -> None:
+    project = PROJECTS[name]["project"]
+    assert project["dynamic"] == ["version"]
+    assert project.keys() >= {"description", "readme", "license", "license-files", "requires-python", "urls"}
+    assert (ROOT / name / project["readme"]).is_file()
+    assert list((ROOT / name).glob("src/*/py.typed")) or list((ROOT / name).glob("python/*/py.typed"))
+
+
+@pytest.mark.parametrize("name", set(DISTRIBUTIONS) - {"workers/blender"})
+def test_every_distribution_carries_the_licence(name: str) -> None:
+    assert (ROOT / name / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_our_distributions_fit_together(name: str) -> None:
+    project = PROJECTS[name]["project"]
+    extras = [text for texts in project.get("optional-dependencies", {}).values() for text in texts]
+    ours = [Requirement(text) for text in (*project["dependencies"], *extras) if text.startswith("stickslip-")]
+    for requirement in ours:
+        assert requirement.specifier.contains(Version(VERSION)), f"{requirement} does not admit {VERSION}"
+        assert str(requirement.specifier), f"{name} must state a range of {requirement.name}"
+
+
+def test_the_version_is_written_once() -> None:
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == VERSION
+    chart = yaml.safe_load((ROOT / "deploy/helm/stickslip/Chart.yaml").read_text())
+    assert (chart["version"], chart["appVersion"]) == (VERSION, VERSION)
+    values = yaml.safe_load((ROOT / "deploy/helm/stickslip/values.yaml").read_text())
+    assert {values[part]["image"].rpartition(":")[2] for part in ("coordinator", "worker")} == {VERSION}
+    for name in DISTRIBUTIONS:
+        text = (ROOT / name / "pyproject.toml").read_text()
+        assert f'version = "{VERSION}"' not in text
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_wheels_install_into_a_bare_environment(tmp_path: Path) -> None:
+    """Constraints pin what the index resolves; pip's own configuration says where it is."""
+    wheels = tmp_path / "wheels"
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    for name in (*PURE, "sim_core"):
+        subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", str(wheels), str(ROOT / name)], check=True)
+    place = tmp_path / "venv"
+    venv.create(place, with_pip=True)
+    python = str(place / "bin" / "python")
+    names = ["stickslip-services[server]", "stickslip-training", "stickslip-sim-core"]
+    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--find-links", str(wheels)]
+    subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), *names], check=True, cwd=tmp_path)
+    bare = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    for command in ("stickslip", "stickslip-train"):
+        done = subprocess.run([str(place / "bin" / command), "--help"], capture_output=True, text=True, env=bare)
+        assert done.returncode == 0, done.stderr
+    version = subprocess.run([str(place / "bin" / "stickslip"), "--version"], capture_output=True, text=True, env=bare)
+    assert version.stdout.strip() == f"stickslip {VERSION}"
+    code = "import stickslip_sim_core; from stickslip_sim_core import _sim_core; print(_sim_core.__file__)"
+    done = subprocess.run([python, "-c", code], capture_output=True, text=True, env=bare, cwd=tmp_path)
+    assert done.stdout.startswith(str(place)), done.stdout + done.stderr
