@@ -84,7 +84,7 @@ def h5py(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
 
 
 def streaming(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
-    """Yield MosaicML Streaming with columns of fixed type and shape, as `stickslip export --mds` writes them."""
+    """Yield MosaicML Streaming with columns of fixed type and shape."""
     # torchvision, which it imports, cannot register its operators with PyTorch's build for CPUs.
     operators: Any = torch.library.Library("torchvision", "FRAGMENT")  # type: ignore[no-untyped-call]
     for name in ("nms", "qnms"):

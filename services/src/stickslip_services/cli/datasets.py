@@ -143,7 +143,6 @@ def export(
     huggingface: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
-    mds: Annotated[Path | None, typer.Option(metavar="DIR", help="shards for MosaicML Streaming")] = None,
     usd: Annotated[Path | None, typer.Option(metavar="DIR", help="moving meshes of cloth for USD")] = None,
     obj: Annotated[Path | None, typer.Option(metavar="DIR", help="meshes of cloth, one file an instant")] = None,
     arrays: ArraysOption = None,
@@ -166,7 +165,6 @@ def export(
         "--hdf5": hdf5,
         "--webdataset": webdataset,
         "--huggingface": huggingface,
-        "--mds": mds,
         "--usd": usd,
         "--obj": obj,
         "--arrays": arrays,

@@ -13,7 +13,7 @@ from stickslip_schemas.format.selection import Selection
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import huggingface, mds, meshes, webdataset
+from stickslip_training.export import huggingface, meshes, webdataset
 from stickslip_training.export.content import Content, OnBytes
 from stickslip_training.export.writing import to_directory, to_file
 
@@ -27,7 +27,6 @@ def export(
     to_huggingface: Annotated[
         Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
-    to_mds: Annotated[Path | None, typer.Option("--mds", metavar="DIR", help="shards for MosaicML Streaming")] = None,
     to_usd: Annotated[Path | None, typer.Option("--usd", metavar="DIR", help="moving meshes of cloth for USD")] = None,
     to_obj: Annotated[
         Path | None, typer.Option("--obj", metavar="DIR", help="meshes of cloth, an instant each")
@@ -43,7 +42,6 @@ def export(
         "--hdf5": to_hdf5,
         "--webdataset": to_webdataset,
         "--huggingface": to_huggingface,
-        "--mds": to_mds,
         "--usd": to_usd,
         "--obj": to_obj,
     }
@@ -74,18 +72,16 @@ def export(
 _DIRECTORIES = {
     "--webdataset": webdataset.write,
     "--huggingface": huggingface.write,
-    "--mds": mds.write,
     "--usd": meshes.write_usd,
     "--obj": meshes.write_obj,
 }
-_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--mds": ["streaming"], "--usd": ["pxr"]}
-_EXTRAS = {"--mds": "mds", "--usd": "usd"}
+_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--usd": ["pxr"]}
 
 
 def _require(option: str) -> None:
     missing = [name for name in _NEEDED.get(option, []) if find_spec(name) is None]
     if missing:
-        extra = _EXTRAS.get(option, "export")
+        extra = "usd" if option == "--usd" else "export"
         raise ImportError(
             f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[{extra}]'"
         )

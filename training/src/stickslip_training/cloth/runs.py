@@ -90,32 +90,6 @@ def load_runs(path: str | Path) -> Runs:
         raise ValueError(f"{path} must be a packed file of simulations, and is damaged or is none: {error}") from error
 
 
-def write_packed(
-    path: Path,
-    positions: Floats | SingleFloats,
-    rest: Floats | SingleFloats,
-    triangles: Array,
-    instants: Sequence[int],
-    about: Sequence[str],
-) -> None:
-    """Write positions (runs, frames, V, 3) [m] at instants, and what is true of each run as JSON, as `load_runs` reads
-    them.
-
-    Positions are whole steps of `STEP`; differences of consecutive instants are packed best.
-    """
-    steps = np.round(positions / STEP).astype(np.int16)
-    differences = np.diff(steps, axis=1, prepend=np.int16(0))
-    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
-    np.savez_compressed(
-        path,
-        differences=np.moveaxis(bytes_apart, -1, 0),  # low bytes, high bytes, (2, runs, frames, V, 3)
-        rest=rest,
-        triangles=triangles,
-        instants=np.array(instants, np.int16),
-        about=np.array(about),
-    )
-
-
 def _load(path: str | Path) -> Runs:
     with np.load(path) as file:
         low, high = file["differences"]
