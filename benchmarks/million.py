@@ -38,7 +38,8 @@ from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, parsed
+from stickslip_testing.jobs import parsed
+from stickslip_testing.worker import PretendWorker
 
 BEFORE_SECONDS = 5.0
 """How long leases are measured while nothing is planned [s]."""

@@ -21,7 +21,9 @@ from typing import Any
 
 import httpx
 from stickslip_services.addresses import DATABASE_VARIABLE
-from stickslip_services.testing import HttpApi, PretendWorker, RunningServer, rods, start_server
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import HttpApi, RunningServer, start_server
+from stickslip_testing.worker import PretendWorker
 
 
 def cpu_seconds(server: RunningServer) -> float:

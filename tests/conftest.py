@@ -50,7 +50,7 @@ def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
     pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
     pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip-services[postgresql]'")
-    from stickslip_services.testing_postgresql import find_programs, postgresql_server
+    from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()
     if programs is None:

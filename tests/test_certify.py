@@ -13,7 +13,8 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.cli import app
 from stickslip_services.client.http import Client
 from stickslip_services.local.certifying import read_certificate
-from stickslip_services.testing import BUILDS, RunningServer, start_server
+from stickslip_testing.servers import RunningServer, start_server
+from stickslip_testing.worker import BUILDS
 from typer.testing import CliRunner, Result
 
 CLOTH = {

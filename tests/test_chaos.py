@@ -315,7 +315,7 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ser
     pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
     pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip-services[postgresql]'")
-    from stickslip_services.testing_postgresql import find_programs, postgresql_server
+    from stickslip_testing.postgresql import find_programs, postgresql_server
     from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 
     programs = find_programs()

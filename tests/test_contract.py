@@ -22,13 +22,13 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec
 from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
 from stickslip_services.queue.terms import terms_for
-from stickslip_services.testing import BUILDS
 from stickslip_sim_core import character, stage
 from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth import solver
 from stickslip_sim_core.cloth.solver import MU_MAX
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_sim_core.scenes import cloth_sphere, shawl
+from stickslip_testing.worker import BUILDS
 from stickslip_training.benchmark.sets import load_set
 from stickslip_training.kinds import dataset_class
 from stickslip_workers.kinds import kind

@@ -21,7 +21,9 @@ import yaml
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_services.coordinator import GRACE_SECONDS, make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import HttpApi, PretendWorker, failure, rods, serving
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import HttpApi, serving
+from stickslip_testing.worker import PretendWorker, failure
 from stickslip_workers.settings import Settings as WorkerSettings
 
 ROOT = Path(__file__).parents[1]

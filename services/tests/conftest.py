@@ -15,10 +15,12 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.opening import connect
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, start_server
+from stickslip_testing.jobs import ManualClock
+from stickslip_testing.servers import RunningServer, start_server
+from stickslip_testing.worker import PretendWorker
 
 if TYPE_CHECKING:
-    from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.postgresql import PostgresqlServer
     from stickslip_testing.s3 import Proxy
 
 _buckets = itertools.count()
@@ -37,7 +39,7 @@ def postgresql() -> Iterator["PostgresqlServer"]:
     """A PostgreSQL server, started with the first test that needs it."""
     if find_spec("psycopg") is None:
         pytest.skip("psycopg is not installed: pip install 'stickslip-services[server,postgresql]'")
-    from stickslip_services.testing_postgresql import find_programs, postgresql_server
+    from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()
     if programs is None:

@@ -9,7 +9,9 @@ import pytest
 from fastapi import FastAPI
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import HttpApi, ManualClock, PretendWorker, failure, rejection, rods, serving
+from stickslip_testing.jobs import ManualClock, rods
+from stickslip_testing.servers import HttpApi, serving
+from stickslip_testing.worker import PretendWorker, failure, rejection
 
 pytestmark = pytest.mark.databases
 

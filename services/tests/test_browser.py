@@ -14,7 +14,9 @@ from fastapi import FastAPI
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload, CurveReport, ProtocolReport
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import BUILDS, PretendWorker, parsed, rejection, rods, serving, wait_until
+from stickslip_testing.jobs import parsed, rods
+from stickslip_testing.servers import serving, wait_until
+from stickslip_testing.worker import BUILDS, PretendWorker, rejection
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
 axe = pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python")

@@ -17,7 +17,9 @@ from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.validating import validate
 from stickslip_services.settings import Settings
-from stickslip_services.testing import BUILDS, ManualClock, PretendWorker, parsed, rods, serving, show_job
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import BUILDS, PretendWorker
 
 KINDS = ("rod_hang", "cloth_drag", "cloth_on_cloth", "cloth_sphere")
 PAGE = "<!doctype html><title>c</title>"

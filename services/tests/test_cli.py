@@ -10,7 +10,9 @@ import pytest
 import yaml
 from stickslip_services.cli import app
 from stickslip_services.client import Client
-from stickslip_services.testing import PretendWorker, RunningServer, rejection, rods, start_server, wait_until
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import RunningServer, start_server, wait_until
+from stickslip_testing.worker import PretendWorker, rejection
 from typer.testing import CliRunner, Result
 
 

@@ -10,7 +10,9 @@ from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStat
 from stickslip_services.client import Client, ProblemError, UnreachableError, pull, verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, rods, serving
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ import pytest
 from stickslip_services.api import connections
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import RunningServer, rods, serving
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import RunningServer, serving
 
 HEADERS = b"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
 HALF_HEADERS = HEADERS[:30]

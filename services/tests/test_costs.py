@@ -13,7 +13,8 @@ from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.costs import KEPT_RUNS, TIMES, limit_seconds
 from stickslip_services.queue.eta import MEASURED, Cost, StageTimings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rejection, rods, show_job
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
+from stickslip_testing.worker import PretendWorker, failure, rejection
 
 pytestmark = pytest.mark.databases(slow=True)
 

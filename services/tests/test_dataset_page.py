@@ -10,7 +10,9 @@ from stickslip_schemas.plan.points import dataset_id, samples
 from stickslip_services.coordinator import make_app
 from stickslip_services.pages.dataset_page import LISTED, dataset_page
 from stickslip_services.settings import Settings
-from stickslip_services.testing import BUILDS, PretendWorker, parsed, rejection, rods, serving
+from stickslip_testing.jobs import parsed, rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import BUILDS, PretendWorker, rejection
 
 
 def manifest(spec: dict[str, Any], lose: Any = lambda _labels: False, message: str = "made up") -> Manifest:

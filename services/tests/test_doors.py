@@ -18,7 +18,8 @@ from stickslip_services.coordinator import make_app
 from stickslip_services.keys import create_key, list_keys, revoke_key
 from stickslip_services.scopes import Scope
 from stickslip_services.settings import Settings
-from stickslip_services.testing import RunningServer, rods, serving, start_server, wait_until
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import RunningServer, serving, start_server, wait_until
 from typer.testing import CliRunner
 
 WORKER_PATHS = ("/v1/workers", "/v1/worker/lease", "/v1/worker/heartbeat", "/v1/worker/report")

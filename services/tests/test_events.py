@@ -12,7 +12,9 @@ from httpx_sse import ServerSentEvent, connect_sse
 from stickslip_services.api import sse
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, rods, serving
+from stickslip_testing.jobs import ManualClock, rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker, failure
 
 pytestmark = pytest.mark.databases
 

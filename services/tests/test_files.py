@@ -15,7 +15,9 @@ from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, rods, serving
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 
 
 @dataclass

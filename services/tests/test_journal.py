@@ -16,8 +16,10 @@ from stickslip_services.keys import create_key, revoke_key
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.scopes import Scope
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, parsed, rods, serving
 from stickslip_services.webhooks import create_webhook, delete_webhook, retry_webhook
+from stickslip_testing.jobs import parsed, rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases

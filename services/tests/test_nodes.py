@@ -30,10 +30,11 @@ from stickslip_services.database.tables import dataset_versions
 from stickslip_services.local.sockets import listen
 from stickslip_services.queue.audit import audit
 from stickslip_services.settings import Settings
-from stickslip_services.testing import rods, wait_until
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import wait_until
 
 if TYPE_CHECKING:
-    from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.postgresql import PostgresqlServer
     from stickslip_testing.s3 import Proxy
 
 KILLS = int(os.environ.get("STICKSLIP_KILLS", "30"))
@@ -48,7 +49,8 @@ WORKER = """
 import sys, time
 import httpx
 from stickslip_schemas.store import open_store
-from stickslip_services.testing import HttpApi, PretendWorker
+from stickslip_testing.worker import PretendWorker
+from stickslip_testing.servers import HttpApi
 
 name, key, place, url = sys.argv[1:]
 store = open_store(place)

@@ -15,7 +15,9 @@ from stickslip_services.api.routes.pages import _changes
 from stickslip_services.coordinator import make_app
 from stickslip_services.pages.pictures import line_plot, png
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, rejection, rods, serving, show_job
+from stickslip_testing.jobs import ManualClock, rods, show_job
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker, failure, rejection
 
 
 @pytest.fixture

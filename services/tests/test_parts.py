@@ -14,7 +14,9 @@ from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, rods, serving
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner, Result
 
 GAMMAS = (1.0, 2.0, 3.0, 4.0)

@@ -18,19 +18,9 @@ from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
 from stickslip_services.settings import Settings
-from stickslip_services.testing import (
-    BUILDS,
-    ManualClock,
-    PretendWorker,
-    failure,
-    parsed,
-    rejection,
-    rods,
-    serving,
-    show_job,
-    start_server,
-    wait_until,
-)
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
+from stickslip_testing.servers import serving, start_server, wait_until
+from stickslip_testing.worker import BUILDS, PretendWorker, failure, rejection
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases

@@ -29,24 +29,13 @@ from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import (
-    HttpApi,
-    ManualClock,
-    PretendWorker,
-    RunningServer,
-    failure,
-    list_datasets,
-    list_jobs,
-    parsed,
-    rods,
-    show_job,
-    start_server,
-    wait_until,
-)
+from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
+from stickslip_testing.servers import HttpApi, RunningServer, start_server, wait_until
+from stickslip_testing.worker import PretendWorker, failure
 from typer.testing import CliRunner
 
 if TYPE_CHECKING:
-    from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.postgresql import PostgresqlServer
 
 
 @pytest.fixture

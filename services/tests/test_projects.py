@@ -15,7 +15,9 @@ from stickslip_services.projects import acting_for, find_project, list_projects,
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, parsed, rods, serving, show_job
+from stickslip_testing.jobs import parsed, rods, show_job
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases

@@ -21,7 +21,9 @@ from stickslip_services.client.pulling import pull, refuse_foreign_files
 from stickslip_services.client.verifying import safe_path, verify
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, rods, serving
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 
 
 @pytest.fixture(scope="module")

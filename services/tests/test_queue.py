@@ -20,17 +20,8 @@ from stickslip_services.queue.compose import AnyTask, find_task
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.settings import Settings
-from stickslip_services.testing import (
-    BUILDS,
-    ManualClock,
-    PretendWorker,
-    failure,
-    list_jobs,
-    parsed,
-    rejection,
-    rods,
-    show_job,
-)
+from stickslip_testing.jobs import ManualClock, list_jobs, parsed, rods, show_job
+from stickslip_testing.worker import BUILDS, PretendWorker, failure, rejection
 
 pytestmark = pytest.mark.databases
 

@@ -19,20 +19,11 @@ from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.ledger import runnable_tasks
 from stickslip_services.settings import Settings
-from stickslip_services.testing import (
-    ManualClock,
-    PretendWorker,
-    failure,
-    list_datasets,
-    list_jobs,
-    parsed,
-    rejection,
-    rods,
-    show_job,
-)
+from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
+from stickslip_testing.worker import PretendWorker, failure, rejection
 
 if TYPE_CHECKING:
-    from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.postgresql import PostgresqlServer
 
 SPECS = (
     rods(gamma=(1.0,)),

@@ -21,16 +21,9 @@ from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex
 from stickslip_services.settings import Settings
-from stickslip_services.testing import (
-    PretendWorker,
-    list_datasets,
-    list_jobs,
-    parsed,
-    rejection,
-    rods,
-    show_job,
-    start_server,
-)
+from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
+from stickslip_testing.servers import start_server
+from stickslip_testing.worker import PretendWorker, rejection
 from typer.testing import CliRunner, Result
 
 

@@ -13,7 +13,8 @@ from stickslip_services.client.verifying import verify
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
-from stickslip_services.testing import ManualClock, PretendWorker, parsed, rods, show_job
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
+from stickslip_testing.worker import PretendWorker
 
 pytestmark = pytest.mark.databases(slow=True)
 

@@ -13,7 +13,9 @@ from stickslip_services.coordinator import make_app
 from stickslip_services.errors import StickslipError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, list_jobs, parsed, rejection, rods, serving
+from stickslip_testing.jobs import list_jobs, parsed, rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker, rejection
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = 3

@@ -23,7 +23,9 @@ from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex
 from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, list_datasets, parsed, rejection, rods, serving
+from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker, rejection
 from typer.testing import CliRunner
 
 GAMMAS = (1.0, 2.0, 3.0, 4.0)

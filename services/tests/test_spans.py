@@ -12,7 +12,9 @@ import pytest
 from stickslip_schemas import tracing
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, failure, parsed, rods, start_server
+from stickslip_testing.jobs import ManualClock, parsed, rods
+from stickslip_testing.servers import start_server
+from stickslip_testing.worker import PretendWorker, failure
 
 pytest.importorskip("opentelemetry.exporter.otlp.proto.http", reason="needs pip install 'stickslip-schemas[tracing]'")
 

@@ -18,7 +18,9 @@ from stickslip_services.errors import SettingsError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.store_watch import PROBE_SECONDS
 from stickslip_services.settings import Settings
-from stickslip_services.testing import ManualClock, PretendWorker, list_datasets, parsed, rods, serving, show_job
+from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods, show_job
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")

@@ -15,17 +15,9 @@ from stickslip_services.errors import ConflictError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.store_watch import HOLD_SECONDS
 from stickslip_services.settings import Settings
-from stickslip_services.testing import (
-    ManualClock,
-    PretendWorker,
-    RunningServer,
-    failure,
-    parsed,
-    rods,
-    show_job,
-    start_server,
-    wait_until,
-)
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
+from stickslip_testing.servers import RunningServer, start_server, wait_until
+from stickslip_testing.worker import PretendWorker, failure
 
 pytestmark = pytest.mark.databases(slow=True)
 

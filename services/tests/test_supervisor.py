@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import httpx
 import pytest
 from stickslip_services.addresses import DATABASE_VARIABLE
-from stickslip_services.testing import wait_until
+from stickslip_testing.servers import wait_until
 
 if TYPE_CHECKING:
-    from stickslip_services.testing_postgresql import PostgresqlServer
+    from stickslip_testing.postgresql import PostgresqlServer
 
 STUB = """
 import os, signal, sys, time

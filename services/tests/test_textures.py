@@ -18,7 +18,9 @@ from stickslip_services.client.errors import ProblemError
 from stickslip_services.errors import UnknownTextureError
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.unused import unused
-from stickslip_services.testing import PretendWorker, RunningServer, parsed
+from stickslip_testing.jobs import parsed
+from stickslip_testing.servers import RunningServer
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner
 
 KINDS = ("rod_hang", "cloth_drag")

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from stickslip_schemas import tracing
 from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.testing import PretendWorker, parsed, rods
+from stickslip_testing.jobs import parsed, rods
+from stickslip_testing.worker import PretendWorker
 
 HOST = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 """A traceparent as a program sends it that submits jobs [W3C Trace Context, 3.2]."""

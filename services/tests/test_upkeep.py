@@ -24,7 +24,8 @@ from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex
 from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings
-from stickslip_services.testing import PretendWorker, list_datasets, list_jobs, parsed, rods, show_job
+from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases(slow=True)

@@ -14,7 +14,6 @@ from standardwebhooks import Webhook as Verifier
 from stickslip_services.cli import app
 from stickslip_services.errors import SettingsError
 from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.testing import ManualClock, PretendWorker, RunningServer, parsed, rods, wait_until
 from stickslip_services.webhooks import (
     CLAIM_SECONDS,
     GIVE_UP_SECONDS,
@@ -24,6 +23,9 @@ from stickslip_services.webhooks import (
     list_webhooks,
     retry_webhook,
 )
+from stickslip_testing.jobs import ManualClock, parsed, rods
+from stickslip_testing.servers import RunningServer, wait_until
+from stickslip_testing.worker import PretendWorker
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases

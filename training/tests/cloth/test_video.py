@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from stickslip_schemas.spec.cameras import load_rig
+from stickslip_testing.films import meshes_at, write_film
 from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
 from stickslip_training.cloth.training import INSTANTS
@@ -19,7 +20,6 @@ from stickslip_training.cloth.video import (
     load_clip,
     save_clip,
 )
-from stickslip_training.testing import meshes_at, write_film
 
 pytest.importorskip("av")
 cv2 = pytest.importorskip("cv2")

@@ -14,7 +14,6 @@ from itertools import count
 from pathlib import Path
 
 import psycopg
-
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
 from stickslip_services.database.tables import metadata

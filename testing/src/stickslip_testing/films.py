@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from stickslip_schemas.spec.cameras import Camera
-
 from stickslip_training.arrays import Array, Floats, SingleFloats
 from stickslip_training.cloth.crop import stage
 from stickslip_training.cloth.runs import Runs

@@ -1,27 +1,15 @@
-"""For tests of whoever speaks to a coordinator: a clock that stands still, a worker that only pretends, a server."""
+"""A worker that runs no simulation: it finishes tasks at once with invented data, which it stores as a real one."""
 
-import subprocess
-import sys
-import threading
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from math import prod
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import httpx
 import numpy as np
-import uvicorn
-from fastapi import FastAPI
-from pydantic import BaseModel
 from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Reason, Stage
-from stickslip_schemas.documents.responses import Dataset, Job, JobDetail
 from stickslip_schemas.documents.tasks import (
     ChunkRef,
     PackOutput,
@@ -37,16 +25,12 @@ from stickslip_schemas.documents.tasks import (
 )
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
-    HeartbeatAnswer,
     Lease,
-    LeaseBatch,
     LeaseRequest,
     LeaseState,
     Report,
-    ReportAnswer,
     ReportBatch,
     WorkerRegistration,
-    WorkerSession,
 )
 from stickslip_schemas.format.chunks import decode_chunk, decode_shard_index, encode_chunk, encode_shard
 from stickslip_schemas.format.codecs import encode_sample
@@ -63,49 +47,14 @@ from stickslip_schemas.format.manifest import (
     section_path,
     with_manifest_digest,
 )
-from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
-from stickslip_schemas.store import DirectoryStore, Store
-
-from stickslip_services.api.connections import PatientProtocol
-from stickslip_services.catalog import datasets
-from stickslip_services.database.paging import PageRequest
-from stickslip_services.local.sockets import listen
-from stickslip_services.queue import jobs
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.jobs import find_job
-
-A = TypeVar("A", bound=BaseModel)
+from stickslip_schemas.store import Store
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
+
+
 ALL_STAGES = dict.fromkeys(Stage, 1000)
-
-
-class ManualClock:
-    """A clock that stands still until it is told otherwise."""
-
-    def __init__(self) -> None:
-        self.now = 1_800_000_000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def advance(self, seconds: float) -> None:
-        """Let time pass."""
-        self.now += seconds
-
-
-def rods(gamma: Any = (1.0, 2.0), phi1: Any = (1.0, 3.0), **rest: Any) -> dict[str, Any]:
-    """Return a small spec."""
-    gamma = list(gamma) if isinstance(gamma, tuple) else gamma
-    axes = {"gamma": gamma, "phi0": 0.0, "phi1": list(phi1) if isinstance(phi1, tuple) else phi1}
-    return {"kind": "rod_hang", "axes": axes, "samples_per_shard": 2, **rest}
-
-
-def parsed(spec: dict[str, Any]) -> Any:
-    """Return a spec as the coordinator gets it."""
-    return job_spec_adapter.validate_python(spec)
 
 
 def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed") -> TaskResult:
@@ -116,24 +65,6 @@ def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed")
 def rejection(message: str = "it diverged") -> TaskResult:
     """Return a rejected sample."""
     return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
-
-
-def show_job(coordinator: Coordinator, job_id: str) -> JobDetail:
-    """Return a job."""
-    with coordinator.database.read() as connection:
-        return coordinator.show(connection, find_job(connection, job_id).seq)
-
-
-def list_jobs(coordinator: Coordinator) -> tuple[Job, ...]:
-    """Return all jobs, newest first."""
-    with coordinator.database.read() as connection:
-        return jobs.list_jobs(connection, PageRequest(1000, None), ()).items
-
-
-def list_datasets(coordinator: Coordinator) -> tuple[Dataset, ...]:
-    """Return all datasets, newest first."""
-    with coordinator.database.read() as connection:
-        return datasets.list_datasets(connection, PageRequest(1000, None)).items
 
 
 @dataclass
@@ -339,100 +270,3 @@ def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
     column = np.full((rows_held, *array.shape), array.fill, dtype=array.dtype)
     column[: len(values)] = values
     return encode_chunk(column)
-
-
-@dataclass
-class RunningServer:
-    """A coordinator as a process of its own."""
-
-    url: str
-    data: Path
-    process: "subprocess.Popen[str]"
-
-    @property
-    def store(self) -> DirectoryStore:
-        """Its store."""
-        return DirectoryStore(self.data / "store")
-
-    def worker(self, **options: Any) -> PretendWorker:
-        """Return a worker that has registered."""
-        key = (self.data / "worker-key").read_text().strip()
-        return PretendWorker(HttpApi(self.url, key), self.store, **options).register()
-
-    def stop(self) -> None:
-        """Stop it."""
-        self.process.terminate()
-        self.process.wait(20)
-        if self.process.stdout is not None:
-            self.process.stdout.close()
-
-
-class HttpApi:
-    """The four verbs of the worker API over HTTP."""
-
-    def __init__(self, url: str, key: str, post: Callable[..., httpx.Response] | None = None) -> None:
-        self._url = url
-        self._key = key
-        self._send = post or partial(httpx.post, trust_env=False)
-        """Sends requests; by default each over a connection of its own."""
-
-    def register(self, document: WorkerRegistration) -> WorkerSession:
-        """Register a worker."""
-        return self._post("/v1/workers", document, WorkerSession)
-
-    def lease(self, document: LeaseRequest) -> LeaseBatch:
-        """Lease tasks."""
-        return self._post("/v1/worker/lease", document, LeaseBatch)
-
-    def heartbeat(self, document: Heartbeat) -> HeartbeatAnswer:
-        """Renew leases."""
-        return self._post("/v1/worker/heartbeat", document, HeartbeatAnswer)
-
-    def report(self, document: ReportBatch) -> ReportAnswer:
-        """Report results."""
-        return self._post("/v1/worker/report", document, ReportAnswer)
-
-    def _post(self, path: str, document: BaseModel, answer: type[A]) -> A:
-        content, headers = document.model_dump_json(), {"Content-Type": "application/json"}
-        headers["Authorization"] = f"Bearer {self._key}"
-        response = self._send(self._url + path, content=content, headers=headers)
-        response.raise_for_status()
-        return answer.model_validate_json(response.content)
-
-
-@contextmanager
-def serving(app: FastAPI) -> Iterator[str]:
-    """Serve an application from a thread of this process; yield its URL."""
-    listener = listen("127.0.0.1", 0)
-    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1, http=PatientProtocol)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    try:
-        wait_until(lambda: server.started or not thread.is_alive())
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join()
-        listener.close()
-
-
-def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> RunningServer:
-    """Start a coordinator and wait until it answers."""
-    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", str(port)]
-    command += options
-    log = (data.parent / f"{data.name}.log").open("ab")
-    with log:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
-    assert process.stdout is not None
-    words = process.stdout.readline().split()
-    assert words, "the coordinator did not start"
-    return RunningServer(words[-1], data, process)
-
-
-def wait_until(condition: Callable[[], bool], *, seconds: float = 20.0) -> None:
-    """Return when `condition` holds; fail after `seconds`."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to pass"
-        time.sleep(0.02)
