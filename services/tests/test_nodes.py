@@ -27,7 +27,7 @@ from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.database.opening import connect
 from stickslip_services.database.tables import dataset_versions
-from stickslip_services.local.sockets import listen
+from stickslip_services.local.process import listen
 from stickslip_services.queue.audit import audit
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods

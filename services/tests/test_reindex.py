@@ -16,7 +16,7 @@ from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
-from stickslip_services.local.locking import locked
+from stickslip_services.local.process import locked
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex

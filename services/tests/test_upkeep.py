@@ -18,7 +18,7 @@ from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
-from stickslip_services.local.locking import locked
+from stickslip_services.local.process import locked
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex

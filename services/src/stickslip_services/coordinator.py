@@ -42,9 +42,7 @@ from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.keys import KeyRing, local_worker_key
-from stickslip_services.local.locking import locked
-from stickslip_services.local.logs import configure_logging
-from stickslip_services.local.sockets import listen
+from stickslip_services.local.process import configure_logging, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex as find_versions

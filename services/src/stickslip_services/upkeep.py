@@ -17,7 +17,7 @@ from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import ConflictError, DatabaseRefusedError, NotFoundError, SettingsError
 from stickslip_services.journal import acting, this_user
-from stickslip_services.local.locking import locked
+from stickslip_services.local.process import locked
 from stickslip_services.queue.removing import remove
 from stickslip_services.queue.unused import unused
 from stickslip_services.settings import Settings

@@ -27,7 +27,7 @@ from stickslip_schemas.documents.worker_api import (
 )
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.api.connections import PatientProtocol
-from stickslip_services.local.sockets import listen
+from stickslip_services.local.process import listen
 
 from stickslip_testing.worker import PretendWorker
 

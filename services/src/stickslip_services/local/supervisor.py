@@ -25,8 +25,7 @@ from stickslip_schemas.store import write_durably
 
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.errors import SupervisorError
-from stickslip_services.local.locking import locked
-from stickslip_services.local.sockets import listen
+from stickslip_services.local.process import listen, locked
 from stickslip_services.settings import Settings
 
 START_SECONDS = 180.0

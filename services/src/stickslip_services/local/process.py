@@ -1,0 +1,76 @@
+"""Process setup of the programs on a machine: the lock of a data directory, a listening socket, and the log."""
+
+import fcntl
+import logging
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stickslip_services.errors import DatabaseRefusedError
+
+
+@contextmanager
+def locked(data: Path) -> Iterator[int]:
+    """Hold the lock of a data directory, which one coordinator or one `stickslip up` may use at a time.
+
+    Yield the file descriptor of the lock. Child processes inherit it, so the lock is held until the last one ends.
+    Raise DatabaseRefusedError if another process holds it.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    path = data / "lock"
+    with path.open("a+") as file:
+        deadline = time.monotonic() + 10
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                holder = path.read_text(encoding="utf-8").strip()
+                # After a kill of `stickslip up`, its coordinator holds the lock for another moment.
+                if _is_alive(holder) or time.monotonic() > deadline:
+                    message = f"{path.parent} is in use by another `stickslip up` or coordinator (pid {holder})"
+                    raise DatabaseRefusedError(message) from None
+                time.sleep(0.1)
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        os.set_inheritable(file.fileno(), True)
+        yield file.fileno()
+
+
+def _is_alive(pid: str) -> bool:
+    if not pid.isdecimal():
+        return False
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that is bound to a port, but does not accept connections yet."""
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    listener = socket.socket(family, kind, protocol)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def configure_logging(level: int = logging.INFO) -> None:
+    """Log to standard error, one event a line: `time level logger: message`, in UTC."""
+    formatter = logging.Formatter("%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
+    formatter.converter = time.gmtime
+    handler = logging.StreamHandler()
+    handler.setFormatter(formatter)
+    logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
