@@ -394,7 +394,7 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
     with opened(Settings.chosen(data=tmp_path, database=newer), Role.upkeep):
         pass
     postgresql.execute("UPDATE alembic_version SET version_num = '9042'", newer.partition("?")[0].rpartition("/")[2])
-    assert "was made by a newer stickslip (schema 9042" in refusal(newer)
+    assert "has the schema 9042, and this version of stickslip knows 0001" in refusal(newer)
     others = postgresql.empty()
     postgresql.execute("CREATE TABLE birds (name text)", others.partition("?")[0].rpartition("/")[2])
     assert "is not a database of stickslip: give it one of its own" in refusal(others)

@@ -7,11 +7,11 @@ from typing import Any
 import httpx
 import pytest
 from stickslip_schemas.base.states import JobState
+from stickslip_services.access.audit_log import read_audit_log
+from stickslip_services.access.projects import acting_for, find_project, list_projects, set_quota
 from stickslip_services.cli.main import app
 from stickslip_services.coordinator import make_app
 from stickslip_services.errors import QuotaExceededError
-from stickslip_services.journal import read_journal
-from stickslip_services.projects import acting_for, find_project, list_projects, set_quota
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
@@ -58,7 +58,7 @@ def test_a_quota_of_samples_refuses_what_is_too_much(coordinator: Coordinator, w
     with coordinator.database.read() as connection:
         assert audit(connection) == []
         assert [project.name for project in list_projects(connection)] == ["", "lab", "other"]
-        assert [line.subject for line in read_journal(connection) if line.action == "project.quota"] == ["lab", "lab"]
+        assert [line.subject for line in read_audit_log(connection) if line.action == "project.quota"] == ["lab", "lab"]
 
 
 def test_a_quota_of_jobs_counts_those_that_have_not_ended(coordinator: Coordinator, worker: PretendWorker) -> None:

@@ -220,7 +220,7 @@ class QueueMachine(RuleBasedStateMachine):
     @invariant()
     def what_has_ended_stays_so(self) -> None:
         for job in list_jobs(self.coordinator):
-            if job.state.is_terminal:
+            if not job.state.is_open:
                 assert self.ended.setdefault(job.id, job.state) is job.state
             else:
                 assert job.id not in self.ended
@@ -242,7 +242,7 @@ class QueueMachine(RuleBasedStateMachine):
             self.coordinator.plan_large_jobs()
             worker.work()
         for job in list_jobs(self.coordinator):
-            assert job.state.is_terminal, f"{job.id} is {job.state}"
+            assert not job.state.is_open, f"{job.id} is {job.state}"
         self.ledger_is_right()
         self.coordinator.close()
         self.directory.cleanup()

@@ -86,7 +86,7 @@ def cancel_jobs(coordinator: Coordinator, stop: threading.Event) -> None:
     """End the jobs that are made: the event stream of one that waits for a worker would go on for ever."""
     while not stop.wait(0.1):
         for job in list_jobs(coordinator):
-            if not job.state.is_terminal:
+            if job.state.is_open:
                 try:
                     coordinator.cancel(job.id)
                 except StickslipError:

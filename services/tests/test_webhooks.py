@@ -11,10 +11,7 @@ from typing import Any
 import httpx
 import pytest
 from standardwebhooks import Webhook as Verifier
-from stickslip_services.cli import app
-from stickslip_services.errors import SettingsError
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.webhooks import (
+from stickslip_services.access.webhooks import (
     CLAIM_SECONDS,
     GIVE_UP_SECONDS,
     WAITS,
@@ -23,6 +20,9 @@ from stickslip_services.webhooks import (
     list_webhooks,
     retry_webhook,
 )
+from stickslip_services.cli import app
+from stickslip_services.errors import SettingsError
+from stickslip_services.queue.coordinator import Coordinator
 from stickslip_testing.jobs import ManualClock, parsed, rods
 from stickslip_testing.servers import RunningServer, wait_until
 from stickslip_testing.worker import PretendWorker

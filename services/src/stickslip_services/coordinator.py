@@ -27,10 +27,12 @@ from stickslip_schemas import tracing
 from stickslip_schemas.store import open_store
 
 from stickslip_services import __version__
+from stickslip_services.access.keys import KeyRing, local_worker_key
+from stickslip_services.access.webhooks import Messenger
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
+from stickslip_services.api.auth import KeyMiddleware, OriginMiddleware
 from stickslip_services.api.connections import PatientProtocol, allow_many_files
-from stickslip_services.api.doors import DoorMiddleware, KeyMiddleware
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
@@ -41,13 +43,11 @@ from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
-from stickslip_services.keys import KeyRing, local_worker_key
 from stickslip_services.local.process import configure_logging, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex as find_versions
 from stickslip_services.settings import Settings
-from stickslip_services.webhooks import Messenger
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
     app.add_middleware(KeyMiddleware, ring=KeyRing(coordinator.database), required=settings.keys_required)
-    app.add_middleware(DoorMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
+    app.add_middleware(OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
     app.add_middleware(RequestIdMiddleware)
     app.add_middleware(TimingMiddleware, observe=metrics.observe)
     return app

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from stickslip_schemas.store import Store, open_store
 
+from stickslip_services.access.audit_log import acting, this_user
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import ConflictError, DatabaseRefusedError, NotFoundError, SettingsError
-from stickslip_services.journal import acting, this_user
 from stickslip_services.local.process import locked
 from stickslip_services.queue.removing import remove
 from stickslip_services.queue.unused import unused

@@ -66,7 +66,7 @@ class PostgresqlServer:
         It has no rows and counts from 1 again. Who still uses it is thrown out.
         """
         deletions = [
-            f"{'TRUNCATE' if table.name == 'journal' else 'DELETE FROM'} {table.name}"  # it refuses to be deleted from
+            f"{'TRUNCATE' if table.name == 'audit_log' else 'DELETE FROM'} {table.name}"
             for table in reversed(metadata.sorted_tables)
         ]
         with psycopg.connect(self._migrated, autocommit=True) as connection:

@@ -21,17 +21,14 @@ class JobState(StrEnum):
     failed = "failed"
 
     @property
-    def is_terminal(self) -> bool:
-        """True where the job will not change any more."""
-        return self in _TERMINAL_JOB_STATES
-
-
-_TERMINAL_JOB_STATES = {
-    JobState.cancelled,
-    JobState.succeeded,
-    JobState.succeeded_with_rejects,
-    JobState.failed,
-}
+    def is_open(self) -> bool:
+        """True until the job has ended."""
+        return self not in (
+            JobState.cancelled,
+            JobState.succeeded,
+            JobState.succeeded_with_rejects,
+            JobState.failed,
+        )
 
 
 class TaskState(StrEnum):

@@ -154,7 +154,7 @@ class _Feed:
             shown = (
                 self._show(connection, self._job) if with_progress or any(event.is_last for event in events) else None
             )
-        ended = shown is not None and shown.state.is_terminal and len(events) < BATCH
+        ended = shown is not None and not shown.state.is_open and len(events) < BATCH
         progress = None if shown is None else JobProgressEvent(progress=shown.progress).model_dump_json()
         return _News(events, progress, ended)
 

@@ -167,7 +167,7 @@ def _job_table(job: JobDetail) -> Table:
     shown.add_row("tasks", escape(wording.stages(job.progress)))
     if planned := wording.planned(job.progress, job.sample_count):
         shown.add_row("", planned)
-    if not job.state.is_terminal:
+    if job.state.is_open:
         shown.add_row("time left", wording.eta(job.progress.eta))
     cpu = sum(stage.cpu_seconds for stage in job.progress.stages.values())
     shown.add_row("CPU time", wording.duration(cpu))

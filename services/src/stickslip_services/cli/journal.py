@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
     require_server("journal")
-    from stickslip_services.database.opening import visited  # the server's packages may be missing
+    from stickslip_services.access.audit_log import visited  # the server's packages may be missing
 
     return visited(data, database)
 
@@ -35,9 +35,9 @@ def journal(
 ) -> None:
     """Show who changed what, and when, newest first."""
     with _visited(data, database) as connection:
-        from stickslip_services.journal import read_journal
+        from stickslip_services.access.audit_log import read_audit_log
 
-        lines = read_journal(connection, subject=subject, limit=limit)
+        lines = read_audit_log(connection, subject=subject, limit=limit)
     if as_json:
         for line in lines:
             document = {"at": line.at.isoformat(), "actor": line.actor, "action": line.action, "subject": line.subject}

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from stickslip_services.access.scopes import Scope
 from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
-from stickslip_services.scopes import Scope
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -25,7 +25,7 @@ app = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
 def visited_database(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
     """Open the database of a coordinator, which may run, for a few rows."""
     require_server("keys")
-    from stickslip_services.database.opening import visited  # the server's packages may be missing
+    from stickslip_services.access.audit_log import visited  # the server's packages may be missing
 
     return visited(data, database)
 
@@ -43,7 +43,7 @@ def create(
 ) -> None:
     """Make a key and print it. It is shown this once: only its digest is kept."""
     with visited_database(data, database) as connection:
-        from stickslip_services.keys import create_key
+        from stickslip_services.access.keys import create_key
 
         key, secret = create_key(connection, name, scope, time.time(), project=project)
     typer.echo(secret)
@@ -56,7 +56,7 @@ def create(
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List keys, also the revoked ones, newest first."""
     with visited_database(data, database) as connection:
-        from stickslip_services.keys import list_keys
+        from stickslip_services.access.keys import list_keys
 
         found = list_keys(connection)
     shown = table("key", "name", "scopes", "project", "made", "revoked", no_wrap=("key",))
@@ -81,7 +81,7 @@ def revoke(
 ) -> None:
     """Let a key open nothing any more; a running coordinator knows it within a second."""
     with visited_database(data, database) as connection:
-        from stickslip_services.keys import revoke_key
+        from stickslip_services.access.keys import revoke_key
 
         revoke_key(connection, key_id, time.time())
     typer.echo(f"{key_id} is revoked")

@@ -23,7 +23,7 @@ UNLIMITED = "any number"
 def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
     """Open the database of a coordinator, which may run, for a few rows."""
     require_server("projects")
-    from stickslip_services.database.opening import visited  # the server's packages may be missing
+    from stickslip_services.access.audit_log import visited  # the server's packages may be missing
 
     return visited(data, database)
 
@@ -33,7 +33,7 @@ def _visited(data: Path, database: str | None) -> AbstractContextManager["Connec
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List projects with their quotas, and what of these is taken by jobs that have not ended."""
     with _visited(data, database) as connection:
-        from stickslip_services.projects import list_projects
+        from stickslip_services.access.projects import list_projects
 
         found = list_projects(connection)
     shown = table("project", "jobs", "at most", "samples", "at most", no_wrap=("project",))
@@ -59,7 +59,7 @@ def quota(
 ) -> None:
     """Set the quota of a project, from its next submission on. Jobs that are there go on."""
     with _visited(data, database) as connection:
-        from stickslip_services.projects import set_quota
+        from stickslip_services.access.projects import set_quota
 
         try:
             set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())

@@ -22,7 +22,7 @@ IdArgument = Annotated[str, typer.Argument(metavar="WEBHOOK", help="id, as `stic
 
 def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
     require_server("webhooks")
-    from stickslip_services.database.opening import visited  # the server's packages may be missing
+    from stickslip_services.access.audit_log import visited  # the server's packages may be missing
 
     return visited(data, database)
 
@@ -36,7 +36,7 @@ def create(
 ) -> None:
     """Tell a receiver what happens from now on. Prints the secret with which it checks signatures."""
     with _visited(data, database) as connection:
-        from stickslip_services.webhooks import create_webhook
+        from stickslip_services.access.webhooks import create_webhook
 
         webhook, secret = create_webhook(connection, url, time.time())
     typer.echo(secret)
@@ -48,7 +48,7 @@ def create(
 def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List webhooks, newest first, and what is wrong with them."""
     with _visited(data, database) as connection:
-        from stickslip_services.webhooks import list_webhooks
+        from stickslip_services.access.webhooks import list_webhooks
 
         found = list_webhooks(connection, time.time())
     shown = table("webhook", "url", "made", "failed tries", "fault", no_wrap=("webhook",))
@@ -64,7 +64,7 @@ def list_(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> N
 def retry(webhook: IdArgument, data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """Try again at once, also where the receiver was given up. Nothing that happened meanwhile is left out."""
     with _visited(data, database) as connection:
-        from stickslip_services.webhooks import retry_webhook
+        from stickslip_services.access.webhooks import retry_webhook
 
         retry_webhook(connection, webhook, time.time())
     typer.echo(f"{webhook} is tried again")
@@ -75,7 +75,7 @@ def retry(webhook: IdArgument, data: DataOption = DEFAULT_DATA, database: Databa
 def delete(webhook: IdArgument, data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """Tell a receiver nothing any more."""
     with _visited(data, database) as connection:
-        from stickslip_services.webhooks import delete_webhook
+        from stickslip_services.access.webhooks import delete_webhook
 
         delete_webhook(connection, webhook, time.time())
     typer.echo(f"{webhook} is deleted")

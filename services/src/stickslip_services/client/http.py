@@ -170,7 +170,7 @@ class Client:
                     event = _read_event(message)
                     if event is not None:
                         yield event
-                    if isinstance(event, JobStateEvent) and event.state.is_terminal:
+                    if isinstance(event, JobStateEvent) and not event.state.is_open:
                         return
                 reason = "the event stream ended before the job"
             except httpx.TransportError as error:

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, inspect, text
+from sqlalchemy import inspect, text
 from sqlalchemy.exc import DBAPIError
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import open_store
@@ -16,7 +16,6 @@ from stickslip_services.database import migrate
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
-from stickslip_services.journal import acting, this_user
 from stickslip_services.settings import Settings
 
 
@@ -51,14 +50,6 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
         database.close()
 
 
-@contextmanager
-def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
-    """Open the database of a coordinator, which may run, for a command of this machine that writes a row or two."""
-    settings = Settings.chosen(data=data, **({} if database_url is None else {"database": database_url}))
-    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
-        yield connection
-
-
 def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
     """Return whether there is a database; raise DatabaseRefusedError where it cannot be used in a role.
 
@@ -79,8 +70,8 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
     known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
     if revision is not None and revision not in known:
         raise DatabaseRefusedError(
-            f"{name} was made by a newer stickslip (schema {revision}, and this version knows up to {max(known)}): "
-            f"install that version again, or name another {settings.database_option}"
+            f"{name} has the schema {revision}, and this version of stickslip knows {max(known)}: install the version "
+            f"that made it again, or name another {settings.database_option}"
         )
     return revision is not None
 

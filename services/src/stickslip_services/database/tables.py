@@ -150,7 +150,7 @@ tasks = Table(
 )
 
 # The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only ever written by
-# planning.py, and the tests audit that both ends are there.
+# write_plan.py, and the tests check that both ends exist.
 
 task_dependencies = Table(
     "task_dependencies",
@@ -306,8 +306,8 @@ projects = Table(  # those with a quota; the others exist by being named
     Column("max_jobs", Integer),  # null: any number
 )
 
-journal = Table(  # triggers of the migration refuse to change or to delete its rows
-    "journal",
+audit_log = Table(  # triggers of the migration refuse to change or to delete its rows
+    "audit_log",
     metadata,
     Column("seq", _Wide, primary_key=True),
     Column("at", Float, nullable=False),

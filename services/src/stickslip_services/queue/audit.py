@@ -16,7 +16,7 @@ from stickslip_services.database.tables import (
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.ledger import LIVE, OPEN, OVER, RUNNABLE
+from stickslip_services.queue.ledger import LIVE, OVER, RUNNABLE
 
 
 def audit(connection: Connection) -> list[str]:
@@ -89,7 +89,9 @@ def _counter_faults(connection: Connection) -> list[str]:
     there = {(stage, state): count for stage, state, count in rows}
     if counted != there:
         faults.append(f"task_counts says {counted}, and there are {there}")
-    open_jobs = list(connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(OPEN))))
+    open_jobs = list(
+        connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_([state for state in JobState if state.is_open])))
+    )
     by_job: dict[int, Counter[tuple[str, str]]] = {job: Counter() for job in open_jobs}
     for job, stage, state, count in connection.execute(
         select(job_tasks.c.job, tasks.c.stage, tasks.c.state, func.count())
@@ -122,7 +124,7 @@ def _job_faults(connection: Connection) -> list[str]:
     for row in connection.execute(select(jobs)):
         if (row.state in good) != (row.manifest is not None):
             faults.append(f"job {row.seq} is {row.state} and its dataset says otherwise")
-        if JobState(row.state).is_terminal != (row.finished_at is not None):
+        if JobState(row.state).is_open != (row.finished_at is None):
             faults.append(f"job {row.seq} is {row.state} and its end says otherwise")
     for row in connection.execute(
         select(dataset_versions.c.manifest, tasks.c.state).join(tasks, tasks.c.seq == dataset_versions.c.publish_task)

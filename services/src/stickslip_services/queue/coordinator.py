@@ -31,6 +31,9 @@ from stickslip_schemas.kinds import stored_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store, is_unavailable, open_store
 
+from stickslip_services.access.audit_log import note
+from stickslip_services.access.keys import admit_local_worker
+from stickslip_services.access.projects import check_quota, this_project
 from stickslip_services.catalog.certificates import insert_certificate, store_certificate
 from stickslip_services.catalog.textures import check_textures
 from stickslip_services.catalog.versions import ManifestSummary, check_output, damaged_files, read_version
@@ -39,9 +42,6 @@ from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
 from stickslip_services.database.opening import connect
 from stickslip_services.errors import ConflictError, KindNotAvailableError, PresetNotCertifiedError
-from stickslip_services.journal import note
-from stickslip_services.keys import admit_local_worker
-from stickslip_services.projects import check_quota, this_project
 from stickslip_services.queue.bell import Bell
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.eta_watch import EtaWatch

@@ -30,7 +30,7 @@ class StoredEvent:
     @property
     def is_last(self) -> bool:
         """True where the job has come to its end with this event."""
-        return self.name is EventName.job_state and JobStateEvent.model_validate_json(self.data).state.is_terminal
+        return self.name is EventName.job_state and not JobStateEvent.model_validate_json(self.data).state.is_open
 
 
 def set_job_state(
@@ -46,7 +46,7 @@ def set_job_state(
     values: dict[str, object] = {"state": state, "reason": reason, "message": message}
     if state is JobState.running:
         values["started_at"] = func.coalesce(jobs.c.started_at, now)
-    if state.is_terminal:
+    if not state.is_open:
         values["finished_at"] = now
     connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
     event = JobStateEvent(state=state, reason=reason, message=message)

@@ -90,7 +90,7 @@ def cancel_job(book: Ledger, job_id: str) -> int:
     row = find_job(book.connection, job_id)
     if row.state in (JobState.cancelling, JobState.cancelled):
         return int(row.seq)
-    if JobState(row.state).is_terminal:
+    if not JobState(row.state).is_open:
         raise ConflictError(f"job {job_id} has ended ({row.state}); there is nothing left to cancel")
     message = "tasks that are running are being stopped"
     set_job_state(book.connection, row.seq, JobState.cancelling, book.now, reason=Reason.cancelled, message=message)
@@ -145,7 +145,7 @@ def check_unchanged(job: JobDetail, etags: Collection[str]) -> None:
 def prioritise_job(book: Ledger, job_id: str, priority: int) -> int:
     """Give a job another priority. Raise ConflictError if it has ended."""
     row = find_job(book.connection, job_id)
-    if JobState(row.state).is_terminal:
+    if not JobState(row.state).is_open:
         raise ConflictError(f"job {job_id} has ended ({row.state}); its priority cannot be changed")
     book.connection.execute(update(jobs).where(jobs.c.seq == row.seq).values(priority=priority))
     charge_waiting_tasks(book.connection, row.seq)

@@ -23,10 +23,6 @@ RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
 LIVE = (*RUNNABLE, JobState.pausing, JobState.paused)
 """States of a job that needs its tasks."""
 
-OPEN = (*LIVE, JobState.cancelling)
-"""States of a job whose counters follow its tasks; those of an ended job stay as they were at its end."""
-
-
 OVER = tuple(state for state in TaskState if state.is_over)
 """States of a task that nothing is left to do of."""
 
@@ -86,7 +82,10 @@ _HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
     .join(jobs, jobs.c.seq == job_tasks.c.job)
     .join(tasks, tasks.c.seq == job_tasks.c.task)
-    .where(job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)), jobs.c.state.in_(OPEN))
+    .where(
+        job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)),
+        jobs.c.state.in_([state for state in JobState if state.is_open]),
+    )
 )
 ADD_TO_JOB_COUNTS = Prepared(
     "UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state"

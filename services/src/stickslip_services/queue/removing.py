@@ -11,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, delete, select, update
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.store import Store
 
+from stickslip_services.access.audit_log import note
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import (
     dataset_versions,
@@ -29,7 +30,6 @@ from stickslip_services.database.tables import (
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
-from stickslip_services.journal import note
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
         select(jobs.c.seq, jobs.c.id, jobs.c.state).where(jobs.c.publish_task == publish_task)
     ).all()
     for row in rows:
-        if not JobState(row.state).is_terminal:
+        if JobState(row.state).is_open:
             raise ConflictError(f"the job {row.id} is {row.state} and makes this version: cancel it first")
     own = [row.seq for row in rows]
     held: set[int] = set()

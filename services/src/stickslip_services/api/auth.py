@@ -1,7 +1,7 @@
-"""Who may come in: the name the coordinator is asked by, the page that asks, and the key that is shown.
+"""Authentication and authorisation of requests: `Host`, `Origin` and API key.
 
-A page of another site that is open in a browser on this machine can send requests here too. It cannot forge `Host` and
-`Origin`, so both are checked: the one against DNS rebinding, the other against forged forms.
+A page of another site that is open in a browser on this machine can send requests to the coordinator, but it cannot
+forge `Host` and `Origin`. The check of `Host` prevents DNS rebinding, that of `Origin` cross-site request forgery.
 """
 
 from base64 import b64decode
@@ -14,12 +14,12 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import ProblemCode
 
+from stickslip_services.access.audit_log import NOBODY, acting
+from stickslip_services.access.keys import Holder, KeyRing
+from stickslip_services.access.projects import acting_for
+from stickslip_services.access.scopes import Scope, allows
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import problem_response
-from stickslip_services.journal import NOBODY, acting
-from stickslip_services.keys import Holder, KeyRing
-from stickslip_services.projects import acting_for
-from stickslip_services.scopes import Scope, allows
 
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
@@ -30,8 +30,8 @@ _HOW = (
 )
 
 
-class DoorMiddleware:
-    """Refuses requests under a foreign name, and changes that a page of another site asks for."""
+class OriginMiddleware:
+    """Refuses requests for a foreign host name, and changes requested by pages of other sites."""
 
     def __init__(self, app: ASGIApp, allowed_hosts: tuple[str, ...] = ()) -> None:
         self._app = app
@@ -71,10 +71,10 @@ def _host_name(host: str) -> str | None:
 
 
 class KeyMiddleware:
-    """Asks for a key where one is needed, and looks at what it is for.
+    """Refuses requests without a key of the scope that they need.
 
-    What a request needs follows from its method and path alone, so that a new route is never open by mistake. Where
-    no key is required, everybody on this machine may do everything but be a worker.
+    The scope follows from method and path alone, so that a new route is never open by mistake. Where no key is
+    required, everybody on this machine may do everything except act as a worker.
     """
 
     def __init__(self, app: ASGIApp, ring: KeyRing, *, required: bool) -> None:
@@ -103,7 +103,7 @@ class KeyMiddleware:
         await response(scope, receive, send)
 
     async def _admitted(self, headers: Headers, needed: Scope) -> Holder | tuple[int, ProblemCode, str]:
-        """Return who sends a request, or why it is refused."""
+        """Return the holder of the request's key, or why the request is refused (status, code, detail)."""
         authorization = headers.get("authorization")
         if authorization is None:
             if needed in self._open:
@@ -123,7 +123,7 @@ class KeyMiddleware:
 
 
 def needed_scope(method: str, path: str) -> Scope | None:
-    """Return what a key must be for to send a request; None where none is needed."""
+    """Return the scope that a request needs; None where it needs no key."""
     if path in ("/livez", "/readyz") or path.startswith("/static/"):
         return None
     if path.startswith("/v1/worker") and method not in _SAFE:

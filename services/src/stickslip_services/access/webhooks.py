@@ -20,12 +20,12 @@ from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or
 from standardwebhooks import Webhook as Signer
 from stickslip_schemas.documents.responses import EventName
 
+from stickslip_services.access.audit_log import note
 from stickslip_services.addresses import is_loopback
 from stickslip_services.clock import Clock, as_datetime
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError
-from stickslip_services.journal import note
 
 logger = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
-"""Projects: who shares a coordinator. A key belongs to one, and so do the jobs that are submitted with it.
+"""Projects: the users that share a coordinator. A key belongs to one project, and so do the jobs submitted with it.
 
 Leases are shared evenly between projects, and a project may have a quota. Requests without a key belong to the project
-without a name.
+with the empty name.
 """
 
 from collections.abc import Iterator
@@ -10,19 +10,21 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, func, insert, select
+from stickslip_schemas.base.states import JobState
 
+from stickslip_services.access.audit_log import note
+from stickslip_services.access.scopes import check_project
 from stickslip_services.database.tables import api_keys, jobs, projects
 from stickslip_services.errors import QuotaExceededError
-from stickslip_services.journal import note
-from stickslip_services.queue.ledger import OPEN
-from stickslip_services.scopes import check_project
+
+_OPEN = [state for state in JobState if state.is_open]
 
 _project = ContextVar("project", default="")
 
 
 @dataclass(frozen=True, slots=True)
 class Project:
-    """A project with its quota and what of it is taken."""
+    """A project with its quota and its usage."""
 
     name: str
     max_samples: int | None
@@ -35,7 +37,7 @@ class Project:
 
 @contextmanager
 def acting_for(project: str) -> Iterator[None]:
-    """Say for which project is done what is done in the block, also in the threads that it waits for."""
+    """Set the project of all submissions in the block, also in threads that it waits for."""
     token = _project.set(project)
     try:
         yield
@@ -44,12 +46,12 @@ def acting_for(project: str) -> Iterator[None]:
 
 
 def this_project() -> str:
-    """Return for which project something is done now."""
+    """Return the project of the current request."""
     return _project.get()
 
 
 def set_quota(connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float) -> None:
-    """Give a project another quota; it holds for the next submission. Raise ValueError for a name that is none."""
+    """Set the quota of a project from the next submission on; raise ValueError for a bad name."""
     connection.execute(delete(projects).where(projects.c.name == check_project(name)))
     connection.execute(insert(projects).values(name=name, max_samples=max_samples, max_jobs=max_jobs))
     note(connection, "project.quota", name, now, max_samples=max_samples, max_jobs=max_jobs)
@@ -66,13 +68,13 @@ def list_projects(connection: Connection) -> list[Project]:
 
 
 def find_project(connection: Connection, name: str) -> Project:
-    """Return a project; one that nobody has named yet has no quota and no job."""
+    """Return a project; an unknown one has no quota and no jobs."""
     limits = connection.execute(
         select(projects.c.max_samples, projects.c.max_jobs).where(projects.c.name == name)
     ).one_or_none()
     taken = connection.execute(
         select(func.coalesce(func.sum(jobs.c.sample_count), 0), func.count()).where(
-            jobs.c.project == name, jobs.c.state.in_(OPEN)
+            jobs.c.project == name, jobs.c.state.in_(_OPEN)
         )
     ).one()
     most = (None, None) if limits is None else tuple(limits)
@@ -80,7 +82,7 @@ def find_project(connection: Connection, name: str) -> Project:
 
 
 def check_quota(connection: Connection, name: str, sample_count: int) -> None:
-    """Raise QuotaExceededError where one more job, with so many samples, is more than a project may have."""
+    """Raise QuotaExceededError where one more job of `sample_count` samples exceeds the quota."""
     project = find_project(connection, name)
     if project.max_jobs is not None and project.jobs + 1 > project.max_jobs:
         raise QuotaExceededError(name, "jobs", project.max_jobs, taken=project.jobs, asked=1)

@@ -12,11 +12,11 @@ import httpx
 import pytest
 from fastapi import FastAPI
 from pydantic import ValidationError
-from stickslip_services.api.doors import needed_scope
+from stickslip_services.access.keys import create_key, list_keys, revoke_key
+from stickslip_services.access.scopes import Scope
+from stickslip_services.api.auth import needed_scope
 from stickslip_services.cli import app as cli
 from stickslip_services.coordinator import make_app
-from stickslip_services.keys import create_key, list_keys, revoke_key
-from stickslip_services.scopes import Scope
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import RunningServer, serving, start_server, wait_until

@@ -15,12 +15,12 @@ from sqlalchemy import Connection, insert, select, update
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
 
+from stickslip_services.access.audit_log import note
+from stickslip_services.access.scopes import Scope, check_project
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys
 from stickslip_services.errors import NotFoundError
-from stickslip_services.journal import note
-from stickslip_services.scopes import Scope, check_project
 
 LOCAL_WORKER = "local-worker"
 """Name of the key in the file `worker-key` of the data directory."""

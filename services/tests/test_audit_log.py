@@ -1,4 +1,4 @@
-"""The journal: every change has a line that says whose it was, and no line is ever changed."""
+"""The audit log: each change has an entry with its actor, and no entry is ever changed."""
 
 import json
 import time
@@ -8,15 +8,15 @@ import httpx
 import pytest
 from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
+from stickslip_services.access.audit_log import NOBODY, acting, read_audit_log
+from stickslip_services.access.keys import create_key, revoke_key
+from stickslip_services.access.scopes import Scope
+from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
 from stickslip_services.cli import app
 from stickslip_services.coordinator import make_app
-from stickslip_services.database.tables import journal
-from stickslip_services.journal import NOBODY, acting, read_journal
-from stickslip_services.keys import create_key, revoke_key
+from stickslip_services.database.tables import audit_log
 from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.scopes import Scope
 from stickslip_services.settings import Settings
-from stickslip_services.webhooks import create_webhook, delete_webhook, retry_webhook
 from stickslip_testing.jobs import parsed, rods
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import PretendWorker
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.databases
 def lines(coordinator: Coordinator, subject: str | None = None) -> list[tuple[str, str, dict[str, Any]]]:
     """Return who did what, the oldest first."""
     with coordinator.database.read() as connection:
-        found = read_journal(connection, subject=subject)
+        found = read_audit_log(connection, subject=subject)
     return [(line.actor, line.action, line.details) for line in reversed(found)]
 
 
@@ -78,12 +78,12 @@ def test_keys_and_webhooks_have_lines(coordinator: Coordinator) -> None:
     assert not any(secret in json.dumps(found) for secret in (secret, sign))
 
 
-@pytest.mark.parametrize("change", [update(journal).values(actor="nobody"), delete(journal)])
+@pytest.mark.parametrize("change", [update(audit_log).values(actor="nobody"), delete(audit_log)])
 def test_no_line_can_be_changed(coordinator: Coordinator, change: Any) -> None:
     coordinator.submit(parsed(rods()), None)
     before = lines(coordinator)
     with (
-        pytest.raises(DBAPIError, match="the journal can only be added to"),
+        pytest.raises(DBAPIError, match="the audit log is append-only"),
         coordinator.database.write() as connection,
     ):
         connection.execute(change)

@@ -1,0 +1,1 @@
+"""Who may do what, who has done what, and which programs receive job events."""

@@ -1,0 +1,90 @@
+"""The audit log: who changed what, and when. Append-only: the database refuses to change or delete an entry.
+
+An entry is written in the transaction of the change itself, so that neither exists without the other.
+"""
+
+import getpass
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, insert, select
+
+from stickslip_services.clock import as_datetime
+from stickslip_services.database.database import Role
+from stickslip_services.database.opening import opened
+from stickslip_services.database.tables import audit_log
+from stickslip_services.settings import Settings
+
+NOBODY = "no key"
+"""The actor of a request without a key: anybody on this machine."""
+
+_actor = ContextVar("actor", default=NOBODY)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An entry of the audit log."""
+
+    at: datetime
+    actor: str
+    """The id and the name of a key, `no key`, or `user NAME` of a command on the machine of the data."""
+    action: str
+    """What was done, for example `job.cancel`."""
+    subject: str
+    """The id of the job, version, key, webhook or certificate that was changed."""
+    details: dict[str, Any]
+
+
+@contextmanager
+def acting(name: str) -> Iterator[None]:
+    """Set the actor of all changes in the block, also in threads that it waits for."""
+    token = _actor.set(name)
+    try:
+        yield
+    finally:
+        _actor.reset(token)
+
+
+def this_user() -> str:
+    """Return the actor of a command on this machine."""
+    try:
+        return f"user {getpass.getuser()}"
+    except (KeyError, OSError):  # a container's user may have no name
+        return "user without a name"
+
+
+def note(connection: Connection, action: str, subject: str, now: float, **details: Any) -> None:
+    """Write an entry."""
+    connection.execute(
+        insert(audit_log).values(
+            at=now, actor=_actor.get(), action=action, subject=subject, details=json.dumps(details)
+        )
+    )
+
+
+def read_audit_log(connection: Connection, *, subject: str | None = None, limit: int = 100) -> list[Entry]:
+    """Return the last `limit` entries, newest first; with `subject`, only those about it."""
+    query = select(audit_log).order_by(audit_log.c.seq.desc()).limit(limit)
+    if subject is not None:
+        query = query.where(audit_log.c.subject == subject)
+    return [
+        Entry(as_datetime(row.at), row.actor, row.action, row.subject, json.loads(row.details))
+        for row in connection.execute(query)
+    ]
+
+
+@contextmanager
+def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
+    """Open a write transaction on the database of `data`, or at a URL, for a command on this machine.
+
+    A coordinator may run meanwhile. Raises DatabaseRefusedError or SettingsError.
+    """
+    settings = Settings.chosen(data=data, **({} if database_url is None else {"database": database_url}))
+    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
+        yield connection
