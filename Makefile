@@ -1,4 +1,5 @@
-# make demo | test | check | docs | bench | constraints | clean. Every target sets up what it needs; a second call is quick.
+# make demo | test-fast | test | test-slow | check | docs | bench | wheels | constraints | clean.
+# Every target sets up what it needs; a second call is quick.
 
 PYTHON ?= python3.11
 PY = .venv/bin/python
@@ -8,7 +9,7 @@ PIP_FLAGS = --quiet --disable-pip-version-check
 SOURCES = $(addsuffix /src,schemas services testing training workers workers/blender) sim_core/python examples benchmarks tools
 # One by one: test modules of different components have the same names. The other tests are not typed.
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
-PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml
+PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml VERSION
 CORE_SOURCES = $(shell find sim_core/src sim_core/cmake -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
 RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
   $(addprefix workers/blender/,CMakeLists.txt pyproject.toml)
@@ -16,9 +17,10 @@ RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
 # hour. render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_contact.py render_cloth.py render_trajectory.py \
   reader.py),$(wildcard benchmarks/*.py))
+DISTRIBUTIONS = schemas sim_core services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup demo test test-parts test-service test-whole test-blender check docs bench constraints clean
+.PHONY: setup demo test-fast test test-slow test-main test-blender check size docs bench wheels release-wheels constraints clean
 
 setup: .venv/core.stamp .venv-blender/raster.stamp
 
@@ -53,29 +55,41 @@ setup: .venv/core.stamp .venv-blender/raster.stamp
 demo: setup
 	$(PY) examples/demo.py
 
-# Two at a time, one for each core; each prints its report when it is done. `pytest -m slow` runs what is left out.
-test: setup check
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-whole test-service test-parts test-blender
+# Three tiers. Fast: no test over one CPU second, none that starts Ray, Blender, PostgreSQL or a server. The second is what
+# a change must pass, with `check` beside the tests. Slow: the long, the random, and what repeats on another database.
+PYTEST = $(PY) -m pytest --quiet --numprocesses=auto --dist=loadgroup
 
-test-parts:
-	$(PY) -m pytest schemas sim_core training
+test-fast: setup
+	$(PYTEST) -m "not slow and not real and not physics" --cpu-limit=1
 
-test-service:
-	$(PY) -m pytest services workers/tests
+test: setup
+	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-main test-blender check
 
-test-whole:
-	$(PY) -m pytest tests
+test-main:
+	$(PYTEST)
 
 test-blender:
-	$(BLENDER_PY) -m pytest workers/blender
+	$(BLENDER_PY) -m pytest --quiet workers/blender
+
+test-slow: setup
+	$(PYTEST) -m slow
+	$(BLENDER_PY) -m pytest --quiet -m slow workers/blender
 
 check: setup
 	$(PY) -m ruff format --check .
 	$(PY) -m ruff check .
 	.venv/bin/clang-format --dry-run --Werror $(CPP_FILES)
+	$(PY) -m codespell_lib
+	PYTHONPATH=workers/blender/src .venv/bin/lint-imports --no-logo
+	@for distribution in $(DISTRIBUTIONS); do (cd $$distribution && $(CURDIR)/$(PY) -m deptry --no-ansi .) || exit 1; done
+	@$(MAKE) --no-print-directory size
 	$(PY) -m mypy $(SOURCES)
 	@for tests in $(TESTS); do $(PY) -m mypy $$tests || exit 1; done
 	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
+
+# The lines of source, and what is longer than it should be.
+size:
+	@$(PY) tools/size.py
 
 # A warning is an error; tests/test_docs_code.py does the same, and runs the code of the pages.
 docs: setup
@@ -86,6 +100,19 @@ bench: setup
 	@for script in $(BENCHMARKS); do \
 	  echo "== $$script"; \
 	  case $$script in */render_*) $(BLENDER_PY) $$script ;; *) $(PY) $$script ;; esac || exit 1; \
+	done
+
+# Everything that PyPI gets: source distributions, and wheels of this machine. Release wheels come from cibuildwheel.
+wheels: setup
+	@for distribution in $(DISTRIBUTIONS); do $(PY) -m build --outdir dist $$distribution || exit 1; done
+
+# In CI, with Docker: manylinux wheels of the two compiled distributions; their pyproject.toml configures cibuildwheel.
+release-wheels: setup
+	@for distribution in schemas services training workers; do $(PY) -m build --outdir dist $$distribution || exit 1; done
+	@for distribution in sim_core workers/blender; do \
+	  $(PY) -m build --sdist --outdir dist $$distribution || exit 1; \
+	  .venv/bin/pip install $(PIP_FLAGS) "cibuildwheel>=4.3,<5"; \
+	  $(PY) -m cibuildwheel --platform linux --output-dir dist $$distribution || exit 1; \
 	done
 
 # Newest versions that the ranges of the components allow, tried in fresh environments.
