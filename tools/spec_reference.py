@@ -5,31 +5,32 @@ python tools/spec_reference.py > docs/spec.md
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable
 from typing import Any
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.kinds import KINDS
+from stickslip_schemas.kinds.cloth.spec import ClothSpec
 from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
 from stickslip_schemas.spec.fabrics import FabricNumbers
+from stickslip_schemas.spec.jobs import JobSpec
 
 HEAD = """# Every key of a spec
 
 <!-- Written by tools/spec_reference.py from the models that check specs; do not edit. -->
 
-A spec is a YAML or JSON document. It names a `kind` and the axes of a parameter grid. This page lists every key, with
-its range, its unit and what it costs. `stickslip validate FILE` checks a spec and counts its samples, also offline.
-Every CPU time on this page is of one core of a shared virtual AMD EPYC; [measurements](measurements.md) say how it was
-measured.
+A spec is a YAML or JSON document with a `kind` and the axes of a parameter grid. This page lists every key with its
+range, unit and cost. `stickslip validate FILE` checks a spec and counts its samples, also without a service. CPU times
+are of one core of a shared virtual AMD EPYC ([measurements](measurements.md)).
 
 ## Axes
 
-Each axis of a grid has one of these forms:
+An axis, under `axes`, has one of these forms:
 
 | form | example | values |
 |---|---|---|
 | one value | `0.5` | that value |
-| list | `[0.1, 0.2]` | these values; no value twice |
+| list | `[0.1, 0.2]` | these values, without repetition |
 | linspace | `{type: linspace, start: 0, stop: 1, num: 5}` | `num` equal steps from `start` to `stop`, both included |
 | random | `{type: random, low: 0, high: 1, num: 5, seed: 0}` | `num` independent uniform values in [low, high) |
 | sobol | `{type: sobol, low: 0, high: 1, num: 5, seed: 0}` | `num` values of a scrambled Sobol sequence |
@@ -37,42 +38,8 @@ Each axis of a grid has one of these forms:
 An axis of names, such as `material`, takes one name or a list. A job has at most 1,000,000 samples.
 """
 
-
-def reference() -> str:
-    """Return the page."""
-    return "\n".join(
-        [
-            HEAD,
-            *(part for kind in KINDS.values() for part in _kind(kind)),
-            *(part for entry in CUSTOM for part in _custom(*entry)),
-        ]
-    )
-
-
-def _kind(kind: Any) -> Iterator[str]:
-    schema = kind.model_json_schema()
-    axes = schema["$defs"][schema["properties"]["axes"]["$ref"].rpartition("/")[2]]
-    yield f"## `{schema['properties']['kind']['const']}`\n"
-    yield f"{kind.__doc__.splitlines()[0]}\n"
-    yield "Axes, under `axes`:\n"
-    yield "| axis | values | meaning |"
-    yield "|---|---|---|"
-    for name, axis in axes["properties"].items():
-        alternatives = axis.get("anyOf", [axis])
-        value = _resolved(alternatives[0] if "anyOf" in axis else axis, schema)
-        if "anyOf" in value:
-            value = _resolved(value["anyOf"][0], schema)
-        meaning = axis.get("description") or value.get("description", "")
-        required = "" if name in axes.get("required", ()) else " (optional)"
-        yield f"| `{name}`{required} | {_allowed(value)} | {_first_line(meaning)} |"
-    yield "\nOther keys:\n"
-    yield "| key | values | default | meaning | cost |"
-    yield "|---|---|---|---|---|"
-    for name, field in schema["properties"].items():
-        if name not in ("axes", "kind"):
-            yield _field_row(name, field, schema)
-    yield ""
-
+AXIS_HEAD = ("| axis | values | meaning |", "|---|---|---|")
+KEY_HEAD = ("| key | values | default | meaning | cost |", "|---|---|---|---|---|")
 
 CUSTOM: tuple[tuple[str, str, type[Document]], ...] = (
     ("materials", "fabric", FabricNumbers),
@@ -82,17 +49,68 @@ CUSTOM: tuple[tuple[str, str, type[Document]], ...] = (
 )
 """What a spec may define: its key, what one entry is, and the model of an entry."""
 
+Rows = dict[str, str]
+"""Rows of a table, by the name of the axis or key."""
 
-def _custom(key: str, what: str, model: type[Document]) -> Iterator[str]:
-    schema = model.model_json_schema()
-    meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
-    yield f"## Custom {what}s\n"
-    yield f"An entry of `{key}` names a {what} and gives its numbers. {meaning}\n"
-    yield "| key | values | default | meaning | cost |"
-    yield "|---|---|---|---|---|"
-    for name, field in schema["properties"].items():
-        yield _field_row(name, field, schema)
-    yield ""
+
+def reference() -> str:
+    """Return the page: what all kinds share, what all kinds of cloth share, then each kind, then custom entries."""
+    keys = {name: _keys(kind) for name, kind in KINDS.items()}
+    axes = {name: _axes(kind) for name, kind in KINDS.items()}
+    cloth = [name for name, kind in KINDS.items() if issubclass(kind, ClothSpec)]
+    every, every_cloth = _shared(keys.values()), _shared(keys[name] for name in cloth)
+    cloth_axes = _shared(axes[name] for name in cloth)
+    lines = [HEAD, "## Keys of every kind\n", *_table(KEY_HEAD, every), "## Keys of every kind of cloth\n"]
+    lines += _table(AXIS_HEAD, cloth_axes) + _table(KEY_HEAD, _without(every_cloth, every))
+    for name, kind in KINDS.items():
+        lines += [f"## `{name}`\n", f"{(kind.__doc__ or '').splitlines()[0]}\n"]
+        known = {**every, **(every_cloth if name in cloth else {})}
+        lines += _table(AXIS_HEAD, _without(axes[name], cloth_axes if name in cloth else {}))
+        lines += _table(KEY_HEAD, _without(keys[name], known))
+    for key, what, model in CUSTOM:
+        meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
+        schema = model.model_json_schema()
+        rows = {name: _field_row(name, field, schema) for name, field in schema["properties"].items()}
+        lines += [f"## Custom {what}s\n", f"An entry of `{key}` names a {what} and gives its numbers. {meaning}\n"]
+        lines += _table(KEY_HEAD, rows)
+    return "\n".join(lines)
+
+
+def _shared(tables: Iterable[Rows]) -> Rows:
+    """Return the rows that all tables have, in the order of the first table."""
+    first, *others = tables
+    return {name: row for name, row in first.items() if all(table.get(name) == row for table in others)}
+
+
+def _without(table: Rows, known: Rows) -> Rows:
+    return {name: row for name, row in table.items() if known.get(name) != row}
+
+
+def _table(head: tuple[str, str], rows: Rows) -> list[str]:
+    return [*head, *rows.values(), ""] if rows else []
+
+
+def _axes(kind: type[JobSpec]) -> Rows:
+    schema = kind.model_json_schema()
+    axes = schema["$defs"][schema["properties"]["axes"]["$ref"].rpartition("/")[2]]
+    rows = {}
+    for name, axis in axes["properties"].items():
+        alternatives = axis.get("anyOf", [axis])
+        value = _resolved(alternatives[0] if "anyOf" in axis else axis, schema)
+        if "anyOf" in value:
+            value = _resolved(value["anyOf"][0], schema)
+        meaning = axis.get("description") or value.get("description", "")
+        required = "" if name in axes.get("required", ()) else " (optional)"
+        rows[name] = f"| `{name}`{required} | {_allowed(value)} | {_first_line(meaning)} |"
+    return rows
+
+
+def _keys(kind: type[JobSpec]) -> Rows:
+    schema = kind.model_json_schema()
+    fields = {name: field for name, field in schema["properties"].items() if name not in ("axes", "kind")}
+    if issubclass(kind, ClothSpec):
+        fields["frames"] = {**fields["frames"], "maximum": kind.instants}
+    return {name: _field_row(name, field, schema) for name, field in fields.items()}
 
 
 _MAPPINGS = ("textures", *(key for key, _, _ in CUSTOM))
@@ -108,7 +126,7 @@ def _field_row(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:
 
 
 def _resolved(value: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of a value, without references, and of what may be null what it is otherwise."""
+    """Return the schema of a value with its references resolved; a nullable value becomes its other alternative."""
     found = value
     if "$ref" in found:
         found = {**schema["$defs"][found["$ref"].rpartition("/")[2]], **{k: v for k, v in found.items() if k != "$ref"}}

@@ -34,16 +34,16 @@ class ClothDragAxes(ClothAxes):
     """What a clip of dragged cloth depends on."""
 
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
         description="camera of the rig, or a custom one under `viewpoints`"
     )
     lighting: LightingAxis | None = Field(
-        default=None, description="which lamps to draw from, or a custom one under `lamps`; by default `drawn`"
+        default=None, description="range of lamps, or a custom one under `lamps`; by default `drawn`"
     )
     substrate: SubstrateAxis | None = Field(
-        default=None, description="finishes of the floor, or a custom one under `substrates`; by default `matt`"
+        default=None, description="finish of the floor, or a custom one under `substrates`; by default `matt`"
     )
 
 
@@ -87,10 +87,9 @@ class ClothDragSpec(ClothSpec):
         default=SELF_FRICTION,
         ge=0,
         le=10,
-        description="friction coefficient of the cloth with itself; null: it passes through itself",
+        description="friction coefficient of the cloth with itself; null turns self-contact off",
         json_schema_extra={
-            "x-cost": "against null, 1.1 to 1.2 times the CPU time of a simulation where no parts of the cloth touch "
-            "each other, and up to 1.7 times where it folds over itself, as camel-ponte-roma does"
+            "x-cost": "1.1 to 1.2 times the CPU time of null, up to 1.7 times where the cloth folds over itself"
         },
     )
     lamps: dict[CustomName, LampNumbers] = Field(

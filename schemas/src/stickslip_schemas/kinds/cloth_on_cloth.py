@@ -18,6 +18,7 @@ from stickslip_schemas.kinds.cloth.spec import (
     Lighting,
     LightingAxis,
     MaterialAxis,
+    MuAxis,
     Substrate,
     TextureAxis,
     codes,
@@ -32,17 +33,18 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 class ClothOnClothAxes(ClothAxes):
     """What a clip of cloth that is dragged over cloth depends on; `mu` is the friction between the two."""
 
+    mu: MuAxis = Field(description="friction coefficient between the two cloths")
     substrate_material: MaterialAxis = Field(
         description="fabric of the stretched cloth, a measured one, or a custom one under `materials`"
     )
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
         description="camera of the rig, or a custom one under `viewpoints`"
     )
     lighting: LightingAxis | None = Field(
-        default=None, description="which lamps to draw from, or a custom one under `lamps`; by default `drawn`"
+        default=None, description="range of lamps, or a custom one under `lamps`; by default `drawn`"
     )
 
 
@@ -88,7 +90,7 @@ class ClothOnClothSpec(ClothSpec):
     kind: Literal["cloth_on_cloth"]
     axes: ClothOnClothAxes
     self_friction: Float = Field(
-        default=SELF_FRICTION, ge=0, le=10, description="friction coefficient of each of the two with itself"
+        default=SELF_FRICTION, ge=0, le=10, description="friction coefficient of each cloth with itself"
     )
     lamps: dict[CustomName, LampNumbers] = Field(
         default_factory=dict,

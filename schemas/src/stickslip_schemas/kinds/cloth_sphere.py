@@ -13,6 +13,7 @@ from stickslip_schemas.kinds.cloth.spec import (
     ClothSimulation,
     ClothSpec,
     Custom,
+    MuAxis,
     TextureAxis,
 )
 from stickslip_schemas.spec.arrays import NAN, ArrayLayout
@@ -23,7 +24,7 @@ from stickslip_schemas.spec.jobs import SeedRule
 AngularSpeed = Annotated[
     float,
     quantity("AngularSpeed"),
-    Field(strict=True, ge=-20, le=20, description="of the sphere about its vertical axis [rad/s]"),
+    Field(strict=True, ge=-20, le=20, description="angular speed of the sphere about its vertical axis [rad/s]"),
 ]
 AngularSpeedAxis = Annotated[
     ListAxis[AngularSpeed] | LinspaceAxis[AngularSpeed] | RandomAxis[AngularSpeed] | SobolAxis[AngularSpeed],
@@ -49,9 +50,10 @@ ViewpointName = Annotated[CustomName, quantity("SphereViewpoint"), name_schema(S
 class ClothSphereAxes(ClothAxes):
     """What a clip of cloth on a turning sphere depends on."""
 
-    angular_speed: AngularSpeedAxis = Field(description="of the sphere about its vertical axis [rad/s]")
+    mu: MuAxis = Field(description="friction coefficient of the cloth with sphere and floor")
+    angular_speed: AngularSpeedAxis = Field(description="angular speed of the sphere about its vertical axis [rad/s]")
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
         description="camera of the rig, or a custom one under `viewpoints`"

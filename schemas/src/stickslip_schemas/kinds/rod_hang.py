@@ -69,7 +69,7 @@ class RodHangSpec(JobSpec):
     views: Literal["rod-4"] | None = Field(default="rod-4", description="camera rig; null renders nothing")
     quality: Quality = Field(
         default=Quality.standard,
-        description="of the pictures",
+        description="quality of the pictures",
         json_schema_extra={"x-cost": "CPU time of a view: preview 19 ms, draft 31 ms, standard 66 ms, high 240 ms"},
     )
 

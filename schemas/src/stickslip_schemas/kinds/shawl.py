@@ -58,7 +58,7 @@ class ShawlAxes(ClothAxes):
     self_friction: MuAxis = Field(description="friction coefficient of the shawl with itself")
     swing: SwingAxis | None = Field(default=None, description="size of the figure's motion; by default 1")
     texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; those held out are to test with"
+        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
     )
     viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
         description="camera of the rig, or a custom one under `viewpoints`"

@@ -47,31 +47,33 @@ class LampNumbers(_Ranges):
     """
 
     azimuth: tuple[Azimuth, Azimuth] = Field(
-        description="direction of the lamp, seen from the cloth, from +x towards +y [degree], from -180 to 180"
+        description="azimuth of the lamp, seen from the cloth, from +x towards +y [degree], -180 to 180"
     )
     elevation: tuple[Elevation, Elevation] = Field(
-        description="direction of the lamp above the floor [degree], from 5 to 90"
+        description="elevation of the lamp above the floor [degree], 5 to 90"
     )
-    power: tuple[Power, Power] = Field(description="power over the nominal, from 0.05 to 10; `drawn` has 0.8 to 1.25")
+    power: tuple[Power, Power] = Field(description="power over the nominal power, 0.05 to 10; `drawn` has 0.8 to 1.25")
 
 
 class FloorNumbers(_Ranges):
     """A custom floor.
 
-    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation. The image gate says how
-    well a floor can be composed, and clips are rendered directly where it cannot.
+    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation. Clips are
+    rendered directly where the image gate finds that composition is not exact enough.
     """
 
     albedo: tuple[Share, Share] = Field(
-        description="share of the light that it scatters, or that a metal reflects, 0 to 1"
+        description="share of the light that the floor scatters, or reflects if it is a metal, 0 to 1"
     )
-    roughness: tuple[Roughness, Roughness] = Field(description="of its gloss, from 0.01 to 1; 0.02 is a mirror")
-    metallic: Share = Field(default=0.0, description="1 for a metal")
-    specular: Share = Field(default=0.5, description="gloss of what is no metal; 0.5 has an index of refraction of 1.5")
-    grain: Share = Field(default=0.1, description="contrast of its marks; without any, motion over it does not show")
+    roughness: tuple[Roughness, Roughness] = Field(description="roughness of the gloss, 0.01 to 1; 0.02 is a mirror")
+    metallic: Share = Field(default=0.0, description="1 for a metal, 0 for a dielectric")
+    specular: Share = Field(default=0.5, description="gloss of a dielectric; 0.5 is an index of refraction of 1.5")
+    grain: Share = Field(
+        default=0.1, description="contrast of the marks on the floor; at 0, motion over it is invisible"
+    )
     tint: tuple[Tint, Tint, Tint] = Field(
         default=(1.0, 1.0, 1.0),
-        description="its colour, linear red, green and blue, from 0.05 to 1; only their ratios count",
+        description="colour (linear red, green, blue), 0.05 to 1; only ratios count",
     )
 
 
@@ -85,7 +87,9 @@ class Calibration(Document):
     image_size: tuple[Pixels, Pixels] = Field(description="width and height of the calibrated image [px]")
     camera_matrix: tuple[Row, Row, Row] = Field(description="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px]")
     distortion: tuple[Float, ...] = Field(
-        default=(), max_length=14, description="distortion coefficients: all 0, for pictures have no lens distortion"
+        default=(),
+        max_length=14,
+        description="distortion coefficients: all 0, because pictures have no lens distortion",
     )
     rvec: Row = Field(description="rotation from the world to the camera, as a Rodrigues vector [rad]")
     tvec: Row = Field(description="the world's origin in the camera's axes [m]")

@@ -18,9 +18,7 @@ MAX_SAMPLES = 1_000_000
 
 T = TypeVar("T")
 Count = Annotated[int, Strict(), Field(ge=1, le=MAX_SAMPLES), WHOLE]
-Seed = Annotated[
-    int, Strict(), Field(ge=0, lt=2**31, description="seed of all that is drawn at random; 0 is a seed, too"), WHOLE
-]
+Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31, description="seed of all random draws"), WHOLE]
 
 
 class quantity:  # noqa: N801 - reads as an annotation

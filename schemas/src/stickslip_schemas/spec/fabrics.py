@@ -64,7 +64,7 @@ class FabricNumbers(Document):
         default=None,
         description="plate rigidities (along the warp, along the weft, twist) [N m], energy per area H:D:H/2",
     )
-    damping: Float = Field(default=0.0, ge=0, le=10, description="force on a mass over its momentum [1/s]")
+    damping: Float = Field(default=0.0, ge=0, le=10, description="damping force over momentum [1/s]")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

@@ -105,24 +105,22 @@ class JobSpec(Document):
     name: str | None = Field(
         default=None,
         pattern=r"^[a-z0-9][a-z0-9-]{0,62}$",
-        description="a label that you choose for the job; it does not enter any key",
+        description="label of the job; enters no key",
     )
     combine: Literal["product", "zip"] = Field(
         default="product",
-        description="product: every combination of the axes; zip: the axes have one length and go together",
+        description="product: every combination of the axes; zip: axes of equal length, combined entry by entry",
     )
     splits: Splits = Field(
         default=Splits(),
-        description="shares of the simulations in each split; they add up to 1. `by: clip` draws samples instead",
+        description="shares of the simulations in each split, with sum 1; `by: clip` draws samples instead",
     )
     samples_per_shard: Int = Field(
         default=64,
         ge=1,
         le=4096,
-        description="samples in one file of an array",
-        json_schema_extra={
-            "x-cost": "more samples a file: fewer files, and a longer wait for the first file of a grid"
-        },
+        description="samples in one file (shard) of an array",
+        json_schema_extra={"x-cost": "larger: fewer files, and a longer wait for the first"},
     )
     seed: Seed = 0
 

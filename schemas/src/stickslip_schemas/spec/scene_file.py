@@ -173,7 +173,7 @@ class SceneFile(Document):
     duration: Float = Field(gt=0, le=10_000, description="[s]")
     frame_rate: Float = Field(default=30.0, gt=0, le=10_000, description="frames that are kept, a second")
     gravity: Vector = Field(default=(0.0, 0.0, -9.81), description="[m/s^2]")
-    preset: PresetName = Field(default=PresetName.certified, description="named settings of the solver")
+    preset: PresetName = Field(default=PresetName.certified, description="named solver settings")
     materials: dict[CustomName, FabricNumbers] = Field(default_factory=dict, max_length=64)
     sheets: dict[CustomName, Sheet] = Field(min_length=1, max_length=64)
     bodies: dict[CustomName, Body] = Field(default_factory=dict, max_length=64)

@@ -127,9 +127,9 @@ class ClothAxes(Document):
 
     material: MaterialAxis = Field(description="a measured fabric, or a custom one under `materials`")
     mu: MuAxis = Field(description="friction coefficient between cloth and floor")
-    density: FactorAxis | None = Field(default=None, description="factors of the fabric's mass per area")
-    bending: FactorAxis | None = Field(default=None, description="factors of the fabric's rigidity against bending")
-    stretching: FactorAxis | None = Field(default=None, description="factors of the fabric's stiffness in its plane")
+    density: FactorAxis | None = Field(default=None, description="factor of the fabric's mass per area")
+    bending: FactorAxis | None = Field(default=None, description="factor of the fabric's bending rigidity")
+    stretching: FactorAxis | None = Field(default=None, description="factor of the fabric's stretching stiffness")
 
 
 PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
@@ -215,12 +215,12 @@ class ClothSpec(JobSpec):
     )
     preset: PresetName = Field(
         default=PresetName.certified,
-        description="named settings of the solver",
+        description="named solver settings",
         json_schema_extra={"x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"},
     )
     allow_uncertified: Bool = Field(
         default=False,
-        description="make the dataset even where no passing certificate vouches for the preset with the workers' build",
+        description="make the dataset without a passing certificate of the preset",
     )
     mesh: Int = Field(
         default=41,
@@ -239,29 +239,29 @@ class ClothSpec(JobSpec):
     )
     store_positions: Bool = Field(
         default=True,
-        description="keep the positions of all vertices at all instants, beside the clips",
+        description="store the positions of all vertices at all instants",
         json_schema_extra={"x-cost": "1.5 MB a sample at mesh 41"},
     )
     quality: Quality = Field(
         default=Quality.standard,
-        description="of the pictures",
+        description="quality of the pictures",
         json_schema_extra={
             "x-cost": "CPU time of a frame and texture: preview 0.04 s, draft 0.07 s, standard 0.10 s, high 0.33 s"
         },
     )
     ground_truth: tuple[GroundTruth, ...] = Field(
         default=(),
-        description="arrays of what is known of every pixel: depth, segmentation, normals, uv, flow",
+        description="arrays per pixel: any of depth, segmentation, normals, uv, flow",
         json_schema_extra={
             "uniqueItems": True,
-            "x-cost": "all five: 3 % more CPU time of a shading, 3.8 MB a sample of 30 frames",
+            "x-cost": "all five: 3 % more CPU time of rendering, 3.8 MB a sample of 30 frames",
         },
     )
     creases: Float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="strength of the fine creases that the renderer adds; 1 is half a millimetre",
+        description="strength of the fine creases that the renderer adds; 1 is 0.5 mm",
     )
 
     @property
