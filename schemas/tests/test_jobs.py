@@ -10,8 +10,7 @@ import yaml
 from pydantic import ValidationError
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.documents.problems import FieldError, field_errors
-from stickslip_schemas.documents.tasks import PackTask, SimulateTask
-from stickslip_schemas.kinds import KINDS, AnyJobSpec, job_spec_adapter, stored_spec_adapter
+from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
@@ -122,42 +121,20 @@ POINT = {"material": "royal-target", "mu": 0.1, "texture": "dots", "viewpoint": 
 
 
 @pytest.mark.parametrize(("given", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)])
-def test_dragged_cloth_feels_itself_unless_its_spec_says_null(given: dict[str, Any], meant: float | None) -> None:
+def test_dragged_cloth_has_self_contact_unless_its_spec_says_null(given: dict[str, Any], meant: float | None) -> None:
     spec = job_spec_adapter.validate_python(CLOTH | given)
     simulation = spec.simulation(POINT)
     assert isinstance(simulation, ClothDragSimulation)
     assert simulation.self_friction == meant
-    named = {} if meant is None else {"self_friction": meant}
-    assert simulation.model_dump(mode="json", include={"self_friction"}) == named
     assert spec.certified_protocols == (() if meant is None else CONTACT_PROTOCOLS)
-    assert ("feels itself" in spec.cost_group(Stage.simulate, POINT)) == (meant is not None)
-    assert "feels itself" not in spec.cost_group(Stage.render, POINT)
-
-
-@pytest.mark.parametrize("meant", [None, 0.3])
-def test_documents_that_are_older_than_a_field_keep_their_meaning(meant: float | None) -> None:
-    """Cloth of the time before `self_friction` passed through itself: its documents must not take the default."""
-    spec = job_spec_adapter.validate_python(CLOTH | {"self_friction": meant})
-    stored = json.loads(spec.model_dump_json())
-    simulation = json.loads(spec.simulation(POINT).model_dump_json())
-    if meant is None:
-        del stored["self_friction"]
-    assert stored_spec_adapter.validate_python(stored) == spec
-    assert stored_spec_adapter.validate_json(json.dumps(stored)) == spec
-    slot = {"slot": 0, "sample_key": "0" * 64, "split": 0, "labels": {}}
-    assert PackTask.model_validate_json(json.dumps({"spec": stored, "shard": 0, "slots": [slot]})).spec == spec
-    task = SimulateTask.model_validate_json(json.dumps({"simulation": simulation}))
-    assert task.simulation == spec.simulation(POINT)
+    assert ("self-contact" in spec.cost_group(Stage.simulate, POINT)) == (meant is not None)
+    assert "self-contact" not in spec.cost_group(Stage.render, POINT)
 
 
 @pytest.mark.parametrize("document", [None, 3, {}, {"kind": []}, {"kind": "silk_fly"}])
-def test_what_is_no_stored_spec_is_refused(document: Any) -> None:
+def test_a_document_of_no_kind_is_refused(document: Any) -> None:
     with pytest.raises(ValidationError):
-        stored_spec_adapter.validate_python(document)
-
-
-def test_stored_defaults_are_fields() -> None:
-    assert all(set(kind.stored_defaults) <= set(kind.model_fields) for kind in KINDS.values())
+        job_spec_adapter.validate_python(document)
 
 
 def test_too_many_points_in_all_are_refused_without_being_made() -> None:

@@ -1,6 +1,7 @@
 """The page of a dataset: what it says of losses, and that its maps put them where they were."""
 
 import re
+from collections import Counter
 from typing import Any
 
 import pytest
@@ -39,6 +40,7 @@ def manifest(spec: dict[str, Any], lose: Any = lambda _labels: False, message: s
         sample_count=len(members),
         valid_count=len(members) - len(rejections),
         split_counts={"train": len(members) - len(rejections)},
+        rejection_counts=Counter(str(item.reason) for item in rejections),
         rejections=rejections,
         sample_keys=tuple(sample.key for sample in members),
         files=(),

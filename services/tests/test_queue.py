@@ -1,19 +1,17 @@
 """The life of jobs and tasks: leases, fencing, retries, sharing, cancelling."""
 
-import json
 from typing import Any
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Dataset
 from stickslip_schemas.documents.tasks import PackTask, PublishSection, PublishTask, RenderTask
 from stickslip_schemas.documents.worker_api import LeaseRequest
-from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.plan.builds import Builds
 from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
-from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
 from stickslip_services.queue.audit import audit
 from stickslip_services.queue.compose import AnyTask, find_task
@@ -413,24 +411,6 @@ def test_a_waiting_job_of_such_a_kind_fails(coordinator: Coordinator) -> None:
     shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
     assert shown.state is JobState.failed
     assert "no worker makes 'cloth_drag'" in shown.message
-
-
-def test_a_job_that_is_older_than_a_field_of_its_spec_keeps_its_meaning(coordinator: Coordinator) -> None:
-    """Cloth passed through itself before `self_friction` was there, and must go on doing so in jobs of that time."""
-    job = coordinator.submit(parsed(CLOTH | {"self_friction": None}), None)
-    with coordinator.database.write() as connection:
-        stored = json.loads(connection.execute(select(jobs.c.spec)).scalar_one())
-        assert stored.pop("self_friction", 0) is None
-        connection.execute(update(jobs).values(spec=json.dumps(stored)))
-    worker = PretendWorker(coordinator, coordinator.store, kinds=("cloth_drag",)).register()
-    assert show_job(coordinator, job.id).spec.self_friction is None  # type: ignore[union-attr]
-    (lease,) = worker.lease(simulate=1)
-    assert lease.task.simulation.self_friction is None  # type: ignore[union-attr]
-    worker.finish(lease)
-    worker.work()
-    made = show_job(coordinator, job.id).dataset  # type: ignore[union-attr]
-    assert made is not None
-    assert Manifest.model_validate_json(coordinator.store.read(made.manifest)).spec.self_friction is None  # type: ignore[union-attr]
 
 
 def test_one_simulation_serves_all_looks_and_those_that_come_later(coordinator: Coordinator) -> None:

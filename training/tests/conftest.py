@@ -93,7 +93,7 @@ def write_dataset(
             values = arrays[array.name].copy()
             if array.name not in ("valid", "split", "sample_key"):
                 values[~valid] = array.fill
-            _write_array(group, array, values, samples_per_file(array, spec, FORMAT))
+            _write_array(group, array, values, samples_per_file(array, spec))
             arrays[array.name] = values
         zarr.consolidate_metadata(group.store)
     files = sorted(path for path in root.rglob("*") if path.is_file() and path != root / "zarr.json")
@@ -112,6 +112,7 @@ def write_dataset(
         sample_count=len(planned),
         valid_count=int(valid.sum()),
         split_counts={name: int((valid & (arrays["split"] == code)).sum()) for code, name in enumerate(SPLITS)},
+        rejection_counts={Reason.out_of_frame: len(rejected)} if len(rejected) else {},
         rejections=tuple(
             Rejection(
                 slot=slot,

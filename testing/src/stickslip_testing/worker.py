@@ -48,7 +48,7 @@ from stickslip_schemas.format.manifest import (
     with_manifest_digest,
 )
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
@@ -225,7 +225,7 @@ class PretendWorker:
                 columns[array.name].append(bytes(decode_chunk(data[offset : offset + length])))
         for array in labels:
             values = b"".join(columns[array.name])
-            size = samples_per_file(array, task.spec, FORMAT) * array.sample_bytes
+            size = samples_per_file(array, task.spec) * array.sample_bytes
             for number in range(-(-len(values) // size)):
                 data = encode_chunk(values[number * size : (number + 1) * size].ljust(size, b"\0"))
                 yield FileEntry(path=array.shard_path(number), sha256=self.store.publish(data), size=len(data))

@@ -1,4 +1,3 @@
-import json
 import os
 import pickle
 import re
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import zarr
 from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_training.data.errors import (
     CorruptDataError,
     DatasetError,
@@ -45,17 +43,6 @@ def test_rejected_samples_are_skipped_and_cannot_be_read(clips):
         reader.read("video", [9])
     with pytest.raises(RejectedSampleError):
         reader.read("mu", [3])
-
-
-def test_a_dataset_that_is_older_than_contact_of_cloth_with_itself_is_read_as_such(make_clips):
-    made = make_clips(self_friction=None)
-    manifest = json.loads((made.root / MANIFEST_NAME).read_bytes())
-    assert manifest["spec"].pop("self_friction", 0) is None
-    (made.root / MANIFEST_NAME).write_bytes(json.dumps(manifest).encode())
-    made.seal()
-    with DatasetReader(made.root) as reader:
-        assert reader.spec.self_friction is None
-        assert np.array_equal(reader.read("mu", reader.slots()), made.arrays["mu"][reader.slots()])
 
 
 def test_splits_part_the_valid_samples(rods):

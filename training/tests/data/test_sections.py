@@ -133,14 +133,7 @@ def test_sections_must_be_all_there(sectioned):
         DatasetReader(sectioned.root)
 
 
-def test_a_version_of_the_format_before_is_read(make_clips):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stickslip_schemas.spec.arrays.LABEL_SAMPLES", 8)  # a shard group
-        made = make_clips()
-    assert (made.root / "mu/c/1").exists()
-    with pytest.raises(InvalidDatasetError, match="chunk_grid"):
-        DatasetReader(made.root)
-    made.edit_manifest(format="stickslip-dataset/1", rejection_counts={})
-    with DatasetReader(made.root, verify=True) as reader:
-        for name in ("mu", "valid", "video", "bias"):
-            assert np.array_equal(reader.read(name, reader.slots()), made.arrays[name])
+def test_a_version_of_an_older_format_is_refused(sectioned):
+    sectioned.edit_manifest(format="stickslip-dataset/2")
+    with pytest.raises(InvalidDatasetError, match=r"stickslip-dataset/3"):
+        DatasetReader(sectioned.root)

@@ -9,7 +9,7 @@ from pydantic import Field
 from stickslip_schemas.base.document import Document, Int
 from stickslip_schemas.base.keys import ArtifactRef, Sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.kinds import StoredJobSpec
+from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds
 
 T = TypeVar("T")
@@ -77,13 +77,13 @@ class Job(Document):
 class JobDetail(Job):
     """A job with what was asked for."""
 
-    spec: StoredJobSpec
+    spec: AnyJobSpec
 
 
 class Validation(Document):
     """What a job would be, without making one. `refusal` says why it would be refused now; null: it would not."""
 
-    spec: StoredJobSpec
+    spec: AnyJobSpec
     spec_digest: Sha256
     sample_count: int
     simulation_count: int = Field(description="different simulations; samples that differ in their look share one")

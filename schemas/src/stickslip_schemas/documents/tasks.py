@@ -10,7 +10,7 @@ from stickslip_schemas.base.document import Bool, Document, Float, Int
 from stickslip_schemas.base.keys import Sha256, referred
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.format.manifest import FileEntry, ManifestSection, Rejection
-from stickslip_schemas.kinds import AnyRender, AnySimulation, StoredJobSpec
+from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.plan.builds import Builds
 
 # --- where bytes are ------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ class PackTask(Document):
     """Make the files of shard `shard` of every array."""
 
     stage: Literal["pack"] = "pack"
-    spec: StoredJobSpec
+    spec: AnyJobSpec
     shard: Int = Field(ge=0)
     slots: tuple[PackSlot, ...] = Field(min_length=1)
 
@@ -127,7 +127,7 @@ class PublishTask(Document):
     """Write the metadata and the manifest of a dataset version; its result is the commit."""
 
     stage: Literal["publish"] = "publish"
-    spec: StoredJobSpec
+    spec: AnyJobSpec
     dataset: str
     version: Int = Field(ge=1)
     builds: Builds

@@ -2,7 +2,7 @@
 
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.spec import arrays
-from stickslip_schemas.spec.arrays import COMMON_ARRAYS, FORMAT_1, ArrayLayout
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 
@@ -11,9 +11,9 @@ def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
     return (*registered(spec).arrays(), *COMMON_ARRAYS)
 
 
-def samples_per_file(array: ArrayLayout, spec: JobSpec, dataset_format: str) -> int:
-    """Return how many consecutive samples a file of an array holds, but the last one."""
-    if array.is_label and dataset_format != FORMAT_1:
+def samples_per_file(array: ArrayLayout, spec: JobSpec) -> int:
+    """Return the number of consecutive samples in every file of an array except the last."""
+    if array.is_label:
         most = max(arrays.LEAST_LABEL_SAMPLES, arrays.LABEL_CHUNK_BYTES // array.sample_bytes)
         return min(most, arrays.LABEL_SAMPLES, spec.sample_count)
     return spec.samples_per_shard

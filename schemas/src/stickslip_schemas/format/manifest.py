@@ -19,9 +19,9 @@ from stickslip_schemas.base.document import Document, Int
 from stickslip_schemas.base.keys import Sha256, sha256
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.format.layout import samples_per_file
-from stickslip_schemas.kinds import StoredJobSpec
+from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.spec.jobs import JobSpec, Quality
 
@@ -122,10 +122,10 @@ class Pictures(Document):
 class Manifest(Document):
     """Everything about a version that is not in its arrays. A version exists when its manifest is committed."""
 
-    format: Literal["stickslip-dataset/1", "stickslip-dataset/2"] = "stickslip-dataset/2"
+    format: Literal["stickslip-dataset/3"] = FORMAT
     dataset: str
     version: int = Field(ge=1)
-    spec: StoredJobSpec
+    spec: AnyJobSpec
     spec_digest: Sha256
     builds: Builds
     certificate: Sha256 | None = Field(
@@ -138,7 +138,7 @@ class Manifest(Document):
     sample_count: int = Field(ge=1, description="slots, the rejected ones included")
     valid_count: int = Field(ge=0)
     split_counts: dict[str, int] = Field(description="valid samples by split")
-    rejection_counts: dict[str, int] = Field(default_factory=dict, description="rejected samples by reason")
+    rejection_counts: dict[str, int] = Field(description="rejected samples by reason")
     sections: tuple[FileEntry, ...] = Field(
         default=(),
         description="files that list samples and the files of their shards, by slot; none in a small version",
@@ -163,8 +163,8 @@ class Manifest(Document):
         return self
 
     def samples_per_file(self, array: ArrayLayout) -> int:
-        """Return how many consecutive samples a file of an array of this version holds, but the last one."""
-        return samples_per_file(array, self.spec, self.format)
+        """Return the number of consecutive samples in every file of an array except the last."""
+        return samples_per_file(array, self.spec)
 
     @property
     def acceptance_rate(self) -> float:

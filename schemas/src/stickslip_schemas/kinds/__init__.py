@@ -3,9 +3,9 @@
 To add a kind, import its module and add its classes to the table and to the three unions.
 """
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothRender, ClothOnClothSimulation, ClothOnClothSpec
@@ -37,20 +37,7 @@ AnyRender = Annotated[
 ]
 
 job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
-"""Validates and dumps the spec of any kind, as a user writes it."""
-
-
-def _with_stored_defaults(document: Any) -> Any:
-    """Return a stored spec with the fields that it is older than, as far as they do not have their defaults in it."""
-    name = document.get("kind") if isinstance(document, dict) else None
-    kind = KINDS.get(name) if isinstance(name, str) else None
-    return document if kind is None else {**kind.stored_defaults, **document}
-
-
-StoredJobSpec = Annotated[AnyJobSpec, BeforeValidator(_with_stored_defaults)]
-"""A spec from a database, a manifest or an answer. It may be older than a field, and must not take its default then."""
-stored_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(StoredJobSpec)
-"""Validates the stored spec of any kind."""
+"""Validates and dumps the spec of any kind."""
 
 
 class UnknownKindError(ValueError):

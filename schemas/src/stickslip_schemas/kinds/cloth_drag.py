@@ -1,7 +1,7 @@
 """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -51,8 +51,7 @@ class ClothDragSimulation(ClothSimulation):
     """The trajectory of a dragged cloth: all that it depends on besides the build."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
-    # Left out where it is null: keys and splits are then those of documents that are older than the field.
-    self_friction: float | None = Field(default=None, exclude_if=lambda value: value is None)
+    self_friction: float | None = Field(description="null: the cloth passes through itself")
 
 
 class ClothDragRender(ClothRender):
@@ -71,7 +70,6 @@ class ClothDragSpec(ClothSpec):
         SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint", "lighting", "substrate")),
         SeedRule("crease_seed", "creases", PHYSICAL_AXES),
     )
-    stored_defaults: ClassVar[Mapping[str, Any]] = {"self_friction": None}
     instants = 300
     instants_per_second = 2.4
     rig = "drag"
@@ -107,13 +105,13 @@ class ClothDragSpec(ClothSpec):
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
-        """Those of contact, where the cloth feels itself."""
+        """Return the protocols of contact where self-contact is on."""
         return () if self.self_friction is None else CONTACT_PROTOCOLS
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on; cloth that feels itself costs more."""
+        """Return the group of samples of similar cost; self-contact raises the cost of a simulation."""
         group = super().cost_group(stage, point)
-        return f"{group}, feels itself" if stage is Stage.simulate and self.self_friction is not None else group
+        return f"{group}, self-contact" if stage is Stage.simulate and self.self_friction is not None else group
 
     def simulation_settings(self) -> dict[str, Any]:
         """Return the fields of the simulation document that are the same for all samples."""

@@ -7,13 +7,11 @@ those of clips and trajectories: see `stickslip_schemas.format.codecs`.
 
 from dataclasses import dataclass, field, fields
 from math import prod
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-FORMAT = "stickslip-dataset/2"
-FORMAT_1 = "stickslip-dataset/1"
-"""The format before: labels were one chunk per shard group, and a manifest had no sections."""
+FORMAT: Literal["stickslip-dataset/3"] = "stickslip-dataset/3"
 
 LABEL_SAMPLES = 65_536
 """Samples in a chunk of a label: a million samples have 16 files of each label."""

@@ -98,8 +98,6 @@ class JobSpec(Document):
     render_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     variant_axis: ClassVar[str | None] = None
     """The axis whose values differ between renders that can be made together, if there is one."""
-    stored_defaults: ClassVar[Mapping[str, Any]] = {}
-    """By field: its value in a stored spec that is older than the field, where that is not the field's default."""
 
     kind: str
     name: str | None = Field(

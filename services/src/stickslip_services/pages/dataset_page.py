@@ -68,7 +68,7 @@ def _facts(contents: Contents) -> str:
 def _losses(manifest: Manifest) -> str:
     if manifest.valid_count == manifest.sample_count:
         return "<p>No sample was rejected.</p>"
-    reasons = Counter(manifest.rejection_counts or Counter(str(item.reason) for item in manifest.rejections))
+    reasons = Counter(manifest.rejection_counts)
     rows = "".join(
         f"<tr><td>{escape(reason)}</td><td>{count:,}</td><td>{count / manifest.sample_count:.2%}</td></tr>"
         for reason, count in reasons.most_common()

@@ -10,7 +10,7 @@ from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
 from stickslip_schemas.format.manifest import section_samples
-from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import dataset_id
 from stickslip_schemas.spec.jobs import JobSpec
@@ -242,4 +242,4 @@ def reserve_version(connection: Connection, task: StoredTask) -> None:
 
 def _job_spec(connection: Connection, job: int) -> tuple[Any, Builds]:
     row = connection.execute(select(jobs.c.spec, jobs.c.builds).where(jobs.c.seq == job)).one()
-    return stored_spec_adapter.validate_json(row.spec), Builds.model_validate_json(row.builds)
+    return job_spec_adapter.validate_json(row.spec), Builds.model_validate_json(row.builds)

@@ -27,7 +27,7 @@ from stickslip_schemas.documents.worker_api import (
     WorkerRegistration,
     WorkerSession,
 )
-from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store, is_unavailable, open_store
 
@@ -473,7 +473,7 @@ class Coordinator:
         with self.database.read() as connection:
             waiting = unplanned_jobs(connection)
         for row in waiting:
-            spec = stored_spec_adapter.validate_json(row.spec)
+            spec = job_spec_adapter.validate_json(row.spec)
             with self.database.read() as connection:
                 terms: Terms | None = None
                 refusal, reason = "", Reason.waiting_for_worker

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
-from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.clock import as_datetime
@@ -199,7 +199,7 @@ def show_job(
     """Return a job with its spec."""
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
     return JobDetail(
-        **dict(_shown(connection, [row], workers, frames)[0]), spec=stored_spec_adapter.validate_json(row.spec)
+        **dict(_shown(connection, [row], workers, frames)[0]), spec=job_spec_adapter.validate_json(row.spec)
     )
 
 

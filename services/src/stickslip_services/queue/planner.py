@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas import tracing
 from stickslip_schemas.base.states import JobState, Stage
-from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.clock import Clock
@@ -109,7 +109,7 @@ class Planner:
         terms = Terms(Builds.model_validate_json(row.builds), row.certificate)
         self._job, self._end = row.seq, row.planned
         return pieces(
-            stored_spec_adapter.validate_json(row.spec),
+            job_spec_adapter.validate_json(row.spec),
             terms,
             size=self._settings.plan_samples,
             previews=self._settings.previews_per_job,

@@ -4,7 +4,7 @@ from sqlalchemy import Connection, func, select
 from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.documents.responses import Validation
 from stickslip_schemas.format.layout import bytes_estimate
-from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.counting import count
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -75,4 +75,4 @@ def _compression(connection: Connection, kind: str) -> float | None:
         .order_by(dataset_versions.c.created_at.desc())
         .limit(1)
     ).one_or_none()
-    return None if row is None else row.bytes / bytes_estimate(stored_spec_adapter.validate_json(row.spec))
+    return None if row is None else row.bytes / bytes_estimate(job_spec_adapter.validate_json(row.spec))

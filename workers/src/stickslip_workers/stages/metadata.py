@@ -28,7 +28,7 @@ def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: i
         },
     )
     for array in layout(spec):
-        create_array(group, array, sample_count=sample_count, samples_per_file=samples_per_file(array, spec, FORMAT))
+        create_array(group, array, sample_count=sample_count, samples_per_file=samples_per_file(array, spec))
     with warnings.catch_warnings():
         # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs #383].
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)

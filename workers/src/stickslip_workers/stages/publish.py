@@ -27,7 +27,7 @@ from stickslip_schemas.format.manifest import (
     with_manifest_digest,
 )
 from stickslip_schemas.plan.points import dataset_id
-from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.jobs import SPLITS
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 
@@ -145,13 +145,13 @@ class _Labels:
         numbers = [
             (array, number)
             for array in self.arrays
-            for number in range(-(-self.count // samples_per_file(array, self._spec, FORMAT)))
+            for number in range(-(-self.count // samples_per_file(array, self._spec)))
         ]
         return in_parallel(self._file, numbers)
 
     def _file(self, which: tuple[ArrayLayout, int]) -> FileEntry:
         array, number = which
-        size = samples_per_file(array, self._spec, FORMAT)
+        size = samples_per_file(array, self._spec)
         chunk = np.full((size, *array.shape), array.fill, array.dtype)  # a chunk is always whole
         values = self._columns[array.name][number * size : (number + 1) * size]
         chunk[: len(values)] = values

@@ -16,7 +16,7 @@ from sqlalchemy import Connection
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, JobDetail
-from stickslip_schemas.kinds import stored_spec_adapter
+from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.points import grid
 from stickslip_schemas.spec.jobs import SPLITS, JobSpec
 from stickslip_schemas.store import Store
@@ -146,7 +146,7 @@ def get_job_map(job_id: str, coordinator: CoordinatorDep) -> Response:
     """Show the grid of a job as maps that fill."""
     with coordinator.database.read() as connection:
         row = find_job(connection, job_id)
-        spec = stored_spec_adapter.validate_json(row.spec)
+        spec = job_spec_adapter.validate_json(row.spec)
         if spec.sample_count > MOST_SAMPLES:
             return _page("map.html", maps=None, count=spec.sample_count)
         samples = list_samples(connection, row.seq, PageRequest(MOST_SAMPLES, None), None).items
@@ -160,7 +160,7 @@ def change_job(job_id: str, verb: str, coordinator: CoordinatorDep) -> Response:
     """Pause, resume or cancel a job, or submit its spec again; answer with where to go."""
     if verb == "resubmit":
         with coordinator.database.read() as connection:
-            spec = stored_spec_adapter.validate_json(find_job(connection, job_id).spec)
+            spec = job_spec_adapter.validate_json(find_job(connection, job_id).spec)
         made = coordinator.submit(spec, None)
         assert isinstance(made, JobDetail)  # there is no key, and so no replay
         job_id = made.id
