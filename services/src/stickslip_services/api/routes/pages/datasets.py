@@ -1,0 +1,160 @@
+"""Pages of datasets: the list, one version, and its samples."""
+
+import json
+from functools import lru_cache
+from io import BytesIO
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import RedirectResponse
+from PIL import Image
+from stickslip_schemas.documents.responses import Dataset, DatasetVersion
+from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.store import Store
+
+from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page
+from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
+from stickslip_services.database.paging import PageRequest
+from stickslip_services.errors import NotFoundError
+from stickslip_services.pages.browsing import histograms, sample_view, sliders, thumbs
+from stickslip_services.pages.sample_data import SampleData
+from stickslip_services.queue.coordinator import Coordinator
+
+router = APIRouter()
+
+Version = Annotated[int, Path(ge=1, lt=2**31)]
+
+
+@router.get("/datasets")
+def get_datasets(coordinator: CoordinatorDep) -> Response:
+    """Show the datasets."""
+    with coordinator.database.read() as connection:
+        datasets = list_datasets(connection, PageRequest(100, None)).items
+    return html_page("datasets.html", here="datasets", datasets=datasets)
+
+
+@router.get("/datasets/{dataset}")
+def get_dataset(dataset: str, coordinator: CoordinatorDep) -> Response:
+    """Go to the newest version of a dataset."""
+    with coordinator.database.read() as connection:
+        versions = find_dataset(connection, dataset).versions
+    if not versions:
+        raise NotFoundError(f"dataset {dataset} has no version yet")
+    return RedirectResponse(f"/datasets/{dataset}/v{versions[-1].version}")
+
+
+@router.get("/datasets/{dataset}/v{version}")
+def get_version(request: Request, dataset: str, version: Version, coordinator: CoordinatorDep) -> Response:
+    """Show a version."""
+    found, committed, data = _open(coordinator, dataset, version)
+    context = thumbs(data, request.query_params, 0)
+    return html_page(
+        "dataset.html",
+        here="datasets",
+        dataset=found,
+        version=committed,
+        manifest=data.manifest,
+        sliders=sliders(data.manifest.spec),
+        histograms=histograms(data),
+        splits=SPLITS,
+        file_count=None if data.manifest.sections else len(data.manifest.files) + 3,
+        card=_listed(data, "README.md"),
+        picture=_listed(data, "preview.webp"),
+        url=coordinator.settings.url,
+        **context,
+    )
+
+
+def _listed(data: SampleData, path: str) -> str | None:
+    """Return the path of a file of a version, None where it has none of that name."""
+    return None if data.contents.file(path) is None else path
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/thumbs")
+def get_thumbs(
+    request: Request,
+    dataset: str,
+    version: Version,
+    coordinator: CoordinatorDep,
+    start: Annotated[int, Query(ge=0, lt=2**31)] = 0,
+) -> Response:
+    """Show the samples that the sliders leave."""
+    found, committed, data = _open(coordinator, dataset, version)
+    return html_page("thumbs.html", dataset=found, version=committed, **thumbs(data, request.query_params, start))
+
+
+def _open(coordinator: Coordinator, dataset: str, version: int) -> tuple[Dataset, DatasetVersion, SampleData]:
+    with coordinator.database.read() as connection:
+        found, committed = find_dataset(connection, dataset), find_version(connection, dataset, version)
+    return found, committed, _sample_data(coordinator.store, committed.manifest)
+
+
+@lru_cache(maxsize=8)
+def _sample_data(store: Store, manifest: str) -> SampleData:
+    return SampleData(store, read_contents(store, manifest))
+
+
+@router.get("/datasets/{dataset}/v{version}/samples/{slot}")
+def get_sample(dataset: str, version: Version, slot: int, coordinator: CoordinatorDep) -> Response:
+    """Show a sample: its pictures, curves, shape and labels."""
+    found, committed, data = _open(coordinator, dataset, version)
+    manifest = data.manifest
+    if not 0 <= slot < manifest.sample_count:
+        raise NotFoundError(f"version {version} of {dataset} has slots 0 to {manifest.sample_count - 1}, not {slot}")
+    rejection = data.rejection(slot)
+    return html_page(
+        "sample.html",
+        here="datasets",
+        dataset=found,
+        version=committed,
+        slot=slot,
+        last_slot=manifest.sample_count - 1,
+        rejection=rejection,
+        **({"pictures": [], "plots": [], "shapes": [], "labels": {}} if rejection else sample_view(data, slot)),
+    )
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")
+def get_picture(
+    dataset: str,
+    version: Version,
+    slot: Annotated[int, Path(ge=0)],
+    array: str,
+    index: Annotated[int, Path(ge=0)],
+    coordinator: CoordinatorDep,
+    step: Annotated[int, Query(ge=1, le=8)] = 1,
+) -> Response:
+    """Return one picture of a sample; with `step`, every so many pixels."""
+    _, _, data = _open(coordinator, dataset, version)
+    values = _value(data, array, slot)
+    if values.ndim != 4 or index >= len(values):
+        raise NotFoundError(f"{array} has no picture {index}")
+    content = BytesIO()
+    Image.fromarray(np.ascontiguousarray(values[index][::step, ::step])).save(content, "PNG")
+    return Response(content.getvalue(), media_type="image/png", headers={"Cache-Control": "private, max-age=86400"})
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.json")
+def get_values(
+    dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, coordinator: CoordinatorDep
+) -> Response:
+    """Return the points of a shape by step, (step, point, xyz), and the triangles where there are any."""
+    _, _, data = _open(coordinator, dataset, version)
+    values = np.asarray(_value(data, array, slot), dtype=np.float32)
+    steps = values if values.ndim == 3 else values[None]
+    chosen = np.linspace(0, len(steps) - 1, min(len(steps), 60)).astype(int)
+    document: dict[str, Any] = {"points": np.round(steps[chosen], 4).tolist(), "steps": chosen.tolist()}
+    triangles = next((name for name, other in data.arrays.items() if "triangle" in other.dimensions), None)
+    if triangles is not None and data.arrays[array].dimensions[-2] == "vertex":
+        document["triangles"] = data.read(triangles, slot).tolist()
+    return Response(json.dumps(document), media_type="application/json")
+
+
+def _value(data: SampleData, array: str, slot: int) -> Any:
+    if array not in data.arrays or slot >= data.manifest.sample_count:
+        raise NotFoundError(f"the dataset has no {array[:50]!r} of sample {slot}")
+    try:
+        return data.read(array, slot)
+    except KeyError as error:
+        raise NotFoundError(f"sample {slot} has no {array[:50]!r}") from error

@@ -1,0 +1,157 @@
+"""Pages of jobs: the list, one job, the map of its grid, and its buttons."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import yaml
+from fastapi import APIRouter, Response
+from fastapi.responses import StreamingResponse
+from sqlalchemy import Connection
+from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.documents.responses import JobDetail
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.spec.jobs import JobSpec
+
+from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page
+from stickslip_services.database.paging import PageRequest
+from stickslip_services.errors import NotFoundError
+from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.jobs import (
+    find_job,
+    list_jobs,
+    list_samples,
+    newest_previews,
+    stage_durations,
+)
+from stickslip_services.queue.retrying import failed_tasks
+
+router = APIRouter()
+
+SHOWN_JOBS = 30
+
+SHOWN_LOST = 50
+
+CHANGE_SECONDS = 1.0
+"""A page is told of changes at most so often [s]."""
+
+
+@router.get("/")
+def get_jobs(coordinator: CoordinatorDep) -> Response:
+    """Show the jobs."""
+    return html_page("jobs.html", here="jobs", url=coordinator.settings.url, **_jobs(coordinator))
+
+
+@router.get("/ui/jobs")
+def get_jobs_part(coordinator: CoordinatorDep) -> Response:
+    """Show the list of jobs alone."""
+    return html_page("jobs_list.html", **_jobs(coordinator))
+
+
+def _jobs(coordinator: Coordinator) -> dict[str, Any]:
+    with coordinator.database.read() as connection:
+        workers = coordinator.alive_workers(connection)
+        jobs = list_jobs(connection, PageRequest(SHOWN_JOBS, None), workers).items
+        pictures = {job.id: newest_previews(connection, find_job(connection, job.id).seq, 5) for job in jobs[:10]}
+    return {"jobs": jobs, "pictures": pictures, "workers": len(workers), "states": JobState}
+
+
+@router.get("/jobs/{job_id}")
+def get_job(job_id: str, coordinator: CoordinatorDep) -> Response:
+    """Show a job."""
+    with coordinator.database.read() as connection:
+        context = _job(coordinator, connection, job_id)
+    spec: JobSpec = context["job"].spec
+    document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
+    document["axes"] = {name: _short_form(axis) for name, axis in document["axes"].items()}
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return html_page("job.html", here="jobs", spec=text, **context)
+
+
+def _short_form(axis: dict[str, Any]) -> Any:
+    """Return an axis as people write it: a list, or its only value."""
+    if axis["type"] != "list":
+        return axis
+    return axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
+
+
+@router.get("/ui/jobs/{job_id}")
+def get_job_part(job_id: str, coordinator: CoordinatorDep) -> Response:
+    """Show what changes of a job."""
+    with coordinator.database.read() as connection:
+        return html_page("job_state.html", **_job(coordinator, connection, job_id))
+
+
+def _job(coordinator: Coordinator, connection: Connection, job_id: str) -> dict[str, Any]:
+    seq = int(find_job(connection, job_id).seq)
+    job: JobDetail = coordinator.show(connection, seq)
+    rejected = list_samples(connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected).items
+    return {
+        "job": job,
+        "durations": stage_durations(connection, seq),
+        "elapsed": _elapsed(job, coordinator),
+        "previews": newest_previews(connection, seq, 24),
+        "rejected": rejected,
+        "failed": failed_tasks(connection, seq, coordinator.settings, SHOWN_LOST),
+        "states": JobState,
+        "url": coordinator.settings.url,
+    }
+
+
+def _elapsed(job: JobDetail, coordinator: Coordinator) -> float | None:
+    if job.started_at is None:
+        return None
+    end = coordinator.clock() if job.finished_at is None else job.finished_at.timestamp()
+    return end - job.started_at.timestamp()
+
+
+@router.get("/ui/jobs/{job_id}/map")
+def get_job_map(job_id: str, coordinator: CoordinatorDep) -> Response:
+    """Show the grid of a job as maps that fill."""
+    with coordinator.database.read() as connection:
+        row = find_job(connection, job_id)
+        spec = job_spec_adapter.validate_json(row.spec)
+        if spec.sample_count > MOST_SAMPLES:
+            return html_page("map.html", maps=None, count=spec.sample_count)
+        samples = list_samples(connection, row.seq, PageRequest(MOST_SAMPLES, None), None).items
+    if len(samples) < spec.sample_count:
+        return html_page("map.html", maps=[], count=spec.sample_count)
+    return html_page(
+        "map.html", maps=grid_maps(spec, [sample.state for sample in samples], most=3), count=spec.sample_count
+    )
+
+
+@router.post("/ui/jobs/{job_id}/{verb}")
+def change_job(job_id: str, verb: str, coordinator: CoordinatorDep) -> Response:
+    """Pause, resume or cancel a job, or submit its spec again; answer with where to go."""
+    if verb == "resubmit":
+        with coordinator.database.read() as connection:
+            spec = job_spec_adapter.validate_json(find_job(connection, job_id).spec)
+        made = coordinator.submit(spec, None)
+        assert isinstance(made, JobDetail)  # there is no key, and so no replay
+        job_id = made.id
+    elif verb in ("pause", "resume", "cancel"):
+        {"pause": coordinator.pause, "resume": coordinator.resume, "cancel": coordinator.cancel}[verb](job_id)
+    else:
+        raise NotFoundError(f"a job has no verb {verb[:50]!r}")
+    return Response(status_code=204, headers={"HX-Redirect": f"/jobs/{job_id}"})
+
+
+@router.get("/ui/changes")
+def get_changes(coordinator: CoordinatorDep) -> StreamingResponse:
+    """Tell a page that something has changed, at most once a second; nothing is read for it."""
+    return StreamingResponse(
+        _changes(coordinator), headers={"Cache-Control": "no-store"}, media_type="text/event-stream"
+    )
+
+
+async def _changes(coordinator: Coordinator) -> AsyncIterator[bytes]:
+    yield b"retry: 2000\n\n"
+    told = -1  # the first message comes at once: something may have changed since the page was made
+    while True:
+        await coordinator.bell.wait(told, 15.0)
+        rung = coordinator.bell.rung
+        yield b": still here\n\n" if rung == told else b"event: change\ndata: {}\n\n"
+        told = rung
+        await asyncio.sleep(CHANGE_SECONDS)

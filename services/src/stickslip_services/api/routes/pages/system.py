@@ -1,0 +1,104 @@
+"""Pages of certificates, of workers, and of the HTTP interface."""
+
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from sqlalchemy import Connection
+from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
+
+from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page
+from stickslip_services.catalog.certificates import find_certificate, list_certificates
+from stickslip_services.clock import as_datetime
+from stickslip_services.database.paging import PageRequest
+from stickslip_services.pages.plots import line_plot
+from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.workers import show_workers
+
+router = APIRouter()
+
+
+@router.get("/certificates")
+def get_certificates(coordinator: CoordinatorDep) -> Response:
+    """Show the certificates."""
+    with coordinator.database.read() as connection:
+        entries = list_certificates(connection, PageRequest(200, None)).items
+        builds = _builds(coordinator, connection)
+    return html_page("certificates.html", here="certificates", entries=entries, builds=builds)
+
+
+@router.get("/certificates/{digest}")
+def get_certificate(digest: str, coordinator: CoordinatorDep) -> Response:
+    """Show a certificate: a row for each protocol."""
+    with coordinator.database.read() as connection:
+        stored = find_certificate(connection, digest)
+        builds = _builds(coordinator, connection)
+    certificate = Certificate.model_validate_json(coordinator.store.read(stored.artifact))
+    plots = {protocol.protocol: list(_curves(protocol)) for protocol in certificate.protocols}
+    return html_page(
+        "certificate.html", here="certificates", certificate=certificate, digest=digest, builds=builds, plots=plots
+    )
+
+
+def _builds(coordinator: Coordinator, connection: Connection) -> set[str]:
+    return {builds.sim_core for worker in coordinator.alive_workers(connection) for builds in worker.builds.values()}
+
+
+def _curves(protocol: ProtocolReport) -> Iterator[str]:
+    for curve in protocol.curves[:6]:
+        dense = curve.dense_x, curve.dense_master
+        line = dense if curve.dense_x else (curve.x, curve.master)  # of a certificate without dense curves
+        name = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
+        yield line_plot(
+            {"master curve": _known(*line)},
+            dots={"measured": _known(curve.x, curve.measured)},
+            x_name=protocol.x,
+            y_name=f"{protocol.y}{f' ({name})' if name else ''}",
+            is_log=True,
+        )
+
+
+def _known(x: Numbers, y: Numbers) -> list[tuple[float, float]]:
+    return sorted((a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None)
+
+
+@router.get("/workers")
+def get_workers(coordinator: CoordinatorDep) -> Response:
+    """Show the workers."""
+    return html_page("workers.html", here="workers", **_workers(coordinator))
+
+
+@router.get("/ui/workers")
+def get_workers_part(coordinator: CoordinatorDep) -> Response:
+    """Show the list of workers alone."""
+    return html_page("workers_list.html", **_workers(coordinator))
+
+
+def _workers(coordinator: Coordinator) -> dict[str, Any]:
+    with coordinator.database.read() as connection:
+        workers = show_workers(connection, alive_since=coordinator.alive_since, frames=coordinator.frames)
+        certified = {
+            entry.sim_core: entry
+            for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
+            if entry.extent == "full" and entry.passed
+        }
+    disk = coordinator.store.room()
+    now = as_datetime(coordinator.clock())
+    return {"workers": workers, "certified": certified, "disk": disk, "memory": _memory(), "now": now}
+
+
+def _memory() -> dict[str, int] | None:
+    """Return bytes of memory of this machine, `MemTotal` and `MemAvailable`; None where Linux does not tell."""
+    try:
+        lines = [line.split() for line in pathlib.Path("/proc/meminfo").read_text().splitlines()]
+    except OSError:
+        return None
+    told = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
+    return told if {"MemTotal", "MemAvailable"} <= told.keys() else None
+
+
+@router.get("/docs")
+def get_docs(request: Request) -> Response:
+    """Show the interface; everything that it needs is here."""
+    return html_page("docs.html", here="docs", api=request.app.openapi())

@@ -1,0 +1,116 @@
+"""Contents of the pages of a dataset version: the chosen samples, the distributions of labels, and one sample."""
+
+from collections.abc import Mapping
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from stickslip_schemas.plan.points import grid
+from stickslip_schemas.spec.jobs import JobSpec
+
+from stickslip_services.pages.grid_map import MOST_SAMPLES
+from stickslip_services.pages.plots import line_plot
+from stickslip_services.pages.sample_data import SampleData
+
+SHOWN_THUMBS = 48
+
+
+def sliders(spec: JobSpec) -> list[dict[str, Any]]:
+    """Return the axes with more than one value: their names and, by place, their values."""
+    columns: dict[str, set[Any]] = {name: set() for name in spec.named_axes}
+    for point in islice(grid(spec), MOST_SAMPLES):
+        for name, value in point.items():
+            columns[name].add(value)
+    return [{"name": name, "values": sorted(values)} for name, values in columns.items() if len(values) > 1]
+
+
+def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, Any]:
+    """Return the samples whose axes lie between the sliders (`NAME.from`, `NAME.to`: places among the values)."""
+    wanted: dict[str, set[Any]] = {}
+    for axis in sliders(data.manifest.spec):
+        values = axis["values"]
+        places = [query.get(f"{axis['name']}.{end}", "") for end in ("from", "to")]
+        first, last = (int(place) if place.isdecimal() and len(place) < 9 else None for place in places)
+        wanted[axis["name"]] = set(values[first or 0 : len(values) if last is None else last + 1])
+    lost = data.rejections(MOST_SAMPLES)
+    chosen = [
+        (slot, point)
+        for slot, point in enumerate(islice(grid(data.manifest.spec), MOST_SAMPLES))
+        if all(point[name] in values for name, values in wanted.items())
+    ]
+    shown = chosen[start : start + SHOWN_THUMBS]
+    keep = {name: value for name, value in query.items() if name != "start"}
+    return {
+        "thumbs": [(slot, point, lost.get(slot)) for slot, point in shown],
+        "chosen": len(chosen),
+        "next_start": start + SHOWN_THUMBS if start + SHOWN_THUMBS < len(chosen) else None,
+        "kept_query": keep,
+        "varying": {axis["name"] for axis in sliders(data.manifest.spec)},
+        "pictured": _pictured(data),
+        "picture_index": _telling_picture(data),
+    }
+
+
+def _pictured(data: SampleData) -> str | None:
+    """Return the array that holds pictures."""
+    return next((name for name, array in data.arrays.items() if array.dimensions[-3:] == ("y", "x", "rgb")), None)
+
+
+def _telling_picture(data: SampleData) -> int:
+    """Return which picture stands for a sample: the middle of a clip, the first of several views."""
+    name = _pictured(data)
+    array = None if name is None else data.arrays[name]
+    return array.shape[0] // 2 if array is not None and array.dimensions[0] == "frame" else 0
+
+
+def histograms(data: SampleData) -> list[dict[str, Any]]:
+    """Return the distributions of the labels that are not axes, over the valid samples."""
+    valid = data.label("valid").astype(bool)
+    shown = []
+    for name, array in data.arrays.items():
+        is_axis = name in data.manifest.spec.named_axes
+        is_number = not (array.dtype == "bool" or name in ("split", "valid") or name.endswith("_seed"))
+        if array.shape or is_axis or array.per_sample or not is_number:
+            continue
+        values = np.asarray(data.label(name), dtype=float)
+        values = values[np.isfinite(values) & valid]
+        if array.categories or values.size < 2 or values.min() == values.max():
+            continue
+        counts, bounds = np.histogram(values, bins=min(20, max(5, values.size // 4)))
+        top = max(int(counts.max()), 1)
+        bars = [(int(count), 100 * count / top, bounds[i], bounds[i + 1]) for i, count in enumerate(counts)]
+        shown.append({"name": name, "text": array.description, "bars": bars})
+    return shown
+
+
+def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
+    pictures, plots, shapes = [], [], []
+    labels: dict[str, tuple[object, str]] = {}
+    for name, array in data.arrays.items():
+        dimensions = array.dimensions
+        if dimensions[-3:] == ("y", "x", "rgb"):
+            pictures.append({"name": name, "count": array.shape[0], "is_clip": dimensions[0] == "frame"})
+        elif dimensions[-1:] == ("xyz",) and len(array.shape) in (2, 3) and dimensions[-2] in ("point", "vertex"):
+            shapes.append({"name": name, "steps": array.shape[0] if len(array.shape) == 3 else 1})
+        elif dimensions[:1] in (("point",), ("instant",)) and len(array.shape) == 2 and array.shape[1] <= 4:
+            plots.append(_plot(data, name, slot))
+        elif len(array.shape) <= 1 and name != "sample_key" and (not array.shape or array.shape[0] <= 8):
+            labels[name] = (data.named(array, data.read(name, slot)), array.description)
+    axes = [name for name in data.manifest.spec.named_axes if name in labels]
+    labels = {name: labels[name] for name in (*axes, *(name for name in labels if name not in axes))}
+    return {"pictures": pictures, "plots": plots, "shapes": shapes, "labels": labels}
+
+
+_COMPONENTS = {"strain": ("twist", "bend 1", "bend 2"), "xyz": ("x", "y", "z")}
+
+
+def _plot(data: SampleData, name: str, slot: int) -> str:
+    array = data.arrays[name]
+    values = np.asarray(data.read(name, slot), dtype=float)
+    parts = _COMPONENTS.get(array.dimensions[1], tuple(str(i) for i in range(array.shape[1])))
+    rate = array.attributes.get("instants_per_second")
+    x, x_name = np.linspace(0, 1, len(values)), "arc length over L"
+    if rate is not None:
+        x, x_name = np.arange(len(values)) / rate, "time [s]"
+    curves = {part: list(zip(x.tolist(), values[:, i].tolist(), strict=True)) for i, part in enumerate(parts)}
+    return line_plot(curves, x_name=x_name, y_name=f"{name}: {array.description}")
