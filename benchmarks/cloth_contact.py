@@ -42,8 +42,8 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import THICKNESS
 from stickslip_sim_core.protocols import capstan
 from stickslip_sim_core.reference import master_curves
-from stickslip_sim_core.scenes import tumbles
 from stickslip_sim_core.scenes.cloth_sphere import SETTLING
+from stickslip_testing import tumbles
 
 PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "capstan": {},

@@ -56,7 +56,6 @@ def main() -> None:
         figures.mkdir(parents=True, exist_ok=True)
         for result in results:
             plots.plot(result).savefig(figures / f"{result.protocol}.png")
-        plots.plot_bend_twist_phases().savefig(figures / "bend-twist-phases.png")
 
 
 if __name__ == "__main__":

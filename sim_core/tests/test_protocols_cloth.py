@@ -12,7 +12,7 @@ from stickslip_sim_core import PRESETS, preset_named, protocols
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import ProtocolResult, cantilever, inclined_plane, lateral_buckling, stick_slip
-from stickslip_sim_core.protocols.strip import LENGTH, strips
+from stickslip_sim_core.protocols.strip import LENGTH, strip
 from stickslip_sim_core.reference import master_curves
 
 CERTIFIED = preset_named("certified")
@@ -20,7 +20,7 @@ CERTIFIED = preset_named("certified")
 
 @pytest.fixture(scope="module")
 def pressed() -> ProtocolResult:
-    return stick_slip.run(friction=(0.1, 0.3), cells=30, structured=1, unstructured=1)
+    return protocols.run("stick-slip", friction=(0.1, 0.3), cells=30, structured=1, unstructured=1)
 
 
 class TestStickSlip:
@@ -54,39 +54,39 @@ class TestStickSlip:
 
     def test_friction_beyond_the_triple_point_is_refused(self) -> None:
         with pytest.raises(ValueError, match="friction: "):
-            stick_slip.run(friction=(0.4,))
+            protocols.run("stick-slip", friction=(0.4,))
 
 
 class TestCantilever:
     def test_passes(self) -> None:
-        result = cantilever.run(gamma=(0.01, 30.0, 300.0), cells=25, unstructured=1)
+        result = protocols.run("cantilever", gamma=(0.01, 30.0, 300.0), cells=25, unstructured=1)
         assert result.error < 0.03
-        assert cantilever.run(gamma=(0.01, 30.0), unstructured=1).passed
+        assert protocols.run("cantilever", gamma=(0.01, 30.0), unstructured=1).passed
 
     def test_locking_is_seen(self) -> None:
         """Ten times as stiff against stretching as it should be, an unstructured mesh is not passed at a sharp bend."""
-        strip = list(strips(cantilever.WIDTH, 25, 1, 1))[1]
-        good, bad = (cantilever.hang(strip, 300.0, CERTIFIED, Y)[0] for Y in (3e3, 1e6))
+        loose = strip(cantilever.WIDTH, 25, 0)
+        good, bad = (cantilever.hang(loose, 300.0, CERTIFIED, Y)[0] for Y in (3e3, 1e6))
         exact = float(master_curves.cantilever(300.0))
         assert abs(good / exact - 1.0) < abs(bad / exact - 1.0)
 
     def test_what_does_not_settle_is_nan(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(cantilever, "STEPS_MAX", 20)
-        result = cantilever.run(gamma=(1.0,), cells=10, unstructured=0)
+        result = protocols.run("cantilever", gamma=(1.0,), cells=10, unstructured=0)
         assert math.isnan(result.curves[0].measured[0])
         assert not result.passed
 
 
 class TestLateralBuckling:
     def test_passes(self) -> None:
-        result = lateral_buckling.run(aspect=(0.2,), cells=40, structured=1, unstructured=1)
+        result = protocols.run("lateral-buckling", aspect=(0.2,), cells=40, structured=1, unstructured=1)
         assert result.passed
         assert result.error < 0.01
 
     def test_error_falls_with_the_square(self) -> None:
         master = float(master_curves.lateral_buckling(0.2, 0.0))
         coarse, fine = (
-            lateral_buckling.threshold(next(strips(0.02, cells, 1, 0)), 0.0, CERTIFIED) / master - 1.0
+            lateral_buckling.threshold(strip(0.02, cells, "alternating"), 0.0, CERTIFIED) / master - 1.0
             for cells in (15, 30)
         )
         assert coarse / fine == pytest.approx(4.0, rel=0.3)
@@ -94,26 +94,26 @@ class TestLateralBuckling:
     @pytest.mark.parametrize(("share", "falls"), [(0.97, False), (1.03, True)])
     def test_it_is_where_the_solver_buckles(self, share: float, falls: bool) -> None:
         """A sideways push of 1e-5 g turns a strip 3 % heavier than the threshold, and leaves one 3 % lighter."""
-        strip = next(strips(0.02, 20, 1, 0))
-        gamma = share * lateral_buckling.threshold(strip, 0.0, CERTIFIED)
-        cloth, flat = lateral_buckling.loaded(strip, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED)
+        clamped = strip(0.02, 20, "alternating")
+        gamma = share * lateral_buckling.threshold(clamped, 0.0, CERTIFIED)
+        cloth, flat = lateral_buckling.loaded(clamped, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED)
         cloth.gravity[:, 2] = 1e-5 * GRAVITY
         for _ in range(1000):
-            cloth.step(0.02, held=flat[strip.held], damping=5.0)
-        sideways = float(np.abs(cloth.positions[strip.tip, 2]).max()) / LENGTH
+            cloth.step(0.02, held=flat[clamped.held], damping=5.0)
+        sideways = float(np.abs(cloth.positions[clamped.tip, 2]).max()) / LENGTH
         assert (sideways > 0.03) if falls else (sideways < 1e-3)
 
 
 class TestInclinedPlane:
     def test_passes(self) -> None:
-        result = inclined_plane.run(friction=(0.1, 1.5), cells=6)
+        result = protocols.run("inclined-plane", friction=(0.1, 1.5), cells=6)
         assert result.passed
         assert result.error < 1e-3
         assert result.settings["drift_mm"] == 0.0
 
     def test_creep_is_not_passed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(inclined_plane, "drift", lambda *_, **__: 2e-5)
-        result = inclined_plane.run(friction=(0.5,), cells=4, unstructured=0)
+        result = protocols.run("inclined-plane", friction=(0.5,), cells=4, unstructured=0)
         assert math.isnan(result.curves[0].measured[0])
         assert not result.passed
 
@@ -158,6 +158,6 @@ def test_plots_of_all(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     from stickslip_sim_core.protocols import plots
 
-    result = inclined_plane.run(friction=(0.5, 1.0), cells=4, unstructured=0)
+    result = protocols.run("inclined-plane", friction=(0.5, 1.0), cells=4, unstructured=0)
     for figure in plots.figures(result):
         figure.savefig(tmp_path / "figure.png")

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from stickslip_sim_core import SelfContact, cylinder, preset_named
+from stickslip_sim_core import SelfContact, cylinder, preset_named, protocols
 from stickslip_sim_core.protocols import capstan, heavy_fold, pull_out
 from stickslip_sim_core.reference import master_curves
 
 
 class TestCapstan:
     def test_measures_tensions(self) -> None:
-        result = capstan.run(friction=(0.1, 0.8), bending=(0.05,))
+        result = protocols.run("capstan", friction=(0.1, 0.8), bending=(0.05,))
         assert result.passed
         assert result.settings["unconverged_steps"] == 0
         assert result.settings["ripple"] < 0.01  # type: ignore[operator]
 
     def test_a_smoother_cylinder_is_seen(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(capstan, "cylinder", lambda mu, *a, **k: cylinder(0.99 * mu, *a, **k))
-        assert not capstan.run(friction=(0.3,), bending=(0.05,)).passed
+        assert not protocols.run("capstan", friction=(0.3,), bending=(0.05,)).passed
 
     @pytest.mark.parametrize("facets", [36, 60])
     def test_facets_are_not_felt(self, facets: int) -> None:
@@ -36,7 +36,7 @@ class TestCapstan:
 
 class TestHeavyFold:
     def test_has_its_shape_and_does_not_drift(self) -> None:
-        result = heavy_fold.run(friction=(0.5,), cells=80)
+        result = protocols.run("heavy-fold", friction=(0.5,), cells=80)
         assert result.passed
         assert result.settings["drift_mm"] < 1e-5  # type: ignore[operator]
         assert result.settings["unconverged_steps"] == 0
@@ -49,19 +49,19 @@ class TestHeavyFold:
 
     def test_an_upper_layer_that_slips_too_soon_is_seen(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(heavy_fold, "SelfContact", lambda mu, thickness: SelfContact(0.97 * mu, thickness))
-        result = heavy_fold.run(friction=(0.5,), cells=80)
+        result = protocols.run("heavy-fold", friction=(0.5,), cells=80)
         assert not result.passed
         assert [max(map(abs, curve.errors)) < result.tolerance for curve in result.curves] == [True, True, False]
 
     def test_one_that_does_not_come_to_rest_has_no_shape(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(heavy_fold, "STEPS_MAX", 3)
         monkeypatch.setattr(heavy_fold, "HOLD_TIME", 0.0)
-        assert not heavy_fold.run(friction=(0.5,), cells=40).passed
+        assert not protocols.run("heavy-fold", friction=(0.5,), cells=40).passed
 
 
 class TestPullOut:
     def test_measures_both_sides(self) -> None:
-        result = pull_out.run(friction=(0.3,), loads=(1.0,), cells=4)
+        result = protocols.run("pull-out", friction=(0.3,), loads=(1.0,), cells=4)
         assert result.error < 1e-4
         assert result.settings["unconverged_steps"] == 0
 
@@ -69,4 +69,4 @@ class TestPullOut:
         monkeypatch.setattr(pull_out, "ROUGH", 0.0)
         monkeypatch.setattr(pull_out, "SLIDING", 0.2)
         monkeypatch.setattr(pull_out, "MEASURED", 0.1)
-        assert not pull_out.run(friction=(0.3,), loads=(1.0,), cells=3, unstructured=0).passed
+        assert not protocols.run("pull-out", friction=(0.3,), loads=(1.0,), cells=3, unstructured=0).passed

@@ -6,13 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stickslip_testing import tumbles
 
-from stickslip_sim_core import Cloth, SelfContact, Surface, fabric, isotropic, plane, preset_named, self_intersections
+from stickslip_sim_core import (
+    Cloth,
+    SelfContact,
+    Surface,
+    fabric,
+    isotropic,
+    plane,
+    preset_named,
+    protocols,
+    self_intersections,
+)
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import stacked_incline
 from stickslip_sim_core.protocols.inclined_plane import tilted
-from stickslip_sim_core.scenes import tumbles
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +111,7 @@ class TestStack:
         assert moved[2] == pytest.approx(np.full(len(moved[2]), moved[1].mean()), rel=2e-3)
 
     def test_measures_mu(self) -> None:
-        result = stacked_incline.run(friction=(0.3,), sheets=(2,), cells=4, unstructured=0)
+        result = protocols.run("stacked-incline", friction=(0.3,), sheets=(2,), cells=4, unstructured=0)
         assert result.passed
         assert result.settings["unconverged_steps"] == 0
         assert result.settings["least_distance_over_thickness"] >= 0.99  # type: ignore[operator]
@@ -109,7 +119,7 @@ class TestStack:
     def test_a_stack_that_creeps_has_no_slip_angle(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(stacked_incline.Stack, "drift", lambda _: 2e-5)
         monkeypatch.setattr(stacked_incline.Stack, "slip_slope", lambda _: 0.3)
-        assert not stacked_incline.run(friction=(0.3,), sheets=(2,), cells=3, unstructured=0).passed
+        assert not protocols.run("stacked-incline", friction=(0.3,), sheets=(2,), cells=3, unstructured=0).passed
 
 
 class TestBearing:

@@ -1,43 +1,46 @@
-"""Physical protocols: what a build of the core measures, against the master curves. See docs/protocols.md."""
+"""Physical protocols: measurements of a build of the core, against master curves. See docs/protocols.md."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_sim_core.protocols import (
-    bend_twist,
-    cantilever,
-    capstan,
-    heavy_fold,
-    inclined_plane,
-    lateral_buckling,
-    pull_out,
-    rod_cantilever,
-    rod_lateral_buckling,
-    stacked_incline,
-    stick_slip,
-)
+from stickslip_sim_core.protocols.bend_twist import BendTwist
+from stickslip_sim_core.protocols.cantilever import Cantilever
+from stickslip_sim_core.protocols.capstan import Capstan
 from stickslip_sim_core.protocols.certification import CERTIFICATION, SCENE_PROTOCOLS, Certification
+from stickslip_sim_core.protocols.heavy_fold import HeavyFold
+from stickslip_sim_core.protocols.inclined_plane import InclinedPlane
+from stickslip_sim_core.protocols.lateral_buckling import LateralBuckling
+from stickslip_sim_core.protocols.protocol import Protocol
+from stickslip_sim_core.protocols.pull_out import PullOut
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.rod_cantilever import RodCantilever
+from stickslip_sim_core.protocols.rod_chain import RodProtocol
+from stickslip_sim_core.protocols.rod_lateral_buckling import RodLateralBuckling
+from stickslip_sim_core.protocols.stacked_incline import StackedIncline
+from stickslip_sim_core.protocols.stick_slip import StickSlip
 
-PROTOCOLS: Mapping[str, Callable[..., ProtocolResult]] = MappingProxyType(
+PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
     {
-        "bend-twist": bend_twist.run,
-        "rod-cantilever": rod_cantilever.run,
-        "rod-lateral-buckling": rod_lateral_buckling.run,
-        "stick-slip": stick_slip.run,
-        "cantilever": cantilever.run,
-        "lateral-buckling": lateral_buckling.run,
-        "inclined-plane": inclined_plane.run,
-        "stacked-incline": stacked_incline.run,
-        "pull-out": pull_out.run,
-        "heavy-fold": heavy_fold.run,
-        "capstan": capstan.run,
+        protocol.name: protocol
+        for protocol in (
+            BendTwist,
+            RodCantilever,
+            RodLateralBuckling,
+            StickSlip,
+            Cantilever,
+            LateralBuckling,
+            InclinedPlane,
+            StackedIncline,
+            PullOut,
+            HeavyFold,
+            Capstan,
+        )
     }
 )
 
-ROD_PROTOCOLS = frozenset({"bend-twist", "rod-cantilever", "rod-lateral-buckling"})
-"""Those that know no presets."""
+ROD_PROTOCOLS = frozenset(name for name, protocol in PROTOCOLS.items() if issubclass(protocol, RodProtocol))
+"""Protocols of the rod solver, which has no presets."""
 
 
 def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult:
@@ -45,18 +48,18 @@ def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult
 
     Args:
         name: The protocol.
-        preset: The solver's preset; None is the protocol's own choice. Protocols of rods take no notice of it.
-        settings: See the protocol's `run`.
+        preset: The cloth solver's preset; None: "certified". Protocols of rods ignore it.
+        settings: The fields of the protocol.
 
     Raises:
-        ValueError: There is no such protocol, or a setting breaks its rule.
-        TypeError: The protocol has no such setting.
+        ValueError: `name` is unknown, or a setting breaks its rule.
+        TypeError: A setting is unknown.
     """
     if name not in PROTOCOLS:
         raise ValueError(f"protocol: must be one of {', '.join(PROTOCOLS)}, got {name!r}")
     if preset is not None and name not in ROD_PROTOCOLS:
         settings["preset"] = preset
-    return PROTOCOLS[name](**settings)
+    return PROTOCOLS[name](**settings).run()
 
 
 __all__ = [
@@ -66,6 +69,7 @@ __all__ = [
     "SCENE_PROTOCOLS",
     "Certification",
     "Curve",
+    "Protocol",
     "ProtocolResult",
     "run",
 ]

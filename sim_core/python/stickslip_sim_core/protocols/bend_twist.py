@@ -4,15 +4,14 @@ Measured is the weight at which the rod solver's own certificate, a positive def
 planar equilibria. An exactly planar rod stays planar, so there is nothing else to wait for.
 """
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.rod_chain import (
-    check_elements,
+    RodProtocol,
     extrapolated,
     loss_of_stability,
     planar_frames,
@@ -29,26 +28,24 @@ POISSON = (0.0, 0.3, 0.5)
 # gamma = 1e-4 phi^3, where all of it has curled up again.
 DOWN = 0.9
 DOWN_TO = 1e-4
-UP = 1.05
-UP_FROM = 1e-2
 
 
-def run(
-    *,
-    phi: Sequence[float] = PHI,
-    poisson: Sequence[float] = POISSON,
-    elements: int = 1024,
-    tolerance: float = 1e-4,
-) -> ProtocolResult:
-    """Measure the upper planar-to-3D boundary Gamma(phi) and compare it with `master_curves.bend_twist`."""
-    check_elements(elements)
-    curves = []
-    for nu in poisson:
-        measured = tuple(extrapolated(partial(upper_boundary, f, nu), elements) for f in phi)
-        master = tuple(float(g) for g in master_curves.bend_twist(phi, nu))
-        curves.append(Curve({"poisson": float(nu)}, tuple(float(f) for f in phi), measured, master))
-    settings = {"elements": elements}
-    return ProtocolResult("bend-twist", "phi", "Gamma", tuple(curves), tolerance, settings, build_info().build_hash)
+@dataclass(kw_only=True, eq=False)
+class BendTwist(RodProtocol):
+    """The upper planar-to-3D boundary Gamma(phi), against `master_curves.bend_twist`."""
+
+    name, x_name, y_name = "bend-twist", "phi", "Gamma"
+    points, parameters = "phi", {"poisson": "poisson"}
+
+    phi: Sequence[float] = PHI
+    """Natural curvatures times L [rad]."""
+    poisson: Sequence[float] = POISSON
+    elements: int = 1024
+    tolerance: float = 1e-4
+
+    def measure(self, phi: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        boundary = extrapolated(lambda elements: upper_boundary(phi, at["poisson"], elements), self.elements)
+        return boundary, float(master_curves.bend_twist(phi, at["poisson"]))
 
 
 def upper_boundary(phi: float, poisson: float, elements: int) -> float:
@@ -59,13 +56,3 @@ def upper_boundary(phi: float, poisson: float, elements: int) -> float:
         raise RuntimeError(f"bend-twist: the heavy rod of phi = {phi} is not stable on {elements} elements")
     steps = np.arange(1, np.ceil(np.log(DOWN_TO) / np.log(DOWN)))
     return loss_of_stability(relax, start, phi**3 * DOWN**steps)
-
-
-def lower_boundary(phi: float, poisson: float, elements: int) -> float:
-    """Return the weight at which the planar chain, followed upwards from its natural shape, loses stability, or NaN."""
-    relax = round_rod(phi, poisson)
-    start = relax(UP_FROM, planar_frames(phi * np.linspace(0.0, 1.0, elements + 1)))
-    if not start.stable:
-        raise RuntimeError(f"bend-twist: the light rod of phi = {phi} is not stable on {elements} elements")
-    steps = np.arange(1, np.ceil(np.log(phi**3 / UP_FROM) / np.log(UP)))
-    return loss_of_stability(relax, start, UP_FROM * UP**steps)

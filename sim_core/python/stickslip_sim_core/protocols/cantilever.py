@@ -1,15 +1,17 @@
 """Cantilever: how far a strip of cloth that is clamped horizontally hangs down [Romero et al. 2021]."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.cloth.fabrics import isotropic
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
 from stickslip_sim_core.reference import master_curves
 
 # Weights rho_A g L^3 / D [-].
@@ -32,81 +34,59 @@ REST = 2e-5  # of the length: a long step in which nothing moves by more is the 
 FORCE_SHARE = 0.1  # of a node's weight: the force that residuals are measured in
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    gamma: Sequence[float] = GAMMA,
-    cells: int = 50,
-    structured: int = 1,
-    unstructured: int = 5,
-    tolerance: float = 0.01,
-) -> ProtocolResult:
-    """Measure H/W, drop of the tip over its horizontal reach, and compare it with `master_curves.cantilever`.
+@dataclass(kw_only=True, eq=False)
+class Cantilever(MeshedProtocol):
+    """H/W, drop of the tip over its horizontal reach, against `master_curves.cantilever`.
 
-    Args:
-        preset: Solver settings, or their name. Its time step is the first one; steps grow to 1 s as the strip settles.
-        gamma: Weights rho_A g L^3 / D.
-        cells: Of a mesh along the strip, up to `HEAVY`; twice as many beyond.
-        structured: Number of structured meshes, 0 ... 4.
-        unstructured: Number of unstructured ones.
-        tolerance: Largest |relative error| that passes.
+    The preset's time step is the first one; steps grow to 1 s as the strip settles.
     """
-    settings = preset_named(preset)
-    master = tuple(float(v) for v in master_curves.cantilever(gamma)) if len(gamma) else ()
-    curves, names, steps, unconverged = [], [], 0, 0
-    pairs = zip(
-        strips(WIDTH, cells, structured, unstructured), strips(WIDTH, 2 * cells, structured, unstructured), strict=True
-    )
-    for number, (light, heavy) in enumerate(pairs):
-        measured = []
-        for weight in gamma:
-            ratio, cloth = hang(heavy if weight > HEAVY else light, weight, settings)
-            measured.append(ratio)
-            steps += cloth.steps
-            unconverged += cloth.unconverged_steps
-        curves.append(Curve({"mesh": float(number)}, tuple(float(g) for g in gamma), tuple(measured), master))
-        names.append(f"{number} {light.name}")
-    return ProtocolResult(
-        "cantilever",
-        "Gamma",
-        "H/W",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "first_time_step": settings.time_step,
+
+    name, x_name, y_name = "cantilever", "Gamma", "H/W"
+    points, time_step_name = "gamma", "first_time_step"
+
+    gamma: Sequence[float] = GAMMA
+    """Weights rho_A g L^3 / D."""
+    cells: int = 50
+    """Of a mesh along the strip, up to `HEAVY`; twice as many beyond."""
+    unstructured: int = 5
+    tolerance: float = 0.01
+
+    def measure(self, gamma: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        cells = 2 * self.cells if gamma > HEAVY else self.cells
+        ratio, cloth = hang(strip(WIDTH, cells, self.kinds[at["mesh"]]), gamma, self.solver)
+        self.tally.count(cloth)
+        return ratio, float(master_curves.cantilever(gamma))
+
+    def reported(self) -> dict[str, Setting]:
+        return {
+            **super().reported(),
             "last_time_step_at_most": LONGEST,
-            "cells": cells,
-            f"cells_beyond_{HEAVY:g}": 2 * cells,
-            "meshes": ", ".join(names),
+            f"cells_beyond_{HEAVY:g}": 2 * self.cells,
             "stretching_over_weight": STRETCHING,
             "force_scale_over_node_weight": FORCE_SHARE,
-            "steps": steps,
-            "unconverged_steps": unconverged,
-        },
-        build_info().build_hash,
-    )
+            **self.counted(),
+        }
 
 
-def hang(strip: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING) -> tuple[float, Cloth]:
+def hang(clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING) -> tuple[float, Cloth]:
     """Let a strip that was straight and horizontal settle; return H/W, NaN if it did not, and the cloth."""
     weight = DENSITY * GRAVITY * LENGTH  # N/m
     cloth = Cloth(
-        strip.mesh,
+        clamped.mesh,
         isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma),
         preset,
-        held=strip.held,
-        clamped=strip.clamped,
-        force_scale=FORCE_SHARE * DENSITY * GRAVITY * strip.mesh.spacing**2,
+        held=clamped.held,
+        clamped=clamped.clamped,
+        force_scale=FORCE_SHARE * DENSITY * GRAVITY * clamped.mesh.spacing**2,
     )
-    straight = np.stack([strip.along, strip.across, np.zeros_like(strip.along)], axis=1)
-    cloth.set_state(straight, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
+    straight = np.stack([clamped.along, clamped.across, np.zeros_like(clamped.along)], axis=1)
+    cloth.set_state(straight, None, np.tile([-1.0, 0.0, 0.0], (len(clamped.clamped), 1)))
     dt, at_rest = preset.time_step, False
     while cloth.steps < STEPS_MAX and not at_rest:
         before = cloth.positions
-        cloth.step(dt, held=straight[strip.held], damping=DAMPING)
+        cloth.step(dt, held=straight[clamped.held], damping=DAMPING)
         at_rest = 2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
         if cloth.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)
-    reach, _, drop = cloth.positions[strip.tip].mean(axis=0)
+    reach, _, drop = cloth.positions[clamped.tip].mean(axis=0)
     return float(-drop / reach) if at_rest else np.nan, cloth

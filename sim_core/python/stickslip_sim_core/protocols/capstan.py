@@ -1,16 +1,18 @@
 """Capstan: a strip is drawn over a cylinder against a light pull; friction makes the heavy pull grow with the wrap."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import isotropic
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import THICKNESS, Body, Cloth, SelfContact, Surface, cylinder
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.protocol import ClothProtocol
+from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
@@ -28,54 +30,37 @@ MEASURED = 0.8  # s: over which its mean is taken, two cells of way
 FORCE_SHARE = 0.01
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    friction: Sequence[float] = FRICTION,
-    bending: Sequence[float] = BENDING,
-    tolerance: float = 0.003,
-) -> ProtocolResult:
-    """Measure ln(T2/T1) of a strip that slides over a cylinder, with cells of 5 degrees.
+@dataclass(kw_only=True, eq=False)
+class Capstan(ClothProtocol):
+    """Ln(T2/T1) of a strip that slides over a cylinder, with cells of 5 degrees."""
 
-    Args:
-        preset: Solver settings, or their name.
-        friction: Of strip and cylinder.
-        bending: B / T1, each > 0.
-        tolerance: Largest |relative error| that passes.
-    """
-    settings = preset_named(preset)
-    curves, ripple, steps, unconverged = [], 0.0, 0, 0
-    for stiff in bending:
-        measured, master = [], []
-        for mu in friction:
-            strip = Strip(mu, stiff, settings)
-            heavy, wrap = strip.draw()
-            measured.append(float(np.log(heavy.mean() / LIGHT)))
-            master.append(float(np.log(master_curves.capstan(mu, wrap, stiff))))
-            ripple = max(ripple, float(np.ptp(heavy) / heavy.mean()))
-            steps, unconverged = steps + strip.cloth.steps, unconverged + strip.cloth.unconverged_steps
-        curves.append(
-            Curve({"bending": float(stiff)}, tuple(float(mu) for mu in friction), tuple(measured), tuple(master))
-        )
-    return ProtocolResult(
-        "capstan",
-        "mu",
-        "ln(T2/T1)",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "time_step": settings.time_step,
+    name, x_name, y_name = "capstan", "mu", "ln(T2/T1)"
+    points, parameters = "friction", {"bending": "bending"}
+
+    friction: Sequence[float] = FRICTION
+    """Of strip and cylinder."""
+    bending: Sequence[float] = BENDING
+    """B / T1, each > 0."""
+    tolerance: float = 0.003
+
+    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        strip = Strip(mu, at["bending"], self.solver)
+        heavy, wrap = strip.draw()
+        self.tally.note(float(np.ptp(heavy) / heavy.mean()))
+        self.tally.count(strip.cloth)
+        master = master_curves.capstan(mu, wrap, at["bending"])
+        return float(np.log(heavy.mean() / LIGHT)), float(np.log(master))
+
+    def reported(self) -> dict[str, Setting]:
+        return {
+            **super().reported(),
             "wrap": WRAP,
             "cells_per_turn": CELLS_PER_TURN,
             "speed": SPEED,
-            "ripple": ripple,
+            "ripple": self.tally.largest,
             "force_scale_over_pull_on_a_cell": FORCE_SHARE,
-            "steps": steps,
-            "unconverged_steps": unconverged,
-        },
-        build_info().build_hash,
-    )
+            **self.counted(),
+        }
 
 
 class Strip:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import PchipInterpolator
 
 from stickslip_sim_core.protocols.result import Curve
 from stickslip_sim_core.reference import master_curves
@@ -40,8 +41,6 @@ def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
         return dense, np.asarray(_EXACT[protocol](dense), dtype=np.float64)
     if len(x) < 2:
         return x, y
-    from scipy.interpolate import PchipInterpolator
-
     is_log = bool(x[0] > 0.0 and np.all(y > 0.0))
     dense = np.geomspace(x[0], x[-1], POINTS) if is_log else np.linspace(x[0], x[-1], POINTS)
     if is_log:

@@ -3,16 +3,18 @@
 The upper layer is then pulled away from the loop, until it slips.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import isotropic
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, SelfContact, plane
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.protocol import ClothProtocol
+from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.reference import master_curves
 
 BENDING_LENGTH = 0.02  # L_gb, m
@@ -37,64 +39,56 @@ MOVED = 1e-6  # m: an upper layer whose vertices have all come so far slips
 FORCE_SHARE = 0.1
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    friction: Sequence[float] = FRICTION,
-    cells: int = 120,
-    tolerance: float = 0.005,
-) -> ProtocolResult:
-    """Measure the height of the loop, how far its nose lies before the landing, and the pull at which it slips.
+@dataclass(kw_only=True, eq=False)
+class HeavyFold(ClothProtocol):
+    """The height of the loop, how far its nose lies before the landing, and the pull at which the upper layer slips.
 
-    Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest says how long the tail is, whose weight and
-    that of the landing's force are the load on friction.
-
-    Args:
-        preset: Solver settings, or their name.
-        friction: Of the strip with itself and with the floor; the shape does not depend on it.
-        cells: Of the strip along its length, which is 11.7 L_gb.
-        tolerance: Largest |relative error| that passes.
+    Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest gives the length of the tail. Its weight and
+    the force at the landing are the load on friction.
     """
-    settings = preset_named(preset)
-    exact = master_curves.heavy_fold(GAP)
-    shapes, pulls, pulls_exact = [], [], []
-    drift, least, steps, unconverged = 0.0, np.inf, 0, 0
-    for mu in friction:
-        fold = Fold(mu, settings, cells)
-        shapes.append(fold.settle())
-        drift = max(drift, fold.drift())
-        pulls.append(fold.slip_pull())
-        pulls_exact.append(fold.expected)
-        least = min(least, fold.cloth.least_distance)
-        steps, unconverged = steps + fold.cloth.steps, unconverged + fold.cloth.unconverged_steps
-    x = tuple(float(mu) for mu in friction)
-    return ProtocolResult(
-        "heavy-fold",
-        "mu",
-        "length/L_gb, pull/(rho g L_gb)",
-        (
-            Curve({"what": 0.0}, x, tuple(shape[0] for shape in shapes), (exact.height,) * len(x)),
-            Curve({"what": 1.0}, x, tuple(shape[1] for shape in shapes), (exact.nose_to_landing,) * len(x)),
-            Curve({"what": 2.0}, x, tuple(pulls), tuple(pulls_exact)),
-        ),
-        tolerance,
-        {
-            "preset": settings.name,
+
+    name, x_name, y_name = "heavy-fold", "mu", "length/L_gb, pull/(rho g L_gb)"
+    points, parameters = "friction", {"what": "what"}
+    what: ClassVar = range(3)
+
+    friction: Sequence[float] = FRICTION
+    """Of the strip with itself and with the floor; the shape does not depend on it."""
+    cells: int = 120
+    """Of the strip along its length, which is 11.7 L_gb."""
+    tolerance: float = 0.005
+
+    folds: dict[float, tuple[tuple[float, float], ...]] = field(default_factory=dict, init=False, repr=False)
+
+    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        if mu not in self.folds:
+            self.folds[mu] = self.fold(mu)
+        return self.folds[mu][at["what"]]
+
+    def fold(self, mu: float) -> tuple[tuple[float, float], ...]:
+        """Return height, distance of nose and landing, and pull at slip: as measured, and of the master curve."""
+        exact = master_curves.heavy_fold(GAP)
+        fold = Fold(mu, self.solver, self.cells)
+        height, nose_to_landing = fold.settle()
+        self.tally.note(fold.drift())
+        pull = fold.slip_pull()
+        self.tally.count(fold.cloth)
+        return (height, exact.height), (nose_to_landing, exact.nose_to_landing), (pull, fold.expected)
+
+    def reported(self) -> dict[str, Setting]:
+        return {
+            "preset": self.solver.name,
             "what": "0 height, 1 nose to landing, 2 pull at slip",
-            "cells": cells,
+            "cells": self.cells,
             "gap_over_bending_length": GAP,
             "stretching_over_weight": STRETCHING,
             "force_scale_over_node_weight": FORCE_SHARE,
             "last_time_step_at_most": LONGEST,
-            "drift_mm": 1e3 * drift,
+            "drift_mm": 1e3 * self.tally.largest,
             "drift_seconds": HOLD_TIME,
             "drift_share_of_slip_pull": HOLD_SHARE,
-            "least_distance_over_thickness": least / (GAP * BENDING_LENGTH),
-            "steps": steps,
-            "unconverged_steps": unconverged,
-        },
-        build_info().build_hash,
-    )
+            "least_distance_over_thickness": self.tally.least_distance / (GAP * BENDING_LENGTH),
+            **self.counted(),
+        }
 
 
 class Fold:

@@ -1,16 +1,19 @@
 """Inclined plane: the slope at which a patch of cloth begins to slide, and how far it creeps below."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import fabric
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, plane
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.protocols.strip import rectangle
 
 FRICTION = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
 SIDE = 0.1  # m
@@ -30,60 +33,39 @@ DRIFT_MAX = 1e-5  # m
 FORCE_SHARE = 1.0
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    friction: Sequence[float] = FRICTION,
-    cells: int = 10,
-    structured: int = 1,
-    unstructured: int = 1,
-    force_share: float = FORCE_SHARE,
-    tolerance: float = 0.005,
-) -> ProtocolResult:
-    """Measure tan(alpha) of the slope at which a patch slides, and compare it with mu.
+@dataclass(kw_only=True, eq=False)
+class InclinedPlane(MeshedProtocol):
+    """Tan(alpha) of the slope at which a patch slides, against mu.
 
-    A patch that comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) has no slip angle: it creeps, and
-    its measurement is NaN.
-
-    Args:
-        preset: Solver settings, or their name.
-        friction: Of the plane.
-        cells: Of a mesh along a side.
-        structured: Number of structured meshes, 0 or 1.
-        unstructured: Number of unstructured ones.
-        force_share: Force that residuals are measured in, over a node's weight.
-        tolerance: Largest |relative error| that passes.
+    A patch that comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) creeps: its measurement is NaN.
     """
-    settings = preset_named(preset)
-    curves, names, furthest = [], [], 0.0
-    for number, (name, mesh) in enumerate(_patches(cells, structured, unstructured)):
-        measured = []
-        for mu in friction:
-            moved = drift(mesh, mu, settings, force_share=force_share)
-            furthest = max(furthest, moved)
-            slope = slip_slope(mesh, mu, settings, force_share=force_share)
-            measured.append(slope if moved <= DRIFT_MAX else np.nan)
-        exact = tuple(float(mu) for mu in friction)
-        curves.append(Curve({"mesh": float(number)}, exact, tuple(measured), exact))
-        names.append(f"{number} {name}")
-    return ProtocolResult(
-        "inclined-plane",
-        "mu",
-        "tan(alpha) at slip",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "time_step": settings.time_step,
-            "cells": cells,
-            "meshes": ", ".join(names),
-            "force_scale_over_node_weight": force_share,
-            "drift_mm": 1e3 * furthest,
+
+    name, x_name, y_name = "inclined-plane", "mu", "tan(alpha) at slip"
+    points = "friction"
+    grids_max = 1
+
+    friction: Sequence[float] = FRICTION
+    """Of the plane."""
+    cells: int = 10
+    force_share: float = FORCE_SHARE
+    """Force that residuals are measured in, over a node's weight."""
+    tolerance: float = 0.005
+
+    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        mesh = rectangle(SIDE, SIDE, (self.cells, self.cells), SIDE / self.cells, self.kinds[at["mesh"]], 0)
+        moved = drift(mesh, mu, self.solver, force_share=self.force_share)
+        self.tally.note(moved)
+        slope = slip_slope(mesh, mu, self.solver, force_share=self.force_share)
+        return slope if moved <= DRIFT_MAX else np.nan, mu
+
+    def reported(self) -> dict[str, Setting]:
+        return {
+            **super().reported(),
+            "force_scale_over_node_weight": self.force_share,
+            "drift_mm": 1e3 * self.tally.largest,
             "drift_seconds": HOLD_TIME,
             "drift_share_of_slip_angle": HOLD_SHARE,
-        },
-        build_info().build_hash,
-    )
+        }
 
 
 def slip_slope(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_share: float = FORCE_SHARE) -> float:
@@ -121,10 +103,3 @@ def _laid(mesh: meshes.Mesh, preset: SolverSettings, force_share: float) -> tupl
     start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
     cloth.set_state(start)
     return cloth, start
-
-
-def _patches(cells: int, structured: int, unstructured: int) -> Iterator[tuple[str, meshes.Mesh]]:
-    if structured:
-        yield "grid alternating", meshes.grid(SIDE, SIDE, cells, cells)
-    for seed in range(unstructured):
-        yield f"unstructured {seed}", meshes.unstructured(SIDE, SIDE, SIDE / cells, seed)

@@ -6,18 +6,20 @@ the smallest eigenvalue of their sum is zero, which is an eigenvalue problem for
 differences of the solver's own gradient.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.fabrics import isotropic
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
 from stickslip_sim_core.reference import master_curves
 
 ASPECT = (0.1, 0.2, 0.5)
@@ -30,66 +32,43 @@ STEPS, GROWTH = 30, 1.5  # of the time step, until inertia is nothing beside sti
 DIFFERENCE = 1e-7  # of the length
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    aspect: Sequence[float] = ASPECT,
-    poisson: Sequence[float] = POISSON,
-    cells: int = 50,
-    structured: int = 2,
-    unstructured: int = 2,
-    tolerance: float = 0.03,
-) -> ProtocolResult:
-    """Measure the weight Gamma* at which flat strips lose stability; compare it with `master_curves.lateral_buckling`.
+@dataclass(kw_only=True, eq=False)
+class LateralBuckling(MeshedProtocol):
+    """The weight Gamma* at which flat strips lose stability, against `master_curves.lateral_buckling`.
 
-    Args:
-        preset: Solver settings, or their name. Its time step is the first one; the others grow.
-        aspect: Widths over length.
-        poisson: Poisson's ratios.
-        cells: Of a mesh along the strip.
-        structured: Number of structured meshes, 0 ... 4.
-        unstructured: Number of unstructured ones.
-        tolerance: Largest |relative error| that passes.
+    The preset's time step is the first one; the others grow.
     """
-    settings = preset_named(preset)
-    measured: dict[tuple[float, int], list[float]] = {}
-    names: list[str] = []
-    for ratio in aspect:
-        for number, strip in enumerate(strips(ratio * LENGTH, cells, structured, unstructured)):
-            for nu in poisson:
-                measured.setdefault((nu, number), []).append(threshold(strip, nu, settings))
-            if number == len(names):
-                names.append(f"{number} {strip.name}")
-    curves = []
-    for (nu, number), weights in measured.items():
-        master = tuple(float(g) for g in master_curves.lateral_buckling(aspect, nu))
-        parameters = {"poisson": float(nu), "mesh": float(number)}
-        curves.append(Curve(parameters, tuple(float(a) for a in aspect), tuple(weights), master))
-    return ProtocolResult(
-        "lateral-buckling",
-        "w/L",
-        "Gamma* = rho_A g L^3 / D",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "first_time_step": settings.time_step,
-            "cells": cells,
-            "meshes": ", ".join(names),
-            "stretching_over_weight": STRETCHING,
-            "force_scale_over_node_weight": FORCE_SHARE,
-        },
-        build_info().build_hash,
-    )
+
+    name, x_name, y_name = "lateral-buckling", "w/L", "Gamma* = rho_A g L^3 / D"
+    points, parameters = "aspect", {"mesh": "meshes", "poisson": "poisson"}
+    time_step_name = "first_time_step"
+
+    aspect: Sequence[float] = ASPECT
+    """Widths over length."""
+    poisson: Sequence[float] = POISSON
+    cells: int = 50
+    """Of a mesh along the strip."""
+    structured: int = 2
+    unstructured: int = 2
+    tolerance: float = 0.03
+
+    def measure(self, aspect: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        clamped = strip(aspect * LENGTH, self.cells, self.kinds[at["mesh"]])
+        weight = threshold(clamped, at["poisson"], self.solver)
+        return weight, float(master_curves.lateral_buckling(aspect, at["poisson"]))
+
+    def reported(self) -> dict[str, Setting]:
+        shares = {"stretching_over_weight": STRETCHING, "force_scale_over_node_weight": FORCE_SHARE}
+        return super().reported() | shares
 
 
-def threshold(strip: Strip, poisson: float, preset: SolverSettings) -> float:
+def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
     """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
-    cloth, flat = loaded(strip, poisson, RIGIDITY, preset)
-    free = np.setdiff1d(np.arange(len(flat)), strip.held)
+    cloth, flat = loaded(clamped, poisson, RIGIDITY, preset)
+    free = np.setdiff1d(np.arange(len(flat)), clamped.held)
     bending = out_of_plane(cloth, flat, free)
     for step in range(STEPS):
-        cloth.step(preset.time_step * GROWTH**step, held=flat[strip.held])
+        cloth.step(preset.time_step * GROWTH**step, held=flat[clamped.held])
     stress = out_of_plane(cloth, cloth.positions, free) - bending
     if not np.isfinite(stress).all():
         return np.nan
@@ -101,18 +80,18 @@ def threshold(strip: Strip, poisson: float, preset: SolverSettings) -> float:
     return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
 
 
-def loaded(strip: Strip, poisson: float, rigidity: float, preset: SolverSettings) -> tuple[Cloth, Floats]:
+def loaded(clamped: Strip, poisson: float, rigidity: float, preset: SolverSettings) -> tuple[Cloth, Floats]:
     """Return a flat strip at rest, to bear its weight along its width, and where its vertices are."""
     cloth = Cloth(
-        strip.mesh,
+        clamped.mesh,
         isotropic(DENSITY, STRETCHING * DENSITY * GRAVITY * LENGTH, rigidity, poisson),
         preset,
-        held=strip.held,
-        clamped=strip.clamped,
-        force_scale=FORCE_SHARE * DENSITY * GRAVITY * strip.mesh.spacing**2,
+        held=clamped.held,
+        clamped=clamped.clamped,
+        force_scale=FORCE_SHARE * DENSITY * GRAVITY * clamped.mesh.spacing**2,
     )
-    flat = np.stack([strip.along, strip.across, np.zeros_like(strip.along)], axis=1)
-    cloth.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(strip.clamped), 1)))
+    flat = np.stack([clamped.along, clamped.across, np.zeros_like(clamped.along)], axis=1)
+    cloth.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(clamped.clamped), 1)))
     cloth.gravity[:] = [0.0, -GRAVITY, 0.0]
     return cloth, flat
 

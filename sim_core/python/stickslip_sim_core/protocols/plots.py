@@ -3,17 +3,13 @@
 They need matplotlib: `pip install stickslip-sim-core[plots]`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stickslip_sim_core.protocols.bend_twist import POISSON, lower_boundary, upper_boundary
 from stickslip_sim_core.protocols.dense import dense_master
 from stickslip_sim_core.protocols.result import ProtocolResult
-from stickslip_sim_core.protocols.rod_chain import extrapolated
 from stickslip_sim_core.protocols.stick_slip import EXTENDED, SLIP, STICK
 from stickslip_sim_core.reference import master_curves
 
@@ -26,9 +22,9 @@ SIZE = (6.0, 5.0)  # inches
 DPI = 110
 
 
-def figures(result: ProtocolResult) -> Iterator["Figure"]:
-    """Draw everything that there is to see of a result."""
-    return (draw(result) for draw in PLOTS.get(result.protocol, (plot,)))
+def figures(result: ProtocolResult) -> list["Figure"]:
+    """Draw a result, and the phase diagram of Stick-Slip."""
+    return [plot(result), plot_stick_slip_phases(result)] if result.protocol == "stick-slip" else [plot(result)]
 
 
 def plot(result: ProtocolResult) -> "Figure":
@@ -84,41 +80,6 @@ def _verdict(result: ProtocolResult) -> str:
     return f"largest error {result.error:.1e}, {'passed' if result.passed else 'FAILED'}"
 
 
-def plot_bend_twist_phases(*, poisson: Sequence[float] = POISSON, points: int = 40, elements: int = 512) -> "Figure":
-    """Draw where a hanging curly rod is planar and where three-dimensional, phi = 0.25 pi ... 25 pi.
-
-    Lines from above are master curves, dots are measured; the lower boundary, where the rod of natural shape leaves its
-    plane as its weight grows, is measured.
-    """
-    from matplotlib.figure import Figure
-
-    phi = np.geomspace(0.25 * np.pi, 25.0 * np.pi, points)
-    figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
-    axes = figure.subplots()
-    for nu, colour in zip(poisson, COLOURS, strict=False):
-        onset, onset_gamma = master_curves.bend_twist_onset(nu)
-        start = np.cbrt(onset_gamma) / onset
-        inside = phi[phi > onset]
-        fine = np.concatenate([onset * (1.0 + np.geomspace(1e-6, 0.2, 25)), np.geomspace(1.25 * onset, phi[-1], 12)])
-        master = np.cbrt(master_curves.bend_twist(fine, nu)) / fine
-        measured = np.array([extrapolated(partial(upper_boundary, f, nu), elements) for f in phi])
-        lower = np.array([extrapolated(partial(lower_boundary, f, nu), elements) for f in inside])
-        axes.plot(np.append(onset, fine) / np.pi, np.append(start, master), color=colour, label=f"poisson = {nu:g}")
-        axes.plot(phi / np.pi, np.cbrt(measured) / phi, "o", color=colour, markersize=4, markerfacecolor="none")
-        axes.plot(np.append(onset, inside) / np.pi, np.append(start, np.cbrt(lower) / inside), ":", color=colour)
-        axes.plot(onset / np.pi, start, "*", color=colour, markersize=10)
-    axes.set(xscale="log", xlabel="phi / pi", ylabel="Gamma^(1/3) / phi", xlim=(0.25, 25.0), ylim=(0.0, 0.8))
-    axes.set_xticks([0.25, 0.5, 1, 2, 5, 10, 25], labels=["0.25", "0.5", "1", "2", "5", "10", "25"])
-    axes.minorticks_off()
-    axes.text(6.0, 0.72, "planar, hanging", ha="center")
-    axes.text(8.0, 0.33, "three-dimensional", ha="center")
-    axes.text(8.0, 0.02, "planar, curled", ha="center")
-    axes.text(0.55, 0.4, "planar\nat every weight", ha="center")
-    axes.set_title("Bend-Twist: master curve (line), measured (dots),\nmeasured from the natural shape (dotted)")
-    axes.legend(loc="upper left", fontsize="small")
-    return figure
-
-
 def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
     """Draw what the strips of a Stick-Slip did at which friction and strain, over the master curve."""
     from matplotlib.figure import Figure
@@ -142,7 +103,3 @@ def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
     axes.set_title("Stick-Slip: master curve (line), measured (dots)")
     figure.legend(fontsize="small", loc="outside lower center", ncols=2)
     return figure
-
-
-PLOTS: Mapping[str, tuple[Callable[[ProtocolResult], "Figure"], ...]] = {"stick-slip": (plot, plot_stick_slip_phases)}
-"""By protocol: its pictures, where they are others than `plot`."""

@@ -1,15 +1,18 @@
 """Pull-out: a sheet is drawn out from between two others that lie under a load; both of its sides rub."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import fabric
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, SelfContact, plane
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
+from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.protocols.strip import MeshKind, rectangle
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 LOADS = (1.0, 4.0)  # weight of the upper sheet, over that of the fabric
@@ -27,65 +30,41 @@ LOWEST_MAX = 1e-5  # m: by which the lowest sheet may move
 FORCE_SHARE = 0.1
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    friction: Sequence[float] = FRICTION,
-    loads: Sequence[float] = LOADS,
-    cells: int = 4,
-    structured: int = 1,
-    unstructured: int = 1,
-    tolerance: float = 0.005,
-) -> ProtocolResult:
-    """Measure the force that draws the middle of three sheets out, over the load between the upper two.
+@dataclass(kw_only=True, eq=False)
+class PullOut(MeshedProtocol):
+    """The force that draws the middle of three sheets out, over the load between the upper two.
 
     Friction is mu between the upper two, and mu/2 between the lower two. The master curve is
     mu + mu/2 (1 + weight of the middle sheet / load).
-
-    Args:
-        preset: Solver settings, or their name.
-        friction: mu.
-        loads: Factors of the gravity on the upper sheet.
-        cells: Of the mesh of the upper sheet along a side.
-        structured: Number of structured meshes, 0 or 1.
-        unstructured: Number of unstructured ones.
-        tolerance: Largest |relative error| that passes.
     """
-    settings = preset_named(preset)
-    curves, least, unconverged, steps = [], np.inf, 0, 0
-    names = ["grid"] * structured + [f"unstructured {seed}" for seed in range(unstructured)]
-    for load in loads:
-        for number, name in enumerate(names):
-            measured, master = [], []
-            for mu in friction:
-                pulled = Pulled(mu, load, settings, cells, None if name == "grid" else number - structured)
-                force, expected = pulled.force()
-                measured.append(force)
-                master.append(expected)
-                least = min(least, pulled.cloth.least_distance)
-                steps, unconverged = steps + pulled.cloth.steps, unconverged + pulled.cloth.unconverged_steps
-            exact = tuple(float(mu) for mu in friction)
-            curves.append(Curve({"load": float(load), "mesh": float(number)}, exact, tuple(measured), tuple(master)))
-    return ProtocolResult(
-        "pull-out",
-        "mu",
-        "force/load",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "time_step": settings.time_step,
-            "cells": cells,
-            "meshes": ", ".join(f"{i} {name}" for i, name in enumerate(names)),
+
+    name, x_name, y_name = "pull-out", "mu", "force/load"
+    points, parameters = "friction", {"load": "loads", "mesh": "meshes"}
+    grids_max = 1
+
+    friction: Sequence[float] = FRICTION
+    """mu."""
+    loads: Sequence[float] = LOADS
+    """Factors of the gravity on the upper sheet."""
+    cells: int = 4
+    """Of the upper sheet along a side."""
+    tolerance: float = 0.005
+
+    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        pulled = Pulled(mu, at["load"], self.solver, self.cells, self.kinds[at["mesh"]])
+        found = pulled.force()
+        self.tally.count(pulled.cloth)
+        return found
+
+    def reported(self) -> dict[str, Setting]:
+        return {
+            **super().reported(),
             "speed": SPEED,
             "friction_below_over_mu": OVER_LOWER,
             "force_scale_over_node_weight": FORCE_SHARE,
-            "least_distance_over_thickness": least / THICKNESS,
-            "steps": steps,
-            "unconverged_steps": unconverged,
-        },
-        build_info().build_hash,
-    )
+            "least_distance_over_thickness": self.tally.least_distance / THICKNESS,
+            **self.counted(),
+        }
 
 
 class Pulled:
@@ -96,18 +75,16 @@ class Pulled:
         load: Factor of the gravity on the upper sheet.
         preset: Solver settings.
         cells: Of the upper sheet along a side.
-        seed: Of unstructured meshes; None: grids.
+        kind: Of the meshes.
     """
 
-    def __init__(self, mu: float, load: float, preset: SolverSettings, cells: int, seed: int | None = None) -> None:
+    def __init__(self, mu: float, load: float, preset: SolverSettings, cells: int, kind: MeshKind) -> None:
         self.mu, self.preset = mu, preset
         sizes = ((1.5 * SIDE, 1.2 * SIDE), (1.25 * SIDE, SIDE), (SIDE, 0.9 * SIDE))  # from the lowest upwards
         centres = (0.0, 0.1 * SIDE, 0.0)
         cell = SIDE / cells
         parts = [
-            meshes.grid(width, length, round(width / cell), round(length / cell))
-            if seed is None
-            else meshes.unstructured(width, length, cell, seed + level)
+            rectangle(width, length, (round(width / cell), round(length / cell)), cell, kind, level)
             for level, (width, length) in enumerate(sizes)
         ]
         laid = fabric(FABRIC)

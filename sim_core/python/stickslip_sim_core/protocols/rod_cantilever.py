@@ -1,13 +1,12 @@
 """Cantilever of a rod: how far a heavy rod that is clamped horizontally hangs down."""
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.rod_chain import check_elements, extrapolated, planar_frames, round_rod, tip
+from stickslip_sim_core.protocols.rod_chain import RodProtocol, extrapolated, planar_frames, round_rod, tip
 from stickslip_sim_core.reference import master_curves
 
 # Weights rho A g L^3 / EI [-]: 1e-3 ... 1e5.
@@ -16,14 +15,20 @@ GAMMA = tuple(float(g) for g in 10.0 ** np.arange(-3.0, 5.1, 0.5))
 POISSON = 0.5  # twist does not enter
 
 
-def run(*, gamma: Sequence[float] = GAMMA, elements: int = 2048, tolerance: float = 1e-4) -> ProtocolResult:
-    """Measure H/W, drop of the tip over its horizontal reach, and compare it with `master_curves.cantilever`."""
-    check_elements(elements)
-    measured = tuple(extrapolated(partial(drop_over_reach, g), elements) for g in gamma)
-    master = tuple(float(ratio) for ratio in master_curves.cantilever(gamma))
-    curve = Curve({}, tuple(float(g) for g in gamma), measured, master)
-    settings = {"elements": elements}
-    return ProtocolResult("rod-cantilever", "Gamma", "H/W", (curve,), tolerance, settings, build_info().build_hash)
+@dataclass(kw_only=True, eq=False)
+class RodCantilever(RodProtocol):
+    """H/W, drop of the tip over its horizontal reach, against `master_curves.cantilever`."""
+
+    name, x_name, y_name = "rod-cantilever", "Gamma", "H/W"
+    points = "gamma"
+
+    gamma: Sequence[float] = GAMMA
+    elements: int = 2048
+    tolerance: float = 1e-4
+
+    def measure(self, gamma: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        drop = extrapolated(lambda elements: drop_over_reach(gamma, elements), self.elements)
+        return drop, float(master_curves.cantilever(gamma))
 
 
 def drop_over_reach(gamma: float, elements: int) -> float:

@@ -7,6 +7,8 @@ import numpy as np
 
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.protocols.protocol import Protocol
+from stickslip_sim_core.protocols.result import Setting
 
 # Bisections end at this relative width.
 BISECTION = 1e-12
@@ -84,6 +86,21 @@ def _bisected(relax: Relax, stable: Equilibrium, unstable: float) -> float:
     return 0.5 * (stable.gamma + unstable)
 
 
-def check_elements(elements: int) -> None:
-    if isinstance(elements, bool) or not isinstance(elements, int) or elements < 16 or elements % 4:
-        raise ValueError(f"elements: must be a multiple of 4 and at least 16, got {elements!r}")
+@dataclass(kw_only=True, eq=False)
+class RodProtocol(Protocol):
+    """A protocol of the rod solver.
+
+    Raises:
+        ValueError: `elements` breaks its rule.
+    """
+
+    elements: int
+    """Of the finest chain, a multiple of 4, at least 16."""
+
+    def __post_init__(self) -> None:
+        count = self.elements
+        if isinstance(count, bool) or not isinstance(count, int) or count < 16 or count % 4:
+            raise ValueError(f"elements: must be a multiple of 4 and at least 16, got {count!r}")
+
+    def reported(self) -> dict[str, Setting]:
+        return {"elements": self.elements}

@@ -4,18 +4,20 @@ Measured is the loss of the rod solver's certificate, a positive definite Hessia
 stays in its vertical plane. The limit of a strip that does not bend in its own plane is reached by extrapolation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import _sim_core, build_info
+from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult, Setting
+from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.rod_chain import (
     Equilibrium,
     Relax,
-    check_elements,
+    RodProtocol,
     extrapolated,
     loss_of_stability,
     planar_frames,
@@ -33,22 +35,22 @@ UP = 1.1
 UP_TO = 60.0
 
 
-def run(*, poisson: Sequence[float] = POISSON, elements: int = 128, tolerance: float = 1e-4) -> ProtocolResult:
-    """Measure rho A g L^3 / sqrt(EI GJ) at buckling and compare it with `master_curves.lateral_buckling_rod`."""
-    check_elements(elements)
-    measured = tuple(rigid_limit(nu, elements) for nu in poisson)
-    master = (master_curves.lateral_buckling_rod(),) * len(measured)
-    curve = Curve({}, tuple(float(nu) for nu in poisson), measured, master)
-    settings: dict[str, Setting] = {"elements": elements, "stiffness_ratios": STIFFNESS_RATIOS}
-    return ProtocolResult(
-        "rod-lateral-buckling",
-        "poisson",
-        "rho A g L^3 / sqrt(EI GJ)",
-        (curve,),
-        tolerance,
-        settings,
-        build_info().build_hash,
-    )
+@dataclass(kw_only=True, eq=False)
+class RodLateralBuckling(RodProtocol):
+    """The weight rho A g L^3 / sqrt(EI GJ) at buckling, against `master_curves.lateral_buckling_rod`."""
+
+    name, x_name, y_name = "rod-lateral-buckling", "poisson", "rho A g L^3 / sqrt(EI GJ)"
+    points = "poisson"
+
+    poisson: Sequence[float] = POISSON
+    elements: int = 128
+    tolerance: float = 1e-4
+
+    def measure(self, poisson: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        return rigid_limit(poisson, self.elements), master_curves.lateral_buckling_rod()
+
+    def reported(self) -> dict[str, Setting]:
+        return super().reported() | {"stiffness_ratios": STIFFNESS_RATIOS}
 
 
 def rigid_limit(poisson: float, elements: int) -> float:

@@ -1,24 +1,20 @@
 """Stacked incline: sheets lie on each other on a slope that grows; the interface of least friction slips, alone."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import fabric
-from stickslip_sim_core.cloth.meshes import Diagonals
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, SelfContact, plane
-from stickslip_sim_core.protocols.inclined_plane import (
-    DRIFT_MAX,
-    HOLD_SHARE,
-    HOLD_TIME,
-    tilted,
-)
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.strip import DIAGONALS
+from stickslip_sim_core.protocols.inclined_plane import DRIFT_MAX, HOLD_SHARE, HOLD_TIME, tilted
+from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.protocols.strip import MeshKind, rectangle
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 SHEETS = (2, 4)
@@ -35,72 +31,45 @@ MOVED = 1e-6  # m: sheets whose vertices have all come so far over what is below
 FORCE_SHARE = 0.1
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    friction: Sequence[float] = FRICTION,
-    sheets: Sequence[int] = SHEETS,
-    cells: int = 4,
-    structured: int = 1,
-    unstructured: int = 1,
-    tolerance: float = 0.002,
-) -> ProtocolResult:
-    """Measure tan(alpha) of the slope at which the upper sheets of a stack slide, and compare it with mu.
+@dataclass(kw_only=True, eq=False)
+class StackedIncline(MeshedProtocol):
+    """Tan(alpha) of the slope at which the upper sheets of a stack slide, against mu of the middle interface.
 
-    Interfaces are rougher than mu but for the middle one. A stack whose sheets come further than `DRIFT_MAX` in 10 s at
-    90 % of the angle atan(mu), or in which anything but the middle interface slides, has no slip angle: its measurement
-    is NaN.
-
-    Args:
-        preset: Solver settings, or their name.
-        friction: Of the middle interface.
-        sheets: Numbers of sheets, at least 2 each.
-        cells: Of the mesh of the sheet on top along a side; the others have cells of about that size.
-        structured: Number of structured meshes, 0 to 4: their cells are cut along alternating, random, left or right
-            diagonals.
-        unstructured: Number of unstructured ones.
-        tolerance: Largest |relative error| that passes.
+    The other interfaces are rougher than mu. A stack whose sheets come further than `DRIFT_MAX` in 10 s at 90 % of the
+    angle atan(mu), or in which another interface slides, has no slip angle: its measurement is NaN.
     """
-    settings = preset_named(preset)
-    curves, furthest, least, unconverged = [], 0.0, np.inf, 0
-    kinds: list[Diagonals | int] = [*DIAGONALS[:structured], *range(unstructured)]
-    for count in sheets:
-        for number, kind in enumerate(kinds):
-            measured = []
-            for mu in friction:
-                stack = Stack(count, mu, settings, cells, kind)
-                moved = stack.drift()
-                furthest, unconverged = max(furthest, moved), unconverged + stack.cloth.unconverged_steps
-                least = min(least, stack.cloth.least_distance)
-                stack = Stack(count, mu, settings, cells, kind)
-                slope = stack.slip_slope()
-                unconverged += stack.cloth.unconverged_steps
-                least = min(least, stack.cloth.least_distance)
-                measured.append(slope if moved <= DRIFT_MAX else np.nan)
-            exact = tuple(float(mu) for mu in friction)
-            curves.append(Curve({"sheets": float(count), "mesh": float(number)}, exact, tuple(measured), exact))
-    return ProtocolResult(
-        "stacked-incline",
-        "mu",
-        "tan(alpha) at slip",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "time_step": settings.time_step,
-            "cells": cells,
-            "meshes": ", ".join(
-                f"{i} {'unstructured' if isinstance(kind, int) else 'grid'} {kind}" for i, kind in enumerate(kinds)
-            ),
+
+    name, x_name, y_name = "stacked-incline", "mu", "tan(alpha) at slip"
+    points, parameters = "friction", {"sheets": "sheets", "mesh": "meshes"}
+
+    friction: Sequence[float] = FRICTION
+    """Of the middle interface."""
+    sheets: Sequence[int] = SHEETS
+    """Numbers of sheets, at least 2 each."""
+    cells: int = 4
+    """Of the sheet on top along a side; the others have cells of about that size."""
+    tolerance: float = 0.002
+
+    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        creeping, slipping = (
+            Stack(at["sheets"], mu, self.solver, self.cells, self.kinds[at["mesh"]]) for _ in range(2)
+        )
+        moved, slope = creeping.drift(), slipping.slip_slope()
+        self.tally.note(moved)
+        self.tally.count(creeping.cloth)
+        self.tally.count(slipping.cloth)
+        return slope if moved <= DRIFT_MAX else np.nan, mu
+
+    def reported(self) -> dict[str, Setting]:
+        return {
+            **super().reported(),
             "force_scale_over_node_weight": FORCE_SHARE,
-            "drift_mm": 1e3 * furthest,
+            "drift_mm": 1e3 * self.tally.largest,
             "drift_seconds": HOLD_TIME,
             "drift_share_of_slip_angle": HOLD_SHARE,
-            "least_distance_over_thickness": least / THICKNESS,
-            "unconverged_steps": unconverged,
-        },
-        build_info().build_hash,
-    )
+            "least_distance_over_thickness": self.tally.least_distance / THICKNESS,
+            "unconverged_steps": self.tally.unconverged_steps,
+        }
 
 
 class Stack:
@@ -115,7 +84,7 @@ class Stack:
     """
 
     def __init__(
-        self, sheets: int, mu: float, preset: SolverSettings, cells: int, kind: Diagonals | int = "alternating"
+        self, sheets: int, mu: float, preset: SolverSettings, cells: int, kind: MeshKind = "alternating"
     ) -> None:
         if sheets < 2:
             raise ValueError(f"sheets: must be at least 2, got {sheets}")
@@ -123,11 +92,8 @@ class Stack:
         parts = []
         for level in range(sheets):
             side = TOP + 2.0 * WIDER * (sheets - 1 - level)
-            if isinstance(kind, int):
-                parts.append(meshes.unstructured(side, side, TOP / cells, kind + level))
-            else:
-                count = round(side / TOP * cells)
-                parts.append(meshes.grid(side, side, count, count, kind, seed=level))
+            count = round(side / TOP * cells)
+            parts.append(rectangle(side, side, (count, count), TOP / cells, kind, level))
         friction = np.full((sheets, sheets), ROUGHER * mu)
         friction[self.loose - 1, self.loose] = friction[self.loose, self.loose - 1] = mu
         laid = fabric(FABRIC)

@@ -5,17 +5,18 @@ that Q/P, which goes with the square root of that strain, grows at an even pace,
 its place is the friction that the solver has, by `master_curves.stick_slip`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core import build_info
 from stickslip_sim_core.cloth.fabrics import isotropic
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth, plane
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, strips
+from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
 from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)
@@ -58,93 +59,79 @@ class Press:
     unconverged_steps: int
 
 
-def run(
-    *,
-    preset: str | SolverSettings = "certified",
-    friction: Sequence[float] = FRICTION,
-    cells: int = 50,
-    structured: int = 2,
-    unstructured: int = 2,
-    phases: bool = True,
-    tolerance: float = 0.01,
-) -> ProtocolResult:
-    """Measure the friction at which tips slip, and compare it with that of the wall.
-
-    Args:
-        preset: Solver settings, or their name.
-        friction: Of the wall, between 0 and the triple point's 0.356370.
-        cells: Of a mesh along the strip.
-        structured: Number of structured meshes, 0 ... 4.
-        unstructured: Number of unstructured ones.
-        phases: Whether to look beyond the triple point, too, for the phase diagram.
-        tolerance: Largest |relative error| of the friction that passes.
+@dataclass(kw_only=True, eq=False)
+class StickSlip(MeshedProtocol):
+    """The friction at which tips slip, against that of the wall.
 
     Raises:
         ValueError: A friction is not on the master curve.
     """
-    settings = preset_named(preset)
-    master_curves.stick_slip_strain(friction)  # refuses what is not on it
-    end = master_curves.stick_slip_triple_point()[0]
-    curves, names, static, steps, unconverged = [], [], [0.0], 0, 0
-    diagram: list[tuple[float, float, float]] = []
-    for number, strip in enumerate(strips(CELLS_ACROSS * LENGTH / cells, cells, structured, unstructured)):
-        presses = [press(strip, mu, settings, end) for mu in friction]
-        slip = np.array([one.slip for one in presses])
-        measured = np.full(len(slip), np.nan)
-        measured[np.isfinite(slip)] = master_curves.stick_slip(slip[np.isfinite(slip)])
-        exact = tuple(float(mu) for mu in friction)
-        curves.append(Curve({"mesh": float(number)}, exact, tuple(measured.tolist()), exact))
-        names.append(f"{number} {strip.name}")
-        if number == 0:
-            diagram += [point for mu, one in zip(exact, presses, strict=True) for point in _phases(mu, one, end)]
-            if phases:
-                beyond = [press(strip, mu, settings, PHASE_STRAIN[-1]) for mu in PHASE_FRICTION]
-                pairs = zip(PHASE_FRICTION, beyond, strict=True)
-                diagram += [point for mu, one in pairs for point in _phases(mu, one, PHASE_STRAIN[-1])]
-                presses += beyond
-        static += [one.static_error for one in presses if np.isfinite(one.static_error)]
-        steps += sum(one.steps for one in presses)
-        unconverged += sum(one.unconverged_steps for one in presses)
-    mu, strain, regime = (tuple(column) for column in zip(*diagram, strict=True)) if diagram else ((), (), ())
-    return ProtocolResult(
-        "stick-slip",
-        "mu",
-        "mu at which the tip slips",
-        tuple(curves),
-        tolerance,
-        {
-            "preset": settings.name,
-            "time_step": settings.time_step,
-            "cells": cells,
-            "meshes": ", ".join(names),
-            "static_ratio_error": max(static),
-            "steps": steps,
-            "unconverged_steps": unconverged,
-            "phase_mu": mu,
-            "phase_strain": strain,
-            "phase_regime": regime,
-        },
-        build_info().build_hash,
-    )
+
+    name, x_name, y_name = "stick-slip", "mu", "mu at which the tip slips"
+    points = "friction"
+
+    friction: Sequence[float] = FRICTION
+    """Of the wall, between 0 and the triple point's 0.356370."""
+    cells: int = 50
+    """Of a mesh along the strip."""
+    structured: int = 2
+    unstructured: int = 2
+    phases: bool = True
+    """Whether the first mesh is pressed beyond the triple point, too, for the phase diagram."""
+    tolerance: float = 0.01
+
+    diagram: list[tuple[float, float, float]] = field(default_factory=list, init=False, repr=False)
+    """(mu, strain, regime) of the first mesh."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        master_curves.stick_slip_strain(self.friction)  # refuses what is not on it
+
+    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        strain = self.press(at["mesh"], mu, master_curves.stick_slip_triple_point()[0]).slip
+        return float(master_curves.stick_slip(strain)) if np.isfinite(strain) else np.nan, mu
+
+    def press(self, mesh: int, mu: float, end: float) -> "Press":
+        """Press the strip of a mesh up to the strain `end`."""
+        pressed = strip(CELLS_ACROSS * LENGTH / self.cells, self.cells, self.kinds[mesh])
+        found = press(pressed, mu, self.solver, end)
+        if mesh == 0:
+            self.diagram += _phases(mu, found, end)
+        if np.isfinite(found.static_error):
+            self.tally.note(found.static_error)
+        self.tally.steps += found.steps
+        self.tally.unconverged_steps += found.unconverged_steps
+        return found
+
+    def reported(self) -> dict[str, Setting]:
+        for mu in PHASE_FRICTION if self.phases and self.kinds else ():
+            self.press(0, mu, PHASE_STRAIN[-1])
+        columns = list(zip(*self.diagram, strict=True)) or [(), (), ()]
+        return {
+            **super().reported(),
+            "static_ratio_error": self.tally.largest,
+            **self.counted(),
+            **dict(zip(("phase_mu", "phase_strain", "phase_regime"), columns, strict=True)),
+        }
 
 
-def press(strip: Strip, mu: float, preset: SolverSettings, strain_end: float) -> Press:
+def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float) -> Press:
     """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`."""
-    width = float(np.ptp(strip.across))
+    width = float(np.ptp(clamped.across))
     buckling = 20.1907 * RIGIDITY * width / LENGTH**2  # N
     cloth = Cloth(
-        strip.mesh,
+        clamped.mesh,
         isotropic(DENSITY, STRETCHING, RIGIDITY),
         preset,
-        held=strip.held,
-        clamped=strip.clamped,
-        force_scale=FORCE_SHARE * buckling / len(strip.tip),
+        held=clamped.held,
+        clamped=clamped.clamped,
+        force_scale=FORCE_SHARE * buckling / len(clamped.tip),
     )
     # The wall is the floor, the clamp above it; the outward slope at the clamp points up.
-    upright = np.stack([np.zeros_like(strip.along), strip.across, LENGTH - strip.along], axis=1)
-    slopes = np.tile([0.0, 0.0, 1.0], (len(strip.clamped), 1))
+    upright = np.stack([np.zeros_like(clamped.along), clamped.across, LENGTH - clamped.along], axis=1)
+    slopes = np.tile([0.0, 0.0, 1.0], (len(clamped.clamped), 1))
     cloth.set_state(upright, None, slopes)
-    wall, clamp = [plane(mu)], upright[strip.held]
+    wall, clamp = [plane(mu)], upright[clamped.held]
     mass = float(cloth.masses.sum())
     dt = preset.time_step
     history: list[tuple[float, float, float]] = []
@@ -154,11 +141,11 @@ def press(strip: Strip, mu: float, preset: SolverSettings, strain_end: float) ->
         load = min(STRETCHING * width * strain, buckling)
         cloth.gravity[:] = [BIAS * load / mass * max(0.0, 1.0 - strain / BIAS_UNTIL), 0.0, 0.0]
         cloth.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
-        force = cloth.reactions[strip.tip].sum(axis=0)
-        moved = abs(cloth.positions[strip.tip, 0].mean()) / LENGTH
+        force = cloth.reactions[clamped.tip].sum(axis=0)
+        moved = abs(cloth.positions[clamped.tip, 0].mean()) / LENGTH
         history.append((strain, float(np.hypot(force[0], force[1]) / max(force[2], 1e-15)), float(moved)))
         touching = np.flatnonzero(cloth.contacts >= 0)
-        if np.isnan(extended) and not np.isin(touching, strip.tip).all():
+        if np.isnan(extended) and not np.isin(touching, clamped.tip).all():
             extended = strain
         if not moved <= MOVED:
             break
