@@ -6,8 +6,9 @@ from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.cli import app
 from stickslip_training.cloth.clips import read_clips
 from stickslip_training.cloth.crop import HEIGHT, WIDTH
+from stickslip_training.cloth.learner import ClothTraining, train_friction
+from stickslip_training.cloth.model import save_friction
 from stickslip_training.cloth.runs import load_runs
-from stickslip_training.cloth.training import ClothTraining, save_friction, train_friction
 from stickslip_training.data.reader import DatasetReader
 from typer.testing import CliRunner
 
@@ -65,7 +66,7 @@ def test_predictions_of_a_dataset_are_a_list_that_can_be_scored(model, clips, tm
     answers = json.loads(result.stdout)
     assert [answer["slot"] for answer in answers] == [0, 2, 3]
     for answer in answers:
-        assert set(answer) == {"slot", "material", "mu", "strangeness"}
+        assert set(answer) == {"slot", "material", "mu", "ood_score"}
         assert sum(answer["material"].values()) == pytest.approx(1.0, abs=1e-4)
         assert 0 <= answer["mu"]["low"] <= answer["mu"]["median"] <= answer["mu"]["high"] <= 1.6
     (tmp_path / "answers.json").write_text(result.stdout)

@@ -27,10 +27,10 @@ def answers(mu, deviation, material, certain=0.9):
 def truth(mu, material=None, run=None):
     count = len(mu)
     return Truth(
-        np.zeros(count, int) if material is None else np.asarray(material),
-        np.asarray(mu, dtype=float),
-        np.where(np.arange(count) % 2, 1, -1),
-        np.arange(count) if run is None else np.asarray(run),
+        material=np.zeros(count, int) if material is None else np.asarray(material),
+        mu=np.asarray(mu, dtype=float),
+        landed=np.where(np.arange(count) % 2, 1, -1),
+        run=np.arange(count) if run is None else np.asarray(run),
     )
 
 

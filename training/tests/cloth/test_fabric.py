@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 import torch
 from stickslip_training.cli import app
+from stickslip_training.cloth.clips import render_clips
 from stickslip_training.cloth.fabric import FABRIC, fabric_numbers, score_fabric, told_fabric
+from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
+from stickslip_training.cloth.model import load_friction, save_friction
 from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.runs import load_runs
-from stickslip_training.cloth.training import (
-    ClothTraining,
-    _FrictionLearner,
-    load_friction,
-    render_clips,
-    save_friction,
-    train_friction,
-)
 from typer.testing import CliRunner
 
 FABRICS = Path(__file__).with_name("fabrics.npz")
@@ -121,9 +116,9 @@ def test_it_goes_on_from_the_weights_of_the_package_and_learns_its_new_heads(par
     start = load_friction()
     assert start.quantities == ()
     named = [part.named(start.materials) for part in parts]
-    learner = _FrictionLearner(*named, replace(SMALL, width=96, batch_size=6, smoothing=(0.02, 0.02)), start=start)
+    learner = FrictionLearner(*named, replace(SMALL, width=96, batch_size=6, smoothing=(0.02, 0.02)), start=start)
     weights = learner.net.state_dict()
-    assert all(torch.equal(weights[name], tensor) for name, tensor in start.nets[0].state_dict().items())
+    assert all(torch.equal(weights[name], tensor) for name, tensor in start.net.state_dict().items())
     batch = learner.batch(0)
     monkeypatch.setattr(learner, "batch", lambda step: batch)
     place = torch.from_numpy(LENGTH.bins.place(batch[4][:, 2].numpy()))

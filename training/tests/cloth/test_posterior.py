@@ -64,11 +64,3 @@ def test_the_joint_histogram_has_both_models_of_the_thesis():
     densities = np.exp(posterior.log_likelihood(np.array([0, 1]), np.array([0.3, 0.6])))
     assert densities[1] / densities[0] == pytest.approx(3.0, rel=1e-3)
     assert densities[1] == pytest.approx(0.75 / (0.05 * np.sqrt(2 * np.pi)), rel=0.05)
-
-
-def test_an_ensemble_is_the_mean_and_must_speak_of_the_same():
-    first = Posterior(("a",), BINS, normal([0.3], 0.05)[:, None])
-    second = Posterior(("a",), BINS, normal([0.9], 0.05)[:, None])
-    assert Posterior.mean([first, second]).mu == pytest.approx((first.mu + second.mu) / 2)
-    with pytest.raises(ValueError, match="must have the same materials and bins"):
-        Posterior.mean([first, Posterior(("b",), BINS, second.joint)])

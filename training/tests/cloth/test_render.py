@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 import torch
 from stickslip_schemas.spec.cameras import Camera
+from stickslip_training.cloth.clips import INSTANTS, frames_at, training_cameras
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, stage
 from stickslip_training.cloth.render import (
+    POINTS,
+    _refined,
     draw_textures,
-    silhouettes,
     splat,
-    splat_meshes,
     turned,
 )
-from stickslip_training.cloth.training import INSTANTS, frames_at, training_cameras
 
 RIG = training_cameras()
 FACING = Camera.looking_at(
@@ -22,6 +22,14 @@ def square(side, center=(0.0, 0.0), half=0.1, x=0.0):
     """A square in the plane of x, as a grid of vertices; 100 px a metre in `FACING`."""
     y, z = torch.meshgrid(torch.linspace(-half, half, side), torch.linspace(-half, half, side), indexing="xy")
     return torch.stack([torch.full_like(y, x), y + center[0], z + center[1]], dim=-1)
+
+
+def silhouettes(positions, camera, points):
+    """Share of each pixel of the picture that meshes (F, side, side, 3) cover, (F, height, width)."""
+    fine = _refined(positions[None], points)
+    whole = Crops(torch.zeros(1, len(positions), 2), torch.ones(1, len(positions)), (0.0, 0.0))
+    size = camera.height, camera.width
+    return splat(fine, torch.ones(fine.shape[:-1]), Cameras.of([camera]), whole, size=size)[0][0]
 
 
 def test_a_square_covers_its_area_wherever_it_lies():
@@ -69,7 +77,8 @@ def test_crops_of_a_picture_are_what_is_rendered_into_them(runs, camera):
     meshes = torch.from_numpy(runs.positions[:1, frames])
     cameras = Cameras.of([camera])
     crops = holder_crops(cameras, instants)
-    direct = splat_meshes(meshes, cameras, crops)
+    fine = _refined(meshes, POINTS)
+    direct = splat(fine, torch.ones(fine.shape[:-1]), cameras, crops)[0]
     through = cut(silhouettes(meshes[0], camera, points=200)[None], crops)
     assert through.shape == direct.shape == (1, 6, HEIGHT, WIDTH)
     assert (through - direct).abs().mean() < 0.012

@@ -8,9 +8,9 @@ import pytest
 import torch
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_testing.films import meshes_at, write_film
+from stickslip_training.cloth.clips import INSTANTS
 from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
-from stickslip_training.cloth.training import INSTANTS
 from stickslip_training.cloth.video import (
     RATE,
     Calibration,

@@ -13,10 +13,10 @@ from stickslip_training.cli.errors import DatasetArgument, check_device, errors_
 from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
+    from stickslip_training.cloth.clips import RenderedClips
     from stickslip_training.cloth.evaluation import Errors, Scores
     from stickslip_training.cloth.fabric import FabricErrors
     from stickslip_training.cloth.runs import Runs
-    from stickslip_training.cloth.training import RenderedClips
 
 cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
 
@@ -52,7 +52,8 @@ def train(
     """Train a network that tells material and friction, on pictures rendered from simulations while it trains."""
     from stickslip_schemas.base.keys import sha256
 
-    from stickslip_training.cloth.training import ClothTraining, load_friction, save_friction, train_friction
+    from stickslip_training.cloth.learner import ClothTraining, train_friction
+    from stickslip_training.cloth.model import load_friction, save_friction
     from stickslip_training.engine.fit import EpochReport
     from stickslip_training.engine.ranks import current_rank, joined
 
@@ -106,11 +107,11 @@ def evaluate(
     """Measure how good a model is on simulations that it has not seen, and write a page about it."""
     import numpy as np
 
-    from stickslip_training.cloth.clips import read_clips
+    from stickslip_training.cloth.clips import read_clips, render_clips
     from stickslip_training.cloth.evaluation import predictions, score
     from stickslip_training.cloth.fabric import score_fabric
+    from stickslip_training.cloth.model import load_friction
     from stickslip_training.cloth.report import write_html
-    from stickslip_training.cloth.training import load_friction, render_clips
 
     with errors_told():
         friction = load_friction(model)
@@ -130,8 +131,8 @@ def evaluate(
             raise ValueError(
                 f"materials of the clips must be known to the model: it knows {', '.join(friction.materials)}"
             )
-        posterior = friction.estimate(clips)
-        scores = score(posterior, clips.truth())
+        posterior, _ = friction.estimate(clips)
+        scores = score(posterior, clips)
         fabric = (
             {}
             if np.isnan(clips.fabric).any()
@@ -208,7 +209,7 @@ def predict(
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.fabric import told_fabric
-    from stickslip_training.cloth.training import WEIGHTS, load_friction
+    from stickslip_training.cloth.model import WEIGHTS, load_friction
     from stickslip_training.cloth.video import load_clip
 
     with errors_told():
@@ -223,10 +224,10 @@ def predict(
                 fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
             true = [f"{mu:.2f}, {fabric}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
-        posterior, strangeness = friction.look(clips)
+        posterior, ood_score = friction.estimate(clips)
         answers = predictions(posterior, slots)
-        for answer, far in zip(answers, strangeness.tolist(), strict=True):
-            answer["strangeness"] = round(far, 3)
+        for answer, far in zip(answers, ood_score.tolist(), strict=True):
+            answer["ood_score"] = round(far, 3)
         for name, intervals in told_fabric(friction.quantities, friction.fabric(clips)).items():
             for answer, interval in zip(answers, intervals, strict=True):
                 answer.setdefault("fabric", {})[name] = interval
@@ -264,15 +265,15 @@ def score(
 
 
 def _warning(answer: dict[str, Any]) -> str:
-    return f"unlike the training clips: {answer['strangeness']:.1f} of 1" if answer["strangeness"] > 1 else ""
+    return f"unlike the training clips: {answer['ood_score']:.1f} of 1" if answer["ood_score"] > 1 else ""
 
 
 def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
     """Return what names the runs, and the runs of each split."""
     from stickslip_schemas.base.keys import sha256
 
+    from stickslip_training.cloth.clips import INSTANTS
     from stickslip_training.cloth.runs import load_runs, runs_of_dataset, split_runs
-    from stickslip_training.cloth.training import INSTANTS
 
     if source.endswith(".npz"):
         parts = split_runs(load_runs(source), SHARES, seed)
@@ -296,9 +297,8 @@ def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[li
     import numpy as np
     from stickslip_schemas.base.keys import sha256
 
-    from stickslip_training.cloth.clips import clips_of_file, read_clips
+    from stickslip_training.cloth.clips import Clips, RenderedClips, clips_of_file, read_clips
     from stickslip_training.cloth.runs import load_runs, split_of_runs
-    from stickslip_training.cloth.training import Clips, RenderedClips
 
     if not all(source.endswith(".npz") for source in sources):
         if len(sources) > 1:

@@ -1,21 +1,171 @@
-"""The clips of a dataset as a network sees them."""
+"""The clips that a network sees: crops around the holders, and what is true of them.
+
+They are rendered from simulations (`render_clips`), or read from a dataset (`read_clips`) or from a file
+(`clips_of_file`).
+"""
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stickslip_schemas.spec.cameras import load_rig
+from numpy.typing import NDArray
+from stickslip_schemas.spec.cameras import Camera, load_rig
 
-from stickslip_training.arrays import Array, Integers
+from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
+from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
-from stickslip_training.cloth.runs import landed_side
-from stickslip_training.cloth.training import RIG, Clips, frames_at
+from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
+from stickslip_training.cloth.runs import Runs, landed_side
 from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.engine.fit import seed_of_step
 
-_CHUNK = 8  # clips in memory at once
+RIG = "drag"
+
+VIEWPOINTS = ("calibrated", "left", "right")
+"""Those that a network is trained on; the family of turned ones is to test with."""
+
+INSTANTS = (60, 80, 130, 150, 210, 220)
+"""Of the frames that a network sees, of 300: two along each of the first three legs.
+
+By then the cloth slides steadily: leave-one-out, a mesh between two neighbours in mu is 0.03 mm from the simulation
+there, and 18 mm at instant 20, where the side of the drop still shows.
+"""
+
+CHUNK = 32
+"""Clips that are rendered or estimated at once outside of training."""
+
+TRAINING, VALIDATION = 0, 1
+"""Streams of random numbers."""
+
+_READ_CHUNK = 8  # clips of full pictures in memory at once
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Clips(Truth):
+    """Crops of clips, and their true values."""
+
+    crops: torch.Tensor
+    """(clips, F, 72, 88)"""
+    direction: torch.Tensor
+    """(clips, 3): of view."""
+    fabric: Floats
+    """(clips, 3): log10 of `fabric.FABRIC`; NaN where they are not known."""
+
+    def __len__(self) -> int:
+        return len(self.mu)
+
+    def __getitem__(self, chosen: Integers | NDArray[np.bool_]) -> "Clips":
+        values = {field.name: getattr(self, field.name) for field in fields(Clips)}
+        parts: dict[str, Any] = {
+            name: value[torch.from_numpy(np.asarray(chosen))] if torch.is_tensor(value) else value[chosen]
+            for name, value in values.items()
+        }
+        return Clips(**parts)
+
+    @staticmethod
+    def joined(parts: "Sequence[Clips]") -> "Clips":
+        """Return the clips of all parts."""
+        columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Clips)}
+        whole: dict[str, Any] = {
+            name: torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each)
+            for name, each in columns.items()
+        }
+        return Clips(**whole)
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedClips:
+    """Clips of another renderer to train on besides the pictures that are rendered while training.
+
+    Half of each batch is then of `train`; `validation` chooses the weights and the temperature.
+    """
+
+    train: Clips
+    validation: Clips
+
+    def __post_init__(self) -> None:
+        for name in ("train", "validation"):
+            part: Clips = getattr(self, name)
+            if not len(part) or (part.material < 0).any():
+                raise ValueError(f"the clips for {name} must be some, and of materials of the runs: {len(part)} clips")
+        if shared := set(self.train.run.tolist()) & set(self.validation.run.tolist()):
+            raise ValueError(f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}")
+
+
+def frames_at(
+    instants: tuple[int, ...], wanted: tuple[int, ...] = INSTANTS, off: int = 2
+) -> tuple[list[int], tuple[int, ...]]:
+    """Return the frames that are nearest to the instants that a network sees, and their instants.
+
+    Raises ValueError where one is more than `off` instants from any frame.
+    """
+    frames = [int(np.abs(np.asarray(instants) - instant).argmin()) for instant in wanted]
+    for frame, instant in zip(frames, wanted, strict=True):
+        if abs(instants[frame] - instant) > off:
+            raise ValueError(
+                f"a clip must show the instant {instant} of 300 to within {off}; its nearest is {instants[frame]}"
+            )
+    return frames, tuple(instants[frame] for frame in frames)
+
+
+def training_cameras() -> tuple[Camera, ...]:
+    """Return the cameras that a network is trained on."""
+    return tuple(camera for camera in load_rig(RIG) if camera.name in VIEWPOINTS)
+
+
+def render_clips(
+    runs: Runs, renders: int, seed: int, *, spread: float = 0.0, wanted: tuple[int, ...] = INSTANTS
+) -> Clips:
+    """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
+
+    `spread` is the standard deviation of random turns of the cameras [degree].
+    """
+    frames, instants = frames_at(runs.instants, wanted)
+    rig = training_cameras()
+    number = np.repeat(np.arange(len(runs)), renders)
+    crops, directions = [], []
+    for start in range(0, len(number), CHUNK):
+        chosen = number[start : start + CHUNK]
+        generator = torch.Generator().manual_seed(seed_of_step(seed, VALIDATION, start))
+        views = [rig[(start + place) % len(rig)] for place in range(len(chosen))]
+        seen = randomly_turned(Cameras.of(views), spread, generator)
+        looks = draw_style(len(chosen), len(frames), generator)
+        meshes = torch.from_numpy(runs.positions[chosen][:, frames])
+        crops.append(render_crops(meshes, seen, instants, looks, generator))
+        directions.append(seen.rotation[:, 2])
+    shown = runs[number]
+    return Clips(
+        crops=torch.cat(crops),
+        direction=torch.cat(directions),
+        material=shown.material,
+        mu=shown.mu,
+        landed=shown.landed,
+        run=number,
+        fabric=shown.fabric,
+    )
+
+
+def jittered(crops: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Return crops (B, F, H, W) with a gamma, gain, offset and shift of each clip's own, and noise.
+
+    They differ as other exposures and registrations would; values stay about 0 to 1.
+    """
+
+    def drawn(deviation: float) -> torch.Tensor:
+        return deviation * torch.randn(len(crops), 1, 1, 1, generator=generator)
+
+    changed = crops.clamp(1e-3, 1.0) ** torch.exp(drawn(0.25)) * torch.exp(drawn(0.15)) + drawn(0.05)
+    shifts = torch.randint(-1, 2, (len(crops), 2), generator=generator).tolist()
+    moved = [torch.roll(clip, shift, (1, 2)) for clip, shift in zip(changed, shifts, strict=True)]
+    return torch.stack(moved) + 0.01 * torch.randn(crops.shape, generator=generator)
+
+
+# --- reading ---------------------------------------------------------------------------------------------------
 
 
 def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str, ...]) -> tuple[Clips, Integers]:
@@ -34,16 +184,21 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
     views = [cameras[names[code]] for code in reader.label("viewpoint")[slots].tolist()]
     seen = Cameras.of(views)
     crops = []
-    for start in range(0, len(slots), _CHUNK):
-        video = torch.from_numpy(reader.read("video", slots[start : start + _CHUNK])[:, frames])
-        place = holder_crops(seen[start : start + _CHUNK], instants)
+    for start in range(0, len(slots), _READ_CHUNK):
+        video = torch.from_numpy(reader.read("video", slots[start : start + _READ_CHUNK])[:, frames])
+        place = holder_crops(seen[start : start + _READ_CHUNK], instants)
         crops.append(cut(grey(video), place))
     known = np.array([materials.index(name) if name in materials else -1 for name in reader.categories("material")])
-    mu = reader.label("mu")[slots].astype(np.float64)
-    material = known[reader.label("material")[slots]]
-    fabric = fabric_numbers(*(reader.label(name)[slots] for name in ("areal_density", "bending_rigidity")))
-    landed, runs = _landed(reader, slots), simulations(reader, slots)
-    return Clips(torch.cat(crops), seen.rotation[:, 2], material, mu, landed, runs, fabric), slots
+    clips = Clips(
+        crops=torch.cat(crops),
+        direction=seen.rotation[:, 2],
+        material=known[reader.label("material")[slots]],
+        mu=reader.label("mu")[slots].astype(np.float64),
+        landed=_landed(reader, slots),
+        run=simulations(reader, slots),
+        fabric=fabric_numbers(*(reader.label(name)[slots] for name in ("areal_density", "bending_rigidity"))),
+    )
+    return clips, slots
 
 
 def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[dict[str, Any]]]:
@@ -65,8 +220,16 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
     ]
     known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
     mu, landed, run = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
-    fabric = numbers_of_runs(about)
-    return Clips(torch.cat(crops), seen.rotation[:, 2], np.array(known), mu, landed, run, fabric), about
+    clips = Clips(
+        crops=torch.cat(crops),
+        direction=seen.rotation[:, 2],
+        material=np.array(known),
+        mu=mu,
+        landed=landed,
+        run=run,
+        fabric=numbers_of_runs(about),
+    )
+    return clips, about
 
 
 def check_kind(reader: DatasetReader) -> None:

@@ -75,15 +75,16 @@ class Scores:
         return asdict(self)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Truth:
-    """Of some clips."""
+    """True values of some clips, (clips,) each."""
 
     material: Integers
     mu: Floats
     landed: Integers
+    """The side along x to which the cloth fell, +1 or -1."""
     run: Integers
-    """Number of the simulation."""
+    """Number of the simulation: errors count simulations and not clips."""
 
 
 def score(posterior: Posterior, truth: Truth) -> Scores:

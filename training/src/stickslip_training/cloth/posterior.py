@@ -1,17 +1,16 @@
-"""What a clip tells: a joint histogram over material and mu, and what is read off it.
+"""The posterior of material and friction of a clip, a joint histogram, and estimates from it.
 
     p(m, mu) = p(m) p(mu | m)
 
-The histogram is the answer: its marginals are the thesis's two models, one blind to the material and one that is given
-it. Where there are two branches, a mean would lie where nothing is: mu is told as the median of its marginal, with the
-shortest interval that holds 80 % of it.
+Its marginal and its conditional are the thesis's two models: mu of an unknown and of a known material. A histogram may
+have two branches, so the estimate of mu is the median of the marginal, with the shortest interval that holds 80 %.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from stickslip_training.arrays import Floats, Integers
+from stickslip_training.arrays import Floats, Integers, SingleFloats
 
 SHARE = 0.8
 """Of the probability that an interval holds."""
@@ -89,12 +88,22 @@ class Posterior:
         return np.asarray(np.log(density + 1e-12))
 
     @staticmethod
-    def mean(posteriors: "list[Posterior]") -> "Posterior":
-        """Return the mixture of the answers of several networks to the same clips."""
-        first = posteriors[0]
-        if any((other.materials, other.bins) != (first.materials, first.bins) for other in posteriors):
-            raise ValueError("networks of an ensemble must have the same materials and bins")
-        return Posterior(first.materials, first.bins, np.mean([other.joint for other in posteriors], axis=0))
+    def of(
+        log_material: SingleFloats,
+        log_mu: SingleFloats,
+        materials: tuple[str, ...],
+        bins: Bins,
+        temperature: tuple[float, float],
+    ) -> "Posterior":
+        """Return the histograms of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at these temperatures."""
+        p_material, p_mu = softmax(log_material / temperature[0]), softmax(log_mu / temperature[1])
+        return Posterior(materials, bins, p_material[..., None] * p_mu)
+
+
+def softmax(logits: SingleFloats) -> Floats:
+    """Return exp(logits) over its sum along the last axis, in double precision."""
+    shifted = np.exp((logits - logits.max(axis=-1, keepdims=True)).astype(np.float64))
+    return np.asarray(shifted / shifted.sum(axis=-1, keepdims=True))
 
 
 def estimates(histogram: Floats, bins: Bins, share: float = SHARE) -> Estimates:

@@ -14,8 +14,9 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
 import torch
-from stickslip_schemas.spec.cameras import Camera
+from scipy.interpolate import CubicHermiteSpline
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
 
@@ -126,6 +127,12 @@ def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> 
     return Cameras(rotation, seen - (rotation @ middle[..., None])[..., 0], cameras.focal, cameras.center)
 
 
+def randomly_turned(cameras: Cameras, deviation: float, generator: torch.Generator) -> Cameras:
+    """Turn each camera by angles of its own of this standard deviation [degree]."""
+    azimuth, elevation = torch.deg2rad(deviation * torch.randn(2, len(cameras.focal), generator=generator))
+    return turned(cameras, azimuth, elevation)
+
+
 def render_crops(
     positions: torch.Tensor,
     cameras: Cameras,
@@ -156,27 +163,6 @@ def render_crops(
     return picture.clamp(0.0, 1.0)
 
 
-def silhouettes(positions: torch.Tensor, camera: Camera, points: int = 160) -> torch.Tensor:
-    """Return how much of each pixel of a picture the cloth covers, (F, height, width), 0 to 1.
-
-    `positions` (F, side, side, 3) [m] are refined to `points` a side, which must be closer together than pixels.
-    """
-    fine = _refined(positions[None], points)
-    whole = Crops(torch.zeros(1, len(positions), 2), torch.ones(1, len(positions)), (0.0, 0.0))
-    size = camera.height, camera.width
-    return splat(fine, torch.ones(fine.shape[:-1]), Cameras.of([camera]), whole, size=size)[0][0]
-
-
-def splat_meshes(positions: torch.Tensor, cameras: Cameras, crops: Crops) -> torch.Tensor:
-    """Return how much of each pixel of the crops the cloth covers, (B, F, 72, 88), of meshes (B, F, side, side, 3)."""
-    covered = []
-    for clip in range(len(positions)):
-        one = slice(clip, clip + 1)
-        fine = _refined(positions[one], POINTS)
-        covered.append(splat(fine, torch.ones(fine.shape[:-1]), cameras[one], crops[one])[0])
-    return torch.cat(covered)
-
-
 def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
     """Refine fields on meshes (B, F, side, side, n) to (B, F, points, points, n), smoothly."""
     weights = _spline(fields.shape[2], points)
@@ -188,27 +174,10 @@ def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
 
 @cache
 def _spline(nodes: int, points: int) -> torch.Tensor:
-    """Return W, (points, nodes): W @ y are values of the Catmull-Rom spline through y, which goes on straight at its
-    ends."""
-    place = torch.linspace(0, nodes - 1, points, dtype=torch.float64)
-    cell = place.floor().clamp(max=nodes - 2).long()
-    t = place - cell
-    basis = torch.stack(
-        [
-            -0.5 * t + t**2 - 0.5 * t**3,
-            1 - 2.5 * t**2 + 1.5 * t**3,
-            0.5 * t + 2 * t**2 - 1.5 * t**3,
-            -0.5 * t**2 + 0.5 * t**3,
-        ],
-        dim=1,
-    )
-    padded = torch.zeros(points, nodes + 2, dtype=torch.float64)
-    padded.scatter_(1, cell[:, None] + torch.arange(4), basis)
-    weights = padded[:, 1:-1].clone()
-    for ghost, first, second in ((0, 0, 1), (-1, -1, -2)):  # y_ghost = 2 y_first - y_second
-        weights[:, first] += 2 * padded[:, ghost]
-        weights[:, second] -= padded[:, ghost]
-    return weights.float()
+    """Return W, (points, nodes): W @ y are values of the Catmull-Rom spline through y."""
+    unit = np.eye(nodes)
+    spline = CubicHermiteSpline(np.arange(nodes), unit, np.gradient(unit, axis=0))
+    return torch.from_numpy(spline(np.linspace(0, nodes - 1, points)).astype(np.float32))
 
 
 def shading(positions: torch.Tensor, cameras: Cameras, style: Style) -> torch.Tensor:

@@ -11,9 +11,9 @@ import numpy as np
 from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array
+from stickslip_training.cloth.clips import Clips
 from stickslip_training.cloth.evaluation import Errors, Measure, Scores
 from stickslip_training.cloth.posterior import Posterior, estimates
-from stickslip_training.cloth.training import Clips
 
 _WORST = 8  # clips that are shown
 _SIZE = 320  # of a plot [px]

@@ -28,9 +28,9 @@ from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Floats
+from stickslip_training.cloth.clips import INSTANTS, Clips, frames_at
 from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, stage
 from stickslip_training.cloth.fabric import FABRIC
-from stickslip_training.cloth.training import INSTANTS, Clips, frames_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -194,8 +194,15 @@ def load_clip(path: str | Path) -> Clips:
     except (KeyError, OSError, ValueError) as error:
         raise ValueError(f"{path} must be a clip that `cloth import` wrote: {error}") from error
     unknown = np.array([-1])
-    fabric = np.full((1, len(FABRIC)), math.nan)
-    return Clips(crops, direction, unknown, np.array([math.nan]), unknown, np.array([0]), fabric)
+    return Clips(
+        crops=crops,
+        direction=direction,
+        material=unknown,
+        mu=np.array([math.nan]),
+        landed=unknown,
+        run=np.array([0]),
+        fabric=np.full((1, len(FABRIC)), math.nan),
+    )
 
 
 # --- following the holders -------------------------------------------------------------------------------------

@@ -6,24 +6,12 @@ import pytest
 import torch
 from stickslip_training.cli import app
 from stickslip_training.cli.cloth import SHARES
-from stickslip_training.cloth.clips import clips_of_file
+from stickslip_training.cloth.calibration import covering_temperature, likeliest_temperatures
+from stickslip_training.cloth.clips import INSTANTS, Clips, RenderedClips, clips_of_file, jittered, render_clips
+from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
+from stickslip_training.cloth.model import WEIGHTS, load_friction, save_friction
 from stickslip_training.cloth.posterior import MU_BINS
 from stickslip_training.cloth.runs import split_of_runs, split_runs
-from stickslip_training.cloth.training import (
-    INSTANTS,
-    WEIGHTS,
-    Clips,
-    ClothTraining,
-    RenderedClips,
-    _FrictionLearner,
-    calibrated,
-    covering,
-    jittered,
-    load_friction,
-    render_clips,
-    save_friction,
-    train_friction,
-)
 from typer.testing import CliRunner
 
 SMALL = ClothTraining(steps=6, batch_size=2, width=16)
@@ -36,7 +24,7 @@ def few(runs):
 
 
 def weights(model):
-    return model.nets[0].state_dict()
+    return model.net.state_dict()
 
 
 def equal(first, second):
@@ -61,8 +49,9 @@ def test_saved_and_loaded(few, tmp_path):
     save_friction(tmp_path / "friction.safetensors", model)
     again = load_friction(tmp_path / "friction.safetensors")
     clips = render_clips(few[2], 2, 0)
-    assert np.array_equal(again.estimate(clips).joint, model.estimate(clips).joint)
-    assert np.array_equal(again.strangeness(clips), model.strangeness(clips))
+    (posterior, ood_score), (wanted, wanted_score) = again.estimate(clips), model.estimate(clips)
+    assert np.array_equal(posterior.joint, wanted.joint)
+    assert np.array_equal(ood_score, wanted_score)
     assert again.card["training_runs"] == 9
     assert (again.materials, again.instants) == (model.materials, model.instants)
 
@@ -98,35 +87,19 @@ def test_temperatures_mend_what_is_too_sure():
     mu = np.repeat(log[:, None], 2, axis=1).astype(np.float32)
     material = np.tile(np.float32([0.0, np.log(4.0)]), (2000, 1))  # 80 %, and it is so in 80 % of the cases
     code = (np.arange(2000) % 5 > 0).astype(int)
-    found = calibrated(material, mu, code, truth, MU_BINS)
+    found = likeliest_temperatures(material, mu, code, truth, MU_BINS)
     assert found[0] == pytest.approx(1.0, abs=0.1)
     assert found[1] == pytest.approx(4.0, rel=0.1)
 
 
-class Sure(torch.nn.Module):
-    """Says that mu is what the direction tells, to within 0.05, and knows one material."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(1))
-
-    def features(self, _crops, direction):
-        return direction
-
-    def read(self, features):
-        off = (torch.from_numpy(MU_BINS.centers) - features[:, :1]) / 0.05
-        return torch.zeros(len(features), 1), torch.log_softmax(-0.5 * off**2, dim=1)[:, None]
-
-
 def test_intervals_of_a_network_that_is_twice_too_sure_become_twice_as_wide():
-    count = 2000
     random = np.random.default_rng(0)
-    mu = random.uniform(0.5, 1.1, count)
-    told = torch.from_numpy(np.stack([mu + random.normal(0.0, 0.1, count)] * 3, axis=1))
-    zeros = np.zeros(count, int)
-    clips = Clips(torch.zeros(count, 1, 1, 1), told, zeros, mu, zeros, np.arange(count), np.full((count, 3), np.nan))
+    mu = random.uniform(0.5, 1.1, 2000)
+    told = mu + random.normal(0.0, 0.1, 2000)
+    log_mu = (-0.5 * ((MU_BINS.centers - told[:, None]) / 0.05) ** 2)[:, None]
     # A Gaussian histogram at temperature T is sqrt(T) as wide.
-    assert covering(Sure(), clips, 1.0, ("cloth",), 0) == pytest.approx(4.0, rel=0.15)
+    found = covering_temperature(np.zeros((2000, 1), np.float32), log_mu, mu, MU_BINS, 1.0)
+    assert found == pytest.approx(4.0, rel=0.15)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +143,7 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_p
 
 def test_half_of_each_batch_is_of_the_clips(few):
     black = replace(some_clips(few).train, mu=np.full(18, 9.0))
-    learner = _FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
+    learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
     crops, direction, material, mu, _ = learner.batch(0)
     assert len(crops) == len(direction) == len(material) == 6
     assert (mu == 9.0).tolist() == [False] * 3 + [True] * 3

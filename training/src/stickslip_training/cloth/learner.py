@@ -1,0 +1,322 @@
+"""Training of the network that measures friction, on pictures that are rendered while it trains."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from stickslip_training.cloth.calibration import (
+    TrainingFeatures,
+    covering_temperature,
+    likeliest_temperature,
+    likeliest_temperatures,
+    quantity_temperatures,
+)
+from stickslip_training.cloth.clips import (
+    INSTANTS,
+    TRAINING,
+    VALIDATION,
+    RenderedClips,
+    frames_at,
+    jittered,
+    render_clips,
+    training_cameras,
+)
+from stickslip_training.cloth.crop import Cameras
+from stickslip_training.cloth.fabric import FABRIC
+from stickslip_training.cloth.model import FrictionModel, features, log_histograms, quantity_log_histograms
+from stickslip_training.cloth.nets import PosteriorNet
+from stickslip_training.cloth.posterior import MU_BINS, Posterior
+from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
+from stickslip_training.cloth.runs import Runs, between
+from stickslip_training.engine.fit import (
+    EpochReport,
+    FitSettings,
+    Fitted,
+    Learner,
+    check_device,
+    check_positive,
+    cosine_rate,
+    fit,
+    seed_of_step,
+    seeded,
+    torch_threads,
+)
+from stickslip_training.engine.ranks import Rank
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClothTraining:
+    """How a network is trained. The same settings, runs, machine and threads give the same weights."""
+
+    steps: int = 1500
+    batch_size: int = 16
+    learning_rate: float = 2e-3
+    """Of AdamW at its highest; it falls to nothing like half a cosine."""
+    averaging: float = 0.99
+    """Decay of the running average over steps that is the model's weights."""
+    smoothing: tuple[float, float] = (0.2, 0.02)
+    """Standard deviation of mu about the truth in what the network is told, at the first and at the last step [1]: it
+    learns an order first, and at the end bins."""
+    gap: float = 0.3
+    """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
+    turn: float = 4.0
+    """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    instants: tuple[int, ...] = INSTANTS
+    """Of the frames that the network sees, of 300."""
+    fabric: bool = False
+    """Also learn the numbers of the fabric, `fabric.FABRIC`. There are no meshes between neighbours in mu then: two
+    fabrics do not make a third."""
+    seed: int = 0
+    width: int = 96
+    threads: int = 1
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        check_positive(self, "steps", "batch_size", "learning_rate", "width", "threads")
+        if not all(0 < deviation < math.inf for deviation in self.smoothing):
+            raise ValueError(f"smoothing must be two numbers above 0 and finite, and is {self.smoothing}")
+        for name in ("gap", "turn"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be 0 or more and finite, and is {getattr(self, name)}")
+        check_device(self.device)
+
+
+def train_friction(
+    train: Runs,
+    validation: Runs,
+    settings: ClothTraining,
+    *,
+    clips: RenderedClips | None = None,
+    start: FrictionModel | None = None,
+    out: Path | None = None,
+    identity: dict[str, Any] | None = None,
+    resume: bool = False,
+    on_epoch: Callable[[EpochReport], None] | None = None,
+    epoch: int = 250,
+) -> FrictionModel:
+    """Train a network on runs, calibrate it on the runs for validation, and return the model.
+
+    Args:
+        train: Simulations to train on.
+        validation: Simulations that choose the weights and the temperatures.
+        settings: Settings of the training.
+        clips: Clips of another renderer to train on, too.
+        start: A model whose weights are the first.
+        out: Directory of the checkpoint; None writes none.
+        identity: Names the runs and the clips; a run that is resumed must have the same.
+        resume: Continue from the checkpoint in `out`.
+        on_epoch: Called with the report of every epoch.
+        epoch: Steps between two validations.
+    """
+    if start is not None and clips is None:
+        train, validation = (runs.named(start.materials) for runs in (train, validation))
+    with torch_threads(settings.threads):
+        learner = FrictionLearner(train, validation, settings, clips, start)
+        compared = {name: value for name, value in asdict(settings).items() if name not in ("threads", "device")}
+        fitted = fit(
+            learner,
+            FitSettings(
+                steps=settings.steps,
+                epoch=epoch,
+                seed=settings.seed,
+                averaging=settings.averaging,
+                clip=1.0,
+                threads=settings.threads,
+                device=settings.device,
+            ),
+            out=out,
+            identity=(identity or {}) | compared,
+            resume=resume,
+            on_epoch=on_epoch,
+        )
+        return learner.calibrated(fitted)
+
+
+class FrictionLearner(Learner):
+    """Every step draws runs, or meshes between two neighbours in mu, mirrors half of them, and renders them anew."""
+
+    def __init__(
+        self,
+        train: Runs,
+        validation: Runs,
+        settings: ClothTraining,
+        clips: RenderedClips | None = None,
+        start: FrictionModel | None = None,
+    ) -> None:
+        if len(train) == 0 or len(validation) == 0:
+            raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
+        self.settings = settings
+        self.rank = Rank()
+        self.frames, self.instants = frames_at(train.instants, settings.instants)
+        self.train = train
+        self.validation_runs = len(validation)
+        self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
+        self.quantities = FABRIC if settings.fabric else ()
+        for runs in (train, validation) if settings.fabric else ():
+            _check_fabric(runs)
+        gap = 0.0 if settings.fabric else settings.gap
+        self.pairs = np.array(between(train, gap) + [(run, run) for run in range(len(train))])
+        widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
+        self.chances = (widths + 0.02) / (widths + 0.02).sum()
+        self.rig = training_cameras()
+        self.clips = clips
+        self.validation = (
+            render_clips(validation, 6, settings.seed, spread=settings.turn, wanted=settings.instants)
+            if clips is None
+            else clips.validation
+        )
+        self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
+        with seeded(settings.seed):
+            self.net = PosteriorNet(
+                materials=len(train.materials),
+                bins=MU_BINS.count,
+                frames=len(self.frames),
+                width=settings.width,
+                quantities=[quantity.bins.count for quantity in self.quantities],
+            )
+        if start is not None:
+            if start.materials != train.materials or start.net.sizes != self.net.sizes:
+                raise ValueError(
+                    f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
+                    f"{', '.join(start.materials)}, and is {start.net.sizes}"
+                )
+            first = self.net.state_dict()  # heads that the start lacks begin anew
+            self.net.load_state_dict(first | {n: t for n, t in start.net.state_dict().items() if n in first})
+
+    def share(self, rank: Rank) -> None:
+        if self.settings.batch_size % rank.count:
+            raise ValueError(
+                f"batch_size must be a multiple of the {rank.count} processes, and is {self.settings.batch_size}"
+            )
+        self.rank = rank
+
+    def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
+
+    def learning_rate(self, step: int) -> float | None:
+        return cosine_rate(self.settings.learning_rate, step, self.settings.steps, 100)
+
+    def loss(self, net: nn.Module, step: int) -> torch.Tensor:
+        assert isinstance(net, PosteriorNet)
+        crops, direction, material, mu, fabric = self.batch(step)
+        first, last = self.settings.smoothing
+        deviation = first * (last / first) ** (step / self.settings.steps)
+        target = _blurred(self.centers, mu, deviation)
+        device = self.settings.device
+        seen = net.features(crops.to(device), direction.to(device))
+        log_material, log_mu = net.read(seen)
+        rows = torch.arange(len(mu), device=device)
+        given = log_mu[rows, material.to(device)]
+        loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
+        for place, (quantity, told) in enumerate(zip(self.quantities, net.read_quantities(seen), strict=True)):
+            bins = quantity.bins
+            wide = deviation * (bins.high - bins.low) / (MU_BINS.high - MU_BINS.low)
+            centers = torch.from_numpy(bins.centers.astype(np.float32))
+            loss = loss - (_blurred(centers, fabric[:, place], wide).to(device) * told).sum(dim=1).mean()
+        return torch.as_tensor(loss)
+
+    def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the crops, directions of view, materials, mu and fabrics of this process's share of a step."""
+        seeds = (self.settings.seed, TRAINING, step, *self.rank.seeds)
+        random = np.random.default_rng(seeds)
+        generator = torch.Generator().manual_seed(seed_of_step(*seeds))
+        count = self.settings.batch_size // self.rank.count
+        chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
+        share = random.random(count, dtype=np.float32)
+        near = torch.from_numpy(share)[:, None, None, None, None]
+        meshes = (1 - near) * self.meshes[chosen[:, 0]] + near * self.meshes[chosen[:, 1]]
+        mirrored = torch.from_numpy(random.random(count) < 0.5)
+        meshes[mirrored] = meshes[mirrored].flip(3) * torch.tensor([1.0, -1.0, 1.0])
+        views = [self.rig[place] for place in random.integers(len(self.rig), size=count)]
+        cameras = randomly_turned(Cameras.of(views), self.settings.turn, generator)
+        looks = draw_style(count, len(self.frames), generator)
+        crops = render_crops(meshes, cameras, self.instants, looks, generator)
+        first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
+        mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32))
+        near, far = (self.train.fabric[chosen[:, place]] for place in (0, 1))
+        fabric = torch.from_numpy((near + share[:, None] * (far - near)).astype(np.float32))
+        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, fabric
+        if self.clips is None:
+            return rendered
+        some = self.clips.train[random.integers(len(self.clips.train), size=count // 2)]
+        told = (
+            jittered(some.crops, generator),
+            some.direction,
+            torch.from_numpy(some.material),
+            torch.from_numpy(some.mu.astype(np.float32)),
+            torch.from_numpy(some.fabric.astype(np.float32)),
+        )
+        both = zip(rendered, told, strict=True)
+        a, b, c, d, e = (torch.cat([own[: count - len(some)], given]) for own, given in both)
+        return a, b, c, d, e
+
+    def validate(self, net: nn.Module) -> float | None:
+        assert isinstance(net, PosteriorNet)
+        clips, seen = self.validation, features(net, self.validation)
+        log_p = log_histograms(net, seen)
+        # Overconfidence does not count: temperatures correct it in the end.
+        temperature = likeliest_temperatures(*log_p, clips.material, clips.mu, MU_BINS)
+        posterior = Posterior.of(*log_p, self.train.materials, MU_BINS, temperature)
+        loss = -float(posterior.log_likelihood(clips.material, clips.mu).mean())
+        for place, (quantity, each) in enumerate(zip(self.quantities, quantity_log_histograms(net, seen), strict=True)):
+            loss += likeliest_temperature(each, quantity.bins.place(clips.fabric[:, place]))[1]
+        return loss
+
+    def calibrated(self, fitted: Fitted) -> FrictionModel:
+        """Return the model of a trained network, calibrated on the clips for validation."""
+        net = fitted.net.cpu()
+        assert isinstance(net, PosteriorNet)
+        settings, clips, train = self.settings, self.validation, self.train
+        seen = features(net, clips)
+        of_material, _ = likeliest_temperatures(*log_histograms(net, seen), clips.material, clips.mu, MU_BINS)
+        # Exposures and registrations differ as those of new clips may.
+        generator = torch.Generator().manual_seed(seed_of_step(settings.seed, VALIDATION, 1))
+        log_p = log_histograms(net, features(net, replace(clips, crops=jittered(clips.crops, generator))))
+        of_mu = covering_temperature(*log_p, clips.mu, MU_BINS, of_material)
+        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
+        card = {
+            "settings": asdict(settings),
+            "training_runs": len(train),
+            "validation_runs": self.validation_runs,
+            "training_clips": 0 if self.clips is None else len(self.clips.train),
+            "steps": fitted.steps,
+            "best_step": fitted.best_step,
+            "seconds": round(fitted.seconds, 1),
+            "history": [asdict(report) for report in fitted.history],
+            "parameters": sum(parameter.numel() for parameter in net.parameters()),
+        }
+        return FrictionModel(
+            net=net,
+            materials=train.materials,
+            instants=self.instants,
+            bins=MU_BINS,
+            temperature=(of_material, of_mu),
+            training_features=TrainingFeatures.of(features(net, known), known.material, seen, len(train.materials)),
+            card=card,
+            quantities=self.quantities,
+            quantity_temperatures=quantity_temperatures(
+                self.quantities, quantity_log_histograms(net, seen), clips.fabric
+            ),
+        )
+
+
+def _blurred(centers: torch.Tensor, truth: torch.Tensor, deviation: float) -> torch.Tensor:
+    """Return histograms (B, bins) of this deviation about the truth, (B,)."""
+    target = torch.exp(-0.5 * ((centers - truth[:, None]) / deviation) ** 2)
+    return target / target.sum(dim=1, keepdim=True)
+
+
+def _check_fabric(runs: Runs) -> None:
+    for column, quantity in zip(runs.fabric.T, FABRIC, strict=True):
+        low, high = quantity.bins.low, quantity.bins.high
+        if not ((low <= column) & (column <= high)).all():
+            raise ValueError(
+                f"{quantity.name} of the runs must be known, from {10**low:.2g} to {10**high:.2g} {quantity.unit}: it "
+                f"is from {10 ** column.min():.3g} to {10 ** column.max():.3g}"
+            )
