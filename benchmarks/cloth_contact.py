@@ -39,7 +39,7 @@ from stickslip_sim_core import (
 )
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.solver import THICKNESS
+from stickslip_sim_core.cloth.contact import THICKNESS
 from stickslip_sim_core.protocols import capstan
 from stickslip_sim_core.reference import master_curves
 from stickslip_sim_core.scenes.cloth_sphere import SETTLING

@@ -24,8 +24,8 @@ from stickslip_services.queue.planning import expand
 from stickslip_services.queue.terms import terms_for
 from stickslip_sim_core import character, stage
 from stickslip_sim_core._sim_core import cloth_kernels
-from stickslip_sim_core.cloth import solver
-from stickslip_sim_core.cloth.solver import MU_MAX
+from stickslip_sim_core.cloth.bodies import MU_MAX
+from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_sim_core.scenes import cloth_sphere, shawl
 from stickslip_testing.worker import BUILDS
@@ -67,7 +67,7 @@ def test_the_figure_of_the_shawl_is_the_cores() -> None:
 
 
 def test_cloth_feels_itself_by_one_default_and_by_certified_contact() -> None:
-    assert solver.SELF_FRICTION == SELF_FRICTION
+    assert CORE_SELF_FRICTION == SELF_FRICTION
     asked = inspect.signature(stickslip_sim_core.drop_and_drag).parameters["self_friction"].default
     assert ClothDragSpec.model_fields["self_friction"].default == asked == SELF_FRICTION
     for name, preset in CERTIFICATION.items():

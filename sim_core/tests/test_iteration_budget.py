@@ -9,7 +9,7 @@ import numpy as np
 
 from stickslip_sim_core import Cloth, SelfContact, fabric, plane, preset_named, sphere
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.solver import THICKNESS
+from stickslip_sim_core.cloth.contact import THICKNESS
 from stickslip_sim_core.protocols.capstan import Strip
 
 

@@ -1,9 +1,11 @@
 """The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python face."""
 
 from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
+from stickslip_sim_core.cloth.bodies import Body, box, cylinder, plane, sphere
+from stickslip_sim_core.cloth.contact import PairForces, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, Surface, box, cylinder, plane, sphere
+from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.motions import Keyframes, MovingMesh, read_moving_mesh
 from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
 from stickslip_sim_core.rods.general import solve_general_rods

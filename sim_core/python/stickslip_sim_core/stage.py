@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.presets import SolverSettings
-from stickslip_sim_core.cloth.solver import GRAVITY, Body, Cloth, Motion
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, Motion
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""

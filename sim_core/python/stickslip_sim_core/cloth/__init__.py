@@ -1,8 +1,10 @@
 """Pieces of cloth: what they are made of, their meshes, and the solver that steps them."""
 
+from stickslip_sim_core.cloth.bodies import Body, box, plane, sphere
+from stickslip_sim_core.cloth.contact import PairForces, SelfContact
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Body, Cloth, PairForces, SelfContact, box, plane, sphere
+from stickslip_sim_core.cloth.solver import Cloth
 
 __all__ = [
     "PRESETS",

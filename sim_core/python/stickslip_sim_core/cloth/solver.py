@@ -1,24 +1,21 @@
-"""Cloth that moves in contact with bodies, itself and surfaces: the thin face of the C++ solver."""
+"""Time stepping of cloth in contact with bodies, itself and surfaces: a thin layer over the C++ solver."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh, sheet_count
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.bodies import Body, BodyTuple
+from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, PairForces, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
-"""Environment variable that names the level of the kernels."""
-
-MU_MAX = 10.0
-"""Largest coefficient of friction."""
+"""Environment variable that sets the level of the kernels."""
 
 RESIDUAL_PATCH = 0.005**2
 """Area whose weight residuals are measured in, whatever the mesh [m^2]."""
@@ -26,226 +23,9 @@ RESIDUAL_PATCH = 0.005**2
 GRAVITY = 9.81
 """[m/s^2]"""
 
-THICKNESS = 5e-4
-"""Of cloth that feels itself or a surface, unless another is given [m]."""
-
-CREASE = float(np.radians(40.0))
-"""Angle from which edges of a surface stay sharp, unless another is given [rad]."""
-
-BodyTuple = tuple[int, float, Floats, Floats, Floats]
-
-
-@dataclass(frozen=True)
-class Body:
-    """A body that cloth touches. In its own axes a plane fills z < 0; others are centred on their origin, and z is the
-    axis of a cylinder."""
-
-    mu: float
-    shape: int = 0
-    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    origin: Floats = field(default_factory=lambda: np.zeros(3))
-    rotation: Floats = field(default_factory=lambda: np.eye(3))
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.mu <= MU_MAX:
-            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {self.mu}")
-
-    def as_tuple(self) -> BodyTuple:
-        """Return what the C++ core takes."""
-        return (
-            self.shape,
-            self.mu,
-            np.array(self.size),
-            np.asarray(self.origin, float),
-            np.asarray(self.rotation, float),
-        )
-
-
-def plane(mu: float, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
-    """Return the half-space below a plane."""
-    n = np.asarray(normal, float)
-    n = n / np.linalg.norm(n)
-    other = np.eye(3)[np.argmin(np.abs(n))]
-    t = np.cross(n, other)
-    t /= np.linalg.norm(t)
-    return Body(mu, 0, origin=np.asarray(origin, float), rotation=np.stack([t, np.cross(n, t), n], axis=1))
-
-
-def sphere(mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:
-    """Return a ball, which carries what sticks to it when its rotation (3, 3) changes from step to step."""
-    if not (np.isfinite(radius) and radius > 0.0):
-        raise ValueError(f"radius: must be finite and > 0, got {radius}")
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return Body(mu, 1, (radius, 0.0, 0.0), np.asarray(origin, float), turn)
-
-
-def cylinder(
-    mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
-) -> Body:
-    """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
-    if not (np.isfinite(radius) and radius > 0.0):
-        raise ValueError(f"radius: must be finite and > 0, got {radius}")
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return Body(mu, 3, (radius, 0.0, 0.0), np.asarray(origin, float), turn)
-
-
-def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:
-    """Return a box with edges of `size` (3,) [m]."""
-    half = 0.5 * np.asarray(size, float)
-    if half.shape != (3,) or not (np.isfinite(half).all() and (half > 0.0).all()):
-        raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return Body(mu, 2, (half[0], half[1], half[2]), np.asarray(origin, float), turn)
-
-
-SELF_FRICTION = 0.5
-"""Coefficient of friction of a cloth with itself in a scene, unless another is asked for: the middle of the two, of
-cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
-
-BEARING: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {"all": (1.0, 1.0), "vertices": (0.9, 1.0), "first": (0.9, 0.9)}
-)
-"""What edges of two sheets, and vertices of the later over the earlier, keep of the thickness: see `SelfContact`."""
-
-
-@dataclass(frozen=True, eq=False)
-class SelfContact:
-    """How cloth feels itself and other cloth: nothing crosses, with exact Coulomb friction.
-
-    Raises:
-        ValueError: A number breaks its rule.
-    """
-
-    mu: float | ArrayLike
-    """Coefficient of friction, 0 ... 10; of several sheets, those of each two: (S, S), symmetric. Sheets are the pieces
-    of the mesh that hang together, in the order of their first vertices."""
-
-    thickness: float | ArrayLike = THICKNESS
-    """Of the sheets [m], or of each: (S,). Two sheets stay the mean of theirs apart, from middle to middle; a sheet of
-    its own must be less than the distance at rest of any of its vertices and edges that do not meet."""
-
-    bearing: str = "all"
-    """What keeps two sheets the thickness apart. "all": vertices, and edges that cross. "vertices": those of both
-    sheets; edges keep 0.9 of it. "first": the vertices of the earlier sheet; the rest keeps 0.9 of it. Where sheets lie
-    on each other over large, smooth faces, "vertices" and "first" converge in fewer iterations. Choose "first" only
-    where these are flat: over curved cloth its forces are rough. Within a sheet all bear."""
-
-    def __post_init__(self) -> None:
-        if self.bearing not in BEARING:
-            raise ValueError(f"bearing: must be one of {', '.join(BEARING)}, got {self.bearing!r}")
-        mu = np.asarray(self.mu, float)
-        if not ((mu >= 0.0) & (mu <= MU_MAX)).all():
-            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {mu.tolist()}")
-        if mu.ndim and not (mu.ndim == 2 and mu.shape[0] == mu.shape[1] and (mu == mu.T).all()):
-            raise ValueError(f"mu: must be a number or a symmetric matrix, got {mu.tolist()}")
-        thickness = np.asarray(self.thickness, float)
-        if thickness.ndim > 1 or not (np.isfinite(thickness) & (thickness > 0.0)).all():
-            raise ValueError(f"thickness: must be finite and > 0, one or one a sheet, got {thickness.tolist()}")
-
-    def of_sheets(self, sheets: int) -> tuple[Floats, Floats]:
-        """Return mu of each two of so many sheets (S, S), and their thicknesses (S,) [m].
-
-        Raises:
-            ValueError: There are more or less in `mu` or in `thickness`.
-        """
-        mu, thickness = np.asarray(self.mu, float), np.asarray(self.thickness, float)
-        if mu.ndim and mu.shape != (sheets, sheets):
-            raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
-        if thickness.ndim and thickness.shape != (sheets,):
-            raise ValueError(f"thickness: must be of {sheets} sheets, got {thickness.tolist()}")
-        return np.broadcast_to(mu, (sheets, sheets)).copy(), np.broadcast_to(thickness, sheets).copy()
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Triangles that cloth touches, from either side, and whose vertices move as you say: a body of any shape.
-
-    It may be open or closed, cross itself, and bend as it moves. Nothing tells its inside from its outside: cloth that
-    starts on one side stays there.
-
-    Vertices of the cloth touch a smooth surface through the vertices of the triangles, as they touch a body. Triangles
-    themselves are only felt where they come nearer to the cloth than a quarter of that, between its vertices: there the
-    cloth keeps this distance by pairs of closest points (see `SelfContact`). Nothing crosses the triangles.
-
-    Raises:
-        ValueError: An argument breaks its rule.
-    """
-
-    triangles: ArrayLike
-    """(T, 3): vertices of each triangle."""
-
-    positions: ArrayLike | Callable[[float], ArrayLike]
-    """(N, 3) [m], or a function of the time [s] that returns them. In each step vertices move on straight lines."""
-
-    mu: float | ArrayLike
-    """Coefficient of friction with the cloth, 0 ... 10; or with each of its sheets: (S,)."""
-
-    thickness: float = THICKNESS
-    """Of a skin around the triangles, half of it on each side [m]: cloth stays half of this and half of its own
-    thickness away from them. May be 0."""
-
-    crease: float = CREASE
-    """Edges stay sharp where the normals of their triangles are further apart at time 0, 0 ... pi [rad]. Borders are
-    sharp."""
-
-    def __post_init__(self) -> None:
-        mu = np.asarray(self.mu, float)
-        if mu.ndim > 1 or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
-            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
-        if not (np.isfinite(self.thickness) and self.thickness >= 0.0):
-            raise ValueError(f"thickness: must be finite and >= 0, got {self.thickness}")
-        if not 0.0 <= self.crease <= np.pi:
-            raise ValueError(f"crease: must be in [0, pi] rad, got {self.crease}")
-        triangles = np.array(self.triangles, dtype=np.int32)
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
-            raise ValueError(f"triangles: must be (T, 3) numbers of vertices, got shape {triangles.shape}")
-        object.__setattr__(self, "triangles", triangles)
-        corners = self.at(0.0)
-        if triangles.min() < 0 or triangles.max() >= len(corners):
-            raise ValueError(
-                f"triangles: must index {len(corners)} vertices, got {triangles.min()} ... {triangles.max()}"
-            )
-        a, b, c = np.moveaxis(corners[triangles], 1, 0)
-        flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) == 0.0)
-        if len(flat):
-            raise ValueError(f"triangles: must have an area, and triangle {flat[0]} has none")
-
-    def at(self, time: float) -> Floats:
-        """Return the positions of the vertices at a time [s]: (N, 3) [m].
-
-        Raises:
-            ValueError: They are not (N, 3) or not finite.
-        """
-        found = np.ascontiguousarray(self.positions(time) if callable(self.positions) else self.positions, dtype=float)
-        if found.ndim != 2 or found.shape[1] != 3:
-            raise ValueError(f"positions: must be (N, 3), got shape {found.shape} at {time:g} s")
-        if not np.isfinite(found).all():
-            raise ValueError(f"positions: must be finite, and are not at {time:g} s")
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class PairForces:
-    """Forces of cloth on cloth and surfaces: P pairs of closest points."""
-
-    vertices: NDArray[np.int32]
-    """(P, 4); those of surfaces come after those of the cloth."""
-
-    weights: Floats
-    """(P, 4): the force acts on each vertex by its weight."""
-
-    forces: Floats
-    """(P, 3) [N]"""
-
-    distance: Floats
-    """(P,) [m]"""
-
-    sliding: NDArray[np.bool_]
-    """(P,)"""
-
 
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
-"""What drives a cloth at a time [s]: gravity (V, 3), positions of held vertices (K, 3), bodies."""
+"""From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies."""
 
 
 class Cloth:
@@ -253,14 +33,14 @@ class Cloth:
 
     Args:
         mesh: The cloth at rest; `meshes.together` puts several sheets into one.
-        fabric: What it is made of; or what each sheet is made of: sheets are the pieces of the mesh that hang together,
-            in the order of their first vertices.
+        fabric: Material of the cloth, or of each sheet. Sheets are the connected pieces of the mesh, in the order of
+            their first vertices.
         preset: Solver settings.
         held: (K,) vertices whose positions are prescribed.
         clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
             outward normal of the rest plane.
-        self_contact: How it feels itself, and its sheets each other; None: it does not, and passes through itself.
-        surfaces: Triangles that it touches. They are where they are at the time of the cloth.
+        self_contact: Contact within and between sheets. None: off, the cloth passes through itself.
+        surfaces: Triangles that it touches.
         force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the lightest fabric.
         kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
             that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
@@ -284,7 +64,7 @@ class Cloth:
     ) -> None:
         self.mesh, self.preset = mesh, preset
         self.fabrics = (fabric,) if isinstance(fabric, Fabric) else tuple(fabric)
-        """One, or one of each sheet."""
+        """One, or one for each sheet."""
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
         edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
         self.slopes = np.zeros((len(edges), 3))
@@ -329,18 +109,17 @@ class Cloth:
             crease=[surface.crease for surface in self.surfaces],
         )
         self.least_distance = np.inf
-        """Of pieces of cloth that do not hang together, and of cloth and surfaces, at the ends of all steps [m]; inf
-        where none came near."""
+        """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
         self.newton = self.krylov = self.flips = self.halvings = 0
         self.factorizations = 0.0
-        """Whole ones, and shares of those in part."""
+        """Whole factorizations, plus shares of partial ones."""
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     def _touch(self, sheets: int) -> tuple[Floats | None, Floats]:
-        """Return mu of each two sheets and surfaces, or None; -1 where they do not feel each other; and thicknesses."""
+        """Return friction between sheets and surfaces (-1: no contact; None: no contact at all), and thicknesses."""
         if not self.self_contact and not self.surfaces:
             return None, np.empty(0)
         mu = np.full((sheets + len(self.surfaces),) * 2, -1.0)
@@ -411,12 +190,10 @@ class Cloth:
     def set_state(
         self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
     ) -> None:
-        """Put the cloth somewhere: positions (V, 3), velocities (V, 3), slopes at clamped edges (E, 3).
-
-        Surfaces are where they are at the time of the cloth.
+        """Set positions (V, 3) [m], velocities (V, 3) [m/s], and slopes at clamped edges (E, 3).
 
         Raises:
-            ValueError: The cloth crosses a surface, or itself although it feels itself; or an array has another shape.
+            ValueError: The cloth crosses a surface, or, with self-contact, itself; or an array has another shape.
         """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
@@ -433,13 +210,12 @@ class Cloth:
         slopes: ArrayLike | None = None,
         damping: float = 0.0,
     ) -> StepReport:
-        """Advance by dt [s]; positions of held vertices (K, 3), slopes and bodies are those at its end.
+        """Advance by dt [s]. Positions of held vertices (K, 3), slopes, bodies and surfaces are those at its end.
 
-        In the first step after `set_state` bodies are taken to have been where they are. Surfaces move to where they
-        are at the end of the step.
+        In the first step after `set_state` bodies do not move.
 
         `damping` is proportional to mass [1/s]; that of the fabric is added.
-        A step that does not converge is counted and its best iterate kept.
+        A step that does not converge is counted, and its best iterate is kept.
         """
         if slopes is not None:
             self.slopes = np.asarray(slopes, float)
@@ -457,10 +233,9 @@ class Cloth:
         return self._count(report)
 
     def advance(self, end: float, motion: Motion, *, damping: float = 0.0) -> StepReport:
-        """Advance to `end` [s] by steps that share the interval and end with it: the controller's, or the preset's.
+        """Advance to `end` [s] by steps of the controller, or by steps of the preset's length.
 
-        All intervals must be equally long. `motion` takes a time [s] and returns what holds at it: gravity (V, 3)
-        [m/s^2], positions of the held vertices (K, 3) [m], and the bodies.
+        All intervals must be equally long.
         """
 
         def drive(time: float) -> tuple[Floats, Floats, Floats, Floats, list[BodyTuple]]:
@@ -485,9 +260,9 @@ class Cloth:
         return report
 
     def contact_force(self) -> Floats:
-        """Return the force of bodies and surfaces on the cloth [N] in the last step.
+        """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
-        It is the change of momentum less weight and holders.
+        It is the rate of momentum less weight and the force of the holders.
         """
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
@@ -509,11 +284,11 @@ class Cloth:
         return report
 
     def softest(self) -> float:
-        """Return the smallest eigenvalue of stiffness over mass here, without contact [1/s^2]; > 0 means stable."""
+        """Return the smallest eigenvalue of stiffness over mass in this state, without contact [1/s^2]; > 0: stable."""
         return float(self._solver.softest(self.positions, self.slopes))
 
     def why_invalid(self, path: Floats) -> str:
-        """Return why a simulation with these positions (frames, V, 3) is not valid, or an empty text."""
+        """Return the reason why a run with these positions (frames, V, 3) is not valid, or an empty text."""
         if not np.isfinite(path).all():
             return f"positions are not finite from frame {len(path) - 1} on"
         if self.unconverged_steps > self.preset.unconverged_share_max * self.steps:

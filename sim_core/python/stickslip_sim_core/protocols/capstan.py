@@ -8,9 +8,11 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body, cylinder
+from stickslip_sim_core.cloth.contact import THICKNESS, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
-from stickslip_sim_core.cloth.solver import THICKNESS, Body, Cloth, SelfContact, Surface, cylinder
+from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.protocol import ClothProtocol
 from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.reference import master_curves

@@ -8,9 +8,11 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import plane
+from stickslip_sim_core.cloth.contact import SelfContact
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings
-from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, SelfContact, plane
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.inclined_plane import DRIFT_MAX, HOLD_SHARE, HOLD_TIME, tilted
 from stickslip_sim_core.protocols.protocol import MeshedProtocol
 from stickslip_sim_core.protocols.result import Setting

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from stickslip_sim_core.cloth.bodies import plane
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
-from stickslip_sim_core.cloth.solver import Cloth, plane
+from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.protocol import MeshedProtocol
 from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip

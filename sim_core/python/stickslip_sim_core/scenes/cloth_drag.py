@@ -4,9 +4,11 @@ from collections.abc import Callable
 
 from stickslip_sim_core import stage
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import plane
+from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import SELF_FRICTION, Cloth, SelfContact, plane
+from stickslip_sim_core.cloth.solver import Cloth
 
 
 def drop_and_drag(

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from stickslip_sim_core import stage
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import plane
+from stickslip_sim_core.cloth.contact import SELF_FRICTION, THICKNESS, SelfContact
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import SELF_FRICTION, THICKNESS, Cloth, SelfContact, plane
+from stickslip_sim_core.cloth.solver import Cloth
 
 BEHIND, LENGTH, WIDTH = 0.15, 0.6, 0.3
 """Of the stretched cloth [m]: how far behind the holders it begins, and its sides along x and y."""

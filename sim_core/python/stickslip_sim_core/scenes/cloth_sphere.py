@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body, plane, sphere
+from stickslip_sim_core.cloth.contact import THICKNESS, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, THICKNESS, Body, Cloth, Surface, plane, sphere
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""

@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from stickslip_sim_core._sim_core import self_intersections, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body
+from stickslip_sim_core.cloth.contact import THICKNESS, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, THICKNESS, Body, Cloth, SelfContact, Surface
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 
 FRAMES_MAX = 10_000
 """Of a scene."""

@@ -10,9 +10,11 @@ from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.character import bones, figure
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body, plane
+from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, SELF_FRICTION, Body, Cloth, SelfContact, Surface, plane
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 
 NECKLINE, HEM, ANGLE = 0.095, 0.5, 5.3
 """The shawl is cut as a part of a ring: its radii inside and outside [m], and its angle [rad]."""
