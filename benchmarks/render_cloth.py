@@ -32,21 +32,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.blender import import_bpy
 from stickslip_blender.build import build_digest
-from stickslip_blender.clips import ClothRenderer
-from stickslip_blender.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
-from stickslip_blender.geometry import FLOOR
-from stickslip_blender.ground_truth import ground_truth
-from stickslip_blender.holders import Holders
-from stickslip_blender.lights import drawn_light
-from stickslip_blender.looks import grained, look_of
-from stickslip_blender.multiplexed import encode
-from stickslip_blender.pixels import FrameReader
+from stickslip_blender.cloth.clips import ClothRenderer
+from stickslip_blender.cloth.geometry import FLOOR, Holders
+from stickslip_blender.cloth.ground_truth import ground_truth
+from stickslip_blender.cloth.looks import drawn_light, grained, look_of
+from stickslip_blender.cloth.scene import Shot
+from stickslip_blender.cloth.substrates import HARD, Substrate, drawn_substrate, floor_factor
+from stickslip_blender.cloth.textures import texture_image
+from stickslip_blender.cycles.blender import import_bpy
+from stickslip_blender.cycles.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
+from stickslip_blender.cycles.pixels import FrameReader, encode
 from stickslip_blender.raster import Textures, Window, projected, see
-from stickslip_blender.stage import Shot
-from stickslip_blender.substrates import HARD, Substrate, drawn_substrate, floor_factor
-from stickslip_blender.textures import texture_image
 from stickslip_blender.workshop import Workshop
 from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.format.codecs import decode_clip
@@ -87,7 +84,7 @@ class Bench:
         self.look = look_of(MATERIAL)
         self.pictures = {texture: grained(texture_image(texture), self.look) for texture in TEXTURES}
         self.textures = Textures(list(self.pictures.values()))
-        self.geometry, self.stage = self.renderer.geometry, self.renderer.stage
+        self.geometry, self.scene = self.renderer.geometry, self.renderer.scene
         self.geometry.surface.dress(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)
         self.rig = load_rig("drag")[:3]
         build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[:12]
@@ -96,22 +93,22 @@ class Bench:
     def set_up(self, shot: View) -> tuple[Shot, npt.NDArray[np.float32]]:
         """Return where everything is, and the floor's factor."""
         camera = self.rig[shot.view]
-        self.stage.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look)
-        return self.stage.shot(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
+        self.scene.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look)
+        return self.scene.shot(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
 
     def reference(self, view: View, texture: Texture) -> tuple[Window, npt.NDArray[np.uint8]]:
         """Return the window and what it should look like."""
         shot, floor = self.set_up(view)
-        window = self.stage.window(shot)
+        window = self.scene.window(shot)
         kept = self.references and self.references / f"{view.name}-{texture}.npy"
         if kept is not None and kept.exists():
             return window, np.load(kept)
         camera = self.rig[view.view]
         light = np.zeros((camera.height, camera.width, 3), dtype=np.float16)
-        light[window.slices] = self.stage.direct(
+        light[window.slices] = self.scene.direct(
             shot, self.pictures[texture], REFERENCE if view.substrate.name == "matt" else SMOOTH, window
         )
-        picture = encode(self.stage.composer.on_floor(light, shot.points, camera, floor))[window.slices]
+        picture = encode(self.scene.composer.on_floor(light, shot.points, camera, floor))[window.slices]
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             np.save(kept, picture)
@@ -121,27 +118,27 @@ class Bench:
         """Return the pictures of all textures, the seconds of Cycles and those of all the rest."""
         shot, floor = self.set_up(view)
         placed = time.process_time()
-        shading = self.stage.shading(shot, sampling, seed=7)
+        shading = self.scene.shading(shot, sampling, seed=7)
         traced = time.process_time()
         camera = self.rig[view.view]
         pictures = np.empty((len(TEXTURES), *shading.shape), dtype=np.uint8)
-        self.stage.composer.compose(shading, shot.points, camera, view.substrate, floor, self.textures, pictures)
+        self.scene.composer.compose(shading, shot.points, camera, view.substrate, floor, self.textures, pictures)
         ended = time.process_time()
         return pictures, traced - placed, ended - traced + self._per_frame(view)
 
     def _per_frame(self, view: View) -> float:
         """Return the seconds that it takes to place everything: once a frame, the rest of `set_up` once a clip."""
         start = time.process_time()
-        self.stage.shot(self.track[view.frame], view.frame)
+        self.scene.shot(self.track[view.frame], view.frame)
         return time.process_time() - start
 
     def direct(self, view: View, texture: Texture, sampling: Sampling) -> tuple[npt.NDArray[np.uint8], float]:
         """Return a picture rendered directly, and its seconds."""
         shot, floor = self.set_up(view)
         start = time.process_time()
-        light = self.stage.direct(shot, self.pictures[texture], sampling)
+        light = self.scene.direct(shot, self.pictures[texture], sampling)
         spent = time.process_time() - start
-        return encode(self.stage.composer.on_floor(light, shot.points, self.rig[view.view], floor)), spent
+        return encode(self.scene.composer.on_floor(light, shot.points, self.rig[view.view], floor)), spent
 
     def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
         """Return which pixels of a window the cloth covers by half or more."""

@@ -7,11 +7,11 @@ color of rod number i is that of seed i.
 """
 
 import argparse
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from stickslip_blender.color import silicone_color
-from stickslip_blender.scenes.rod_hang import RodRenderer
+from stickslip_blender.rods.renderer import RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 
@@ -27,7 +27,7 @@ def main() -> None:
     with np.load(options.rods) as file:
         rods = dict(file)
     rig = load_rig(options.rig)
-    with RodRenderer(quality=options.quality) as renderer:
+    with closing(RodRenderer(quality=options.quality)) as renderer:
         views = [renderer.render(line, rig, color=silicone_color(seed)) for seed, line in enumerate(rods["centerline"])]
     np.savez_compressed(options.views, **rods, views=np.stack(views))
 

@@ -9,14 +9,14 @@ time is all of a rod's four views (mesh, cameras, Cycles, pixels out) over four,
 import argparse
 import platform
 import time
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_blender.blender import import_bpy
-from stickslip_blender.color import silicone_color
-from stickslip_blender.engine import REFERENCE, SAMPLING, Sampling
-from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, POINTS, RodRenderer
+from stickslip_blender.cycles.blender import import_bpy
+from stickslip_blender.cycles.engine import REFERENCE, SAMPLING, Sampling
+from stickslip_blender.rods.renderer import GROUND_LEVEL, POINTS, RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 
 OTHERS = {
@@ -49,7 +49,7 @@ def curls(count: int) -> npt.NDArray[np.float64]:
 
 def measure(sampling: Sampling, lines: npt.NDArray[np.float64]) -> Measured:
     rig, views, seconds = load_rig("rod-4"), [], []
-    with RodRenderer(quality=sampling) as renderer:
+    with closing(RodRenderer(quality=sampling)) as renderer:
         renderer.render(lines[-1], rig[:1], color=silicone_color(0))
         for seed, line in enumerate(lines):
             start = time.process_time()

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stickslip_blender.clips import ClothRenderer
-from stickslip_blender.holders import Holders
-from stickslip_blender.textures import texture_image
+from stickslip_blender.cloth.clips import ClothRenderer
+from stickslip_blender.cloth.geometry import Holders
+from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.kinds.cloth.drag_scene import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig

@@ -1,4 +1,4 @@
-// Pictures of many textures from one trace, and what geometry adds to a frame. stickslip_blender.multiplexed has the
+// Pictures of many textures from one trace, and what geometry adds to a frame. stickslip_blender.cloth.shading has the
 // formula.
 #pragma once
 

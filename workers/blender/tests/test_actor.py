@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,14 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 from pydantic import ValidationError
-from stickslip_blender import clips
 from stickslip_blender.actor import RenderActor
 from stickslip_blender.build import roots
-from stickslip_blender.clips import GATE
-from stickslip_blender.color import silicone_color, to_linear
-from stickslip_blender.lights import drawn_light
-from stickslip_blender.scenes.rod_hang import RodRenderer
-from stickslip_blender.stage import ClothStage
-from stickslip_blender.substrates import drawn_substrate
+from stickslip_blender.cloth import clips
+from stickslip_blender.cloth.clips import GATE
+from stickslip_blender.cloth.looks import drawn_light
+from stickslip_blender.cloth.scene import ClothScene
+from stickslip_blender.cloth.substrates import drawn_substrate
+from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_linear
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
@@ -37,6 +37,8 @@ from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import CorruptArtifactError, DirectoryStore
 
+DOCUMENTS = tuple(f"stickslip_schemas/{name}.py" for name in ("kinds/cloth/spec", "spec/jobs", "spec/appearance"))
+"""Modules of documents, which are in the content key as a whole."""
 LONG_WAY_DOWN = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.1), 150)  # a tenth too long for the rig
 
 
@@ -93,7 +95,7 @@ def test_a_rod_becomes_a_chunk_and_a_preview(
     chunk = result.output.chunks["views"]
     data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
     views = np.frombuffer(data, dtype=np.uint8).reshape(1, 4, 224, 224, 3)[0]
-    with RodRenderer(quality=Quality.draft) as renderer:
+    with closing(RodRenderer(quality=Quality.draft)) as renderer:
         assert np.array_equal(views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5), seed=5))
 
     assert result.output.preview is not None
@@ -153,9 +155,9 @@ def test_what_is_not_the_samples_fault_is_raised(actor: RenderActor, store: Dire
 _CRASH = """
 import json, os, signal, sys
 from stickslip_blender.actor import RenderActor
-from stickslip_blender import clips
-from stickslip_blender.clips import GATE
-from stickslip_blender.pixels import FrameReader
+from stickslip_blender.cloth import clips
+from stickslip_blender.cloth.clips import GATE
+from stickslip_blender.cycles.pixels import FrameReader
 FrameReader.read_matte = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
 """
@@ -276,8 +278,7 @@ def test_every_function_that_renders_is_in_the_build(
         sys.setprofile(None)
         ours = {Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")}
         built = {path.resolve() for path in sources(roots(kind), cut=UNCOUNTED).values()}
-        contract = {path for path in ours if path.parent.name == "stickslip_schemas"}
-        documents = {path for path in contract if path.stem in ("cloth", "jobs", "appearance")}
+        documents = {path for path in ours if path.as_posix().endswith(DOCUMENTS)}
         uncounted = {path for path in ours if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")}
         uncounted |= {path for path in ours if path.parts[-3:-1] == ("stickslip_schemas", "store")}
         assert len(ours) > 8
@@ -297,7 +298,7 @@ def test_a_clip_has_the_same_bytes_however_its_trace_was_made(
     assert several.clips[Texture.plaid] == alone.chunks["video"]
     assert set(several.previews) == {"floral", "plaid"}
     third = RenderActor(str(store.root))
-    monkeypatch.setattr(ClothStage, "shading", None)  # from here on nothing can be traced
+    monkeypatch.setattr(ClothScene, "shading", None)  # from here on nothing can be traced
     later = _output(third.render(_clip(cloth, frames=1, textures=["plaid", "dots"])))
     third.close()
     assert later.clips[Texture.plaid] == alone.chunks["video"]
@@ -308,13 +309,13 @@ def test_nothing_is_traced_again_for_another_texture(
     actor: RenderActor, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traced: list[int] = []
-    shading = ClothStage.shading
+    shading = ClothScene.shading
 
-    def count(self: ClothStage, *arguments: Any) -> Any:
+    def count(self: ClothScene, *arguments: Any) -> Any:
         traced.append(1)
         return shading(self, *arguments)
 
-    monkeypatch.setattr(ClothStage, "shading", count)
+    monkeypatch.setattr(ClothScene, "shading", count)
     cloth = trajectory()
     clips = [_output(actor.render(_clip(cloth, frames=2, texture=texture))).chunks for texture in ("dots", "checker")]
     assert len(traced) == 2
@@ -339,7 +340,7 @@ def test_rods_and_cloths_take_turns(
     actor: RenderActor, record: str, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built: list[str] = []
-    for renderer in (RodRenderer, ClothStage):
+    for renderer in (RodRenderer, ClothScene):
 
         def count(self: Any, *arguments: Any, _init: Any = renderer.__init__, **options: Any) -> None:
             built.append(type(self).__name__)
@@ -349,12 +350,12 @@ def test_rods_and_cloths_take_turns(
     cloth = trajectory()
     first = actor.render(_clip(cloth, frames=1))
     actor.render(_clip(cloth, frames=1, viewpoint="right", material="11oz-black-denim", substrate="any", creases=1.0))
-    assert built == ["ClothStage"]  # built once for all looks of a mesh
+    assert built == ["ClothScene"]  # built once for all looks of a mesh
     rod = actor.render(_task(record))
     again = actor.render(_clip(cloth, frames=1))
-    assert built == ["ClothStage", "RodRenderer", "ClothStage"]  # Blender is one scene per process
+    assert built == ["ClothScene", "RodRenderer", "ClothScene"]  # Blender is one scene per process
     another = actor.render(_clip(cloth, frames=1, light_seed=2))
-    assert built == ["ClothStage", "RodRenderer", "ClothStage"]
+    assert built == ["ClothScene", "RodRenderer", "ClothScene"]
     assert again["output"] == first["output"] != another["output"]
     assert rod["outcome"] == "succeeded"
 

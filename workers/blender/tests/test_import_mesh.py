@@ -9,7 +9,7 @@ import pytest
 
 _WRITE = """
 import sys
-from stickslip_blender.blender import import_bpy
+from stickslip_blender.cycles.blender import import_bpy
 bpy = import_bpy()
 bpy.ops.wm.read_factory_settings(use_empty=True)
 mesh = bpy.data.meshes.new("wedge")

@@ -12,8 +12,8 @@ from typing import Any
 
 from stickslip_schemas.documents.tasks import RenderTask
 
-from stickslip_blender.build import blender_version, build_digest
-from stickslip_blender.device import described
+from stickslip_blender.build import build_digest
+from stickslip_blender.cycles.blender import blender_version, described
 from stickslip_blender.scenes import kind_names, renders
 from stickslip_blender.workshop import Workshop, check_rig
 

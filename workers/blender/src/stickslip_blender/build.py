@@ -1,4 +1,4 @@
-"""Which renderer this is: what enters a content key, besides what the task says."""
+"""The build of the renderer: the part of a content key that the task does not give."""
 
 from __future__ import annotations
 
@@ -8,17 +8,10 @@ from importlib import metadata
 from stickslip_schemas.base.keys import content_key
 from stickslip_schemas.plan.sources import UNCOUNTED, digests, sources
 
-from stickslip_blender.blender import import_bpy
-from stickslip_blender.device import described
+from stickslip_blender.cycles.blender import blender_version, described
 from stickslip_blender.raster._raster import BUILD_HASH
 
 _LIBRARIES = ("numcodecs", "google-crc32c", "numpy", "pillow")
-
-
-def blender_version() -> dict[str, str]:
-    """Return the versions of Blender: of the module and of the sources it was built from."""
-    app = import_bpy().app
-    return {"bpy": app.version_string, "blender_build": app.build_hash.decode()}
 
 
 def roots(kind: str) -> tuple[str, ...]:

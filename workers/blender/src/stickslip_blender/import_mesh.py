@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_blender.blender import import_bpy
+from stickslip_blender.cycles.blender import import_bpy
 
 READERS: dict[str, tuple[str, dict[str, Any]]] = {
     ".abc": ("wm.alembic_import", {"as_background_job": False}),

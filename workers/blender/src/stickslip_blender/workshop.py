@@ -22,7 +22,7 @@ from stickslip_schemas.store import open_store, write_durably
 if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
     from stickslip_schemas.spec.jobs import Render
 
-    from stickslip_blender.clips import Shading
+    from stickslip_blender.cloth.clips import Shading
 
 FRAME_MARGIN = 1.0
 """How far inside the frame a rod or a cloth has to stay [px]."""

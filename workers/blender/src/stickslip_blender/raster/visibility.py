@@ -1,22 +1,50 @@
-"""Which triangle each sample of an image sees, and what is interpolated there."""
+"""Which triangle each sample of an image sees, what is interpolated there, and the albedo of many textures."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.pixels import Window
 from stickslip_blender.raster import _raster
 
 GRID = 12
 """Samples across a pixel, and down: silhouettes are then within 0.0005 of their coverage."""
 
+_LANES = 8  # channels are filled up to a multiple
+
 Points = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a frame: columns [left, right), rows [top, bottom) [px], row 0 on top."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def is_empty(self) -> bool:
+        """True where there is no pixel in it."""
+        return self.right <= self.left or self.bottom <= self.top
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the window in a frame (height, width, ...)."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    @property
+    def place(self) -> tuple[int, int, int, int]:
+        """Left, top, width and height, as the compiled rasteriser takes them."""
+        return self.left, self.top, self.right - self.left, self.bottom - self.top
 
 
 @dataclass(frozen=True)
@@ -87,6 +115,59 @@ def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
     return Window(int(left), int(top), int(right), int(bottom))
 
 
+def fans(faces: Sequence[Sequence[int]]) -> Indices:
+    """Return convex polygons as fans of triangles, shape (T, 3)."""
+    return np.array([(face[0], b, c) for face in faces for b, c in pairwise(face[1:])], dtype=np.int32)
+
+
 def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
     """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window."""
     return Seen(points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid))
+
+
+class Textures:
+    """Pictures of one size, packed so that one lookup serves all of them."""
+
+    def __init__(self, pictures: Sequence[npt.NDArray[np.uint8]]) -> None:
+        """Pack pictures (size, size, 3), 8-bit sRGB, row 0 at v = 0."""
+        shapes = {picture.shape for picture in pictures}
+        if len(shapes) != 1 or (shape := shapes.pop()) != (shape[0], shape[0], 3):
+            raise ValueError(f"textures must be pictures of one shape (size, size, 3); got {sorted(shapes)}")
+        self.count = len(pictures)
+        channels = -(-3 * self.count // _LANES) * _LANES
+        self.texels = np.zeros((shape[0], shape[0], channels), dtype=np.float32)
+        for number, picture in enumerate(pictures):
+            self.texels[..., 3 * number : 3 * number + 3] = picture / np.float32(255)
+
+
+@dataclass(frozen=True)
+class Albedo:
+    """What the pixels of a window see of a cloth."""
+
+    coverage: npt.NDArray[np.float32]
+    """Share of each pixel, shape (height, width)."""
+    mean: npt.NDArray[np.float32]
+    """Linear albedo of what is seen of the cloth, 0 where nothing is; shape (height, width, textures, 3)."""
+    hits: npt.NDArray[np.int32]
+    """Samples that see each of the cloth's triangles."""
+    overall: npt.NDArray[np.float32]
+    """Mean albedo of all that is seen of the cloth, shape (textures, 3)."""
+    area: float
+    """Of the cloth's triangles, each seen alone [pixels]."""
+
+
+def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
+    """Mean textures over what is seen of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
+    return Albedo(
+        *_raster.albedo(
+            seen.triangle,
+            seen.points,
+            seen.triangles,
+            uv,
+            cloth,
+            textures.texels,
+            textures.count,
+            seen.window.place,
+            seen.grid,
+        )
+    )

@@ -1,11 +1,11 @@
-"""The drop-and-drag scene [thesis, 4.2.3]: a square of cloth that hangs between two holders."""
+"""The drag scene [thesis, 4.2.3]: a square of cloth that hangs between two holders."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stickslip_blender.clips import render_clips
-from stickslip_blender.holders import Holders
+from stickslip_blender.cloth.clips import render_clips
+from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:

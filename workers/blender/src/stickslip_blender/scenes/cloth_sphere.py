@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_blender.clips import render_clips
-from stickslip_blender.geometry import Faces, Prop
+from stickslip_blender.cloth.clips import render_clips
+from stickslip_blender.cloth.geometry import Faces, Prop
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ Array = npt.NDArray[np.float64]
 def render(look: ClothSphereRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a cloth on a turning sphere."""
     make = partial(Ball, angular_speed=look.angular_speed)
-    return render_clips(look, task, workshop, make, set_key=look.angular_speed)
+    return render_clips(look, task, workshop, make, surroundings_key=look.angular_speed)
 
 
 def turned(instant: int, angular_speed: float) -> float:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_blender.clips import render_clips
-from stickslip_blender.geometry import Prop
+from stickslip_blender.cloth.clips import render_clips
+from stickslip_blender.cloth.geometry import Prop
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def render(look: ShawlRender, task: RenderTask, workshop: Workshop) -> TaskResul
     )
     (triangles,) = workshop.record(task.record, "skin_triangles")
     make = partial(Figure, skin=skin, triangles=triangles, weights=weights, bones=bones)
-    return render_clips(look, task, workshop, make, set_key=(skin.tobytes(), bones.tobytes()))
+    return render_clips(look, task, workshop, make, surroundings_key=(skin.tobytes(), bones.tobytes()))
 
 
 class Figure:

@@ -1,0 +1,146 @@
+"""The Blender scene of every kind of cloth: a cloth over a floor, under one lamp, before black.
+
+The cloth is the solver's mesh, refined so that no facet shows. The lamp follows it [thesis, 4.2.3]. The module of a
+kind in `stickslip_blender.scenes` adds the props.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.spec.cameras import Camera
+
+from stickslip_blender.cloth.geometry import FLOOR, Geometry, mirrored
+from stickslip_blender.cloth.looks import Light, Look
+from stickslip_blender.cloth.shading import ALBEDOS, Composer
+from stickslip_blender.cloth.substrates import Substrate
+from stickslip_blender.cycles.engine import ClothSampling, Sampling, new_scene, set_sampling
+from stickslip_blender.cycles.environment import set_curtains
+from stickslip_blender.cycles.objects import (
+    Fabric,
+    Lamp,
+    add_material,
+    add_mesh,
+    add_view,
+    move_mesh,
+    set_inputs,
+    set_view,
+)
+from stickslip_blender.cycles.pixels import FrameReader
+from stickslip_blender.raster import Window, projected, window_about
+
+_LAMP_DISTANCE = 1.2  # [m]
+_LAMP_SIZE = 0.5  # [m], diameter
+_LAMP_POWER = 24.0  # [W]
+_AMBIENT = 0.012  # radiance of the black curtains around the scene; cameras see none of it
+_FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
+_WINDOW_MARGIN = 4  # [px] about the cloth
+_MIRRORING = 0.3  # roughness below which a floor's mirror image is in the window too
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The positions of everything at one instant."""
+
+    points: npt.NDArray[np.float64]
+    """All vertices, shape (V, 3) [m]."""
+    aim: npt.NDArray[np.float64]
+    """The point that the lamp is turned to, shape (3,) [m]."""
+
+
+class ClothScene:
+    """A scene with one cloth, built once; only vertices, textures, camera, floor and lamp change between frames."""
+
+    def __init__(self, geometry: Geometry, *, scratch: str | Path | None = None) -> None:
+        self.geometry = geometry
+        self.composer = Composer(geometry)
+        self._scene = new_scene(max_bounces=3, diffuse_bounces=2, light_tree=False)  # one lamp: nothing to choose
+        set_curtains(self._scene, _AMBIENT)
+        self._lamp = Lamp(self._scene, _LAMP_SIZE)
+        self._floor = add_material(add_mesh(self._scene, "floor", *_floor()), "floor")
+        faces, uv = geometry.surface.triangles, geometry.surface.uv
+        flat = np.column_stack([uv, np.zeros(len(uv))])
+        cloth = add_mesh(self._scene, "cloth", flat, faces.tolist(), is_smooth=True)
+        self._fabric = Fabric(cloth, uv, faces.ravel())
+        self._meshes = [cloth]
+        for prop in geometry.surroundings.props:
+            mesh = add_mesh(self._scene, prop.name, prop.vertices, prop.faces, is_smooth=prop.is_smooth)
+            add_material(mesh, prop.name, Base_Color=(*prop.color, 1.0), Roughness=prop.roughness)
+            self._meshes.append(mesh)
+        add_view(self._scene)
+        self._reader = FrameReader(self._scene, scratch)
+
+    def close(self) -> None:
+        """Release what it holds outside Blender."""
+        self._reader.close()
+
+    def set_up(self, camera: Camera, light: Light, substrate: Substrate, look: Look) -> None:
+        """Set the camera, the lamp, the floor and the fabric of the next clips."""
+        set_view(self._scene, camera)
+        self._camera, self._light, self.substrate = camera, light, substrate
+        shader = asdict(look)
+        self._fabric.set_look(**{name: shader[name] for name in ("roughness", "specular", "sheen", "translucency")})
+        self._lamp.set_power(_LAMP_POWER * light.power)
+        set_inputs(
+            self._floor,
+            Base_Color=(*(substrate.albedo,) * 3, 1.0),
+            Roughness=substrate.roughness,
+            Metallic=substrate.metallic,
+            Specular_IOR_Level=substrate.specular,
+        )
+
+    def shading(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
+        """Render one instant for all textures: linear light at ALBEDOS, shape (height, width, 3).
+
+        Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not flicker.
+        """
+        self._fabric.set_color(ALBEDOS)
+        self._place(shot)
+        set_sampling(self._scene, Sampling(sampling.frame, "plain", seed))
+        light = self._reader.read_light()
+        part = self.window(shot)
+        set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
+        light[part.slices] = self._reader.read_light(part)
+        return light
+
+    def direct(
+        self, shot: Shot, picture: npt.NDArray[np.uint8], sampling: Sampling, window: Window | None = None
+    ) -> npt.NDArray[np.float16]:
+        """Render one instant, or a window of it, with a texture on the cloth, the slow way: linear light (h, w, 3)."""
+        self._fabric.set_picture(picture)
+        self._place(shot)
+        set_sampling(self._scene, sampling)
+        return self._reader.read_light(window)
+
+    def window(self, shot: Shot) -> Window:
+        """Return the part of the frame that shows the cloth, and its image in a floor that mirrors it."""
+        cloth = shot.points[: self.geometry.cloth_vertices]
+        if self.substrate.roughness < _MIRRORING:
+            cloth = np.concatenate([cloth, mirrored(cloth)])
+        return window_about(projected(self._camera, cloth), self._camera, _WINDOW_MARGIN)
+
+    def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
+        """Return the positions of everything at an instant, the solver's vertices at positions (V', 3) [m]."""
+        return Shot(self.geometry.points(positions, instant), self.geometry.surroundings.aim(instant, positions))
+
+    def _place(self, shot: Shot) -> None:
+        """Move everything to its position in a shot."""
+        for mesh, points in zip(self._meshes, self.geometry.parts(shot.points), strict=True):
+            move_mesh(mesh, points)
+        a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
+        outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        self._lamp.aim(shot.aim, outward, _LAMP_DISTANCE)
+
+
+def _floor() -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:
+    """Return the vertices and faces of a round plate with a low rim."""
+    around = 64
+    angle = 2.0 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=1) * _FLOOR_RADIUS
+    circle[:, 2] = FLOOR
+    rim = circle + np.array([0.0, 0.0, _FLOOR_RIM])
+    sides = [(k, (k + 1) % around, (k + 1) % around + around, k + around) for k in range(around)]
+    return np.concatenate([circle, rim]), [tuple(range(around)), *sides]

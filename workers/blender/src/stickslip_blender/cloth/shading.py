@@ -1,0 +1,190 @@
+"""One shading for many textures.
+
+The cloth is traced once with the base colour ALBEDOS. Lamp and floor are grey, so red, green and blue are three samples
+of the light that a pixel sends to the camera, as a function of the cloth's albedo a:
+
+    L(a) = S + D a + I a^2        S: gloss and what is not cloth; D: light that cloth scattered once; I: twice
+
+A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is
+
+    L(p) = S + (D + I m) A(p)     m: mean albedo of the cloth in sight, for light comes from elsewhere on the cloth
+
+in linear light, for each of the texture's colours. Off the cloth D is light that the cloth threw there: A is m, or what
+a floor that mirrors shows of the cloth, blurred as much as its roughness does.
+
+Pictures of clips are not rounded to the nearest levels. Each level is within TOLERANCE of the exact value, and chosen
+so that neighbours are equal where they may be: pixels in a row, and the colours of grey. Clips are a sixth smaller for
+it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.spec.cameras import Camera
+
+from stickslip_blender.cloth.geometry import FLOOR, Geometry, mirrored
+from stickslip_blender.cloth.substrates import Substrate
+from stickslip_blender.raster import Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
+
+ALBEDOS = (0.0, 0.5, 0.9)
+"""The cloth's base colour in a shading."""
+
+TOLERANCE: int = _raster.TOLERANCE
+"""How far the pixels of a clip may be from their exact values [8-bit levels]; raster/composition.hpp chooses them."""
+
+_MIRROR_GRID = 8
+_PROP_GRID = 3
+_LOBE = 1.9  # radius of a box, twice applied, over the width of the lobe that it stands for; compared with Cycles
+_PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
+_DIELECTRIC = 0.06  # what a floor that is no metal reflects, at the angles of our cameras
+
+Floats = npt.NDArray[np.float32]
+
+
+def settled(light: Floats) -> npt.NDArray[np.uint8]:
+    """Return linear light (height, width, 3) as the 8-bit sRGB of a clip: within `TOLERANCE`, with pixels alike.
+
+    It depends on nothing but this picture.
+    """
+    picture: npt.NDArray[np.uint8] = _raster.settled(np.ascontiguousarray(light, dtype=np.float32))
+    return picture
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How much is seen of the cloth in a frame."""
+
+    frame_share: float
+    """Share of the frame that is cloth."""
+    visible_share: float
+    """Share of the cloth, its area taken as it is turned to the camera, that nothing hides."""
+
+
+class Composer:
+    """Makes pictures of textures from shadings of one cloth."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self._geometry = geometry
+
+    def compose(
+        self,
+        shading: npt.NDArray[np.float16],
+        points: npt.NDArray[np.float64],
+        camera: Camera,
+        substrate: Substrate,
+        floor: Floats,
+        textures: Textures,
+        pictures: npt.NDArray[np.uint8],
+    ) -> Sight:
+        """Compose one frame's shading (height, width, 3) with all textures, into `pictures`.
+
+        Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
+        8-bit sRGB, chosen as in `settled`, shape (textures, height, width, 3).
+        """
+        seen = see(projected(camera, points), self._geometry.triangles, self._window(points, camera))
+        sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
+        colors = 3 * textures.count
+        reflected, around = np.empty((0, 0, colors), dtype=np.float32), Window(0, 0, 0, 0)
+        if substrate.mirrors:
+            reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
+        _raster.compose(
+            np.ascontiguousarray(shading).view(np.uint16),
+            ALBEDOS[1:],
+            sight.overall.ravel(),
+            sight.coverage,
+            sight.mean.reshape(*sight.coverage.shape, colors),
+            seen.window.place,
+            reflected,
+            around.place,
+            self._uncovered(floor, points, camera),
+            _reflectance(substrate),
+            pictures,
+        )
+        frame = camera.width * camera.height
+        visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
+        return Sight(float(sight.coverage.sum()) / frame, float(min(visible, 1.0)))
+
+    def on_floor(
+        self, light: npt.NDArray[np.float16], points: npt.NDArray[np.float64], camera: Camera, floor: Floats
+    ) -> Floats:
+        """Give the floor of a frame that was rendered directly (height, width, 3) its marks and colour."""
+        window = self._window(points, camera)
+        seen = see(projected(camera, points), self._geometry.triangles, window)
+        cover = np.zeros(light.shape[:2], dtype=np.float32)
+        cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
+        marks = self._uncovered(floor, points, camera) - 1.0
+        factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
+        return light * factor
+
+    def _uncovered(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
+        """Return the factor of the floor where no prop hides it, and 1 where one does."""
+        geometry = self._geometry
+        if not geometry.surroundings.props:
+            return floor
+        projections = projected(camera, points)
+        window = window_about(projections[geometry.cloth_vertices :], camera)
+        if window.is_empty:
+            return floor
+        props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
+        hidden = see(projections, props, window, _PROP_GRID).share_below(len(props))
+        factor = floor.copy()
+        factor[window.slices] += hidden[..., None] * (np.float32(1.0) - factor[window.slices])
+        return factor
+
+    def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
+        return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
+
+    def _mirror(
+        self,
+        overall: Floats,
+        points: npt.NDArray[np.float64],
+        camera: Camera,
+        substrate: Substrate,
+        textures: Textures,
+    ) -> tuple[Floats, Window]:
+        """Return the albedo that the floor shows of the cloth where it mirrors it, (height, width, 3 textures)."""
+        cloth = self._geometry.cloth_triangles
+        below = projected(camera, mirrored(points))
+        window = window_about(below[: self._geometry.cloth_vertices], camera, margin=12)
+        nothing = np.empty((0, 0, 3 * textures.count), dtype=np.float32), Window(0, 0, 0, 0)
+        if window.is_empty:
+            return nothing
+        seen = see(below, self._geometry.triangles, window, _MIRROR_GRID)
+        sight = see_albedo(seen, self._geometry.uv, textures, cloth)
+        if not sight.coverage.any():
+            return nothing
+        beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera)
+        shown = sight.coverage[..., None]
+        wide = np.full(beyond.shape, _PATH_BLUR, dtype=np.float32)
+        around = _raster.blurred(np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide)
+        path = np.clip(around[..., 1] / np.maximum(around[..., 0], np.float32(1e-6)), 0.0, 1.0)
+        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower
+        # across the plane of incidence than in it, by the sine of the angle at which the camera looks down.
+        down = np.asarray(path * np.float32(_LOBE * camera.fy * substrate.roughness**2), dtype=np.float32)
+        across = np.asarray(down * np.float32(-np.asarray(camera.rotation)[2, 2]), dtype=np.float32)
+        flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
+        blurred = _raster.blurred(np.concatenate([shown, flat], axis=2), down, across)
+        share = blurred[..., :1]
+        known = np.minimum(share / 0.02, 1.0)
+        color = blurred[..., 1:] / np.maximum(share, 1e-6)
+        mean = overall.ravel()
+        return (mean + known * (color - mean)).astype(np.float32), window
+
+
+def _reflectance(substrate: Substrate) -> float:
+    return substrate.albedo if substrate.metallic > 0.5 else _DIELECTRIC
+
+
+def _beyond_floor(seen: Seen, camera: Camera) -> Floats:
+    """Return how far behind the floor a mirrored thing appears, over its depth, (height, width); 0 where none is."""
+    depth = seen.at_centers(seen.points[:, 2:])[..., 0]
+    window = seen.window
+    rows, columns = np.mgrid[window.top : window.bottom, window.left : window.right]
+    ray = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], axis=-1)
+    down = (ray @ np.asarray(camera.rotation))[..., 2]
+    floor = (FLOOR - camera.position[2]) / np.where(down < -1e-6, down, -1e-6)
+    share = np.where(depth > 0.0, 1.0 - floor / np.maximum(depth, 1e-6), 0.0)
+    return np.clip(share, 0.0, 1.0).astype(np.float32)

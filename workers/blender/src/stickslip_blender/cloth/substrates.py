@@ -1,0 +1,130 @@
+"""What the cloth is dragged over: finishes drawn from a seed within the ranges of substrates.toml."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.spec.cameras import Camera
+
+from stickslip_blender.raster import _raster
+
+if TYPE_CHECKING:
+    from stickslip_schemas.spec.appearance import FloorNumbers
+
+GRAIN_SIZE = 512
+"""Side of the picture of a floor's grain [texels]."""
+GRAIN_EXTENT = 0.5
+"""What the picture covers; it repeats [m]."""
+_SUBSAMPLES = 3
+HARD = ("aluminium", "aluminium-pet", "ceramic", "rough-glass", "smooth-glass", "polyester-mirror", "stainless-steel")
+"""The substrates of the thesis, 4.2.2."""
+
+
+@dataclass(frozen=True)
+class Substrate:
+    """One floor. Floors are traced grey and plain: `floor_factor` has their marks and colour."""
+
+    name: str
+    albedo: float
+    """Share of the light that it scatters, or as a metal reflects."""
+    roughness: float
+    """Of its gloss."""
+    metallic: float
+    """1 for a metal."""
+    specular: float
+    """Strength of a dielectric's gloss, 0.5 for an index of refraction of 1.5."""
+    grain: float
+    """Contrast of its marks: what moves over a floor without any does not seem to move."""
+    seed: int
+    """Of the marks."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factor of its colour, mean 1."""
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether shapes are seen in it: a rough floor that is no metal shows the cloth's mean colour at most."""
+        return self.metallic > 0.5 or self.roughness < 0.25
+
+    @property
+    def numbers(self) -> list[float]:
+        """What a dataset's label holds: albedo, roughness, metallic, specular, grain, tint."""
+        return [self.albedo, self.roughness, self.metallic, self.specular, self.grain, *self.tint]
+
+
+@cache
+def _ranges() -> dict[str, dict[str, Any]]:
+    text = files("stickslip_blender.cloth").joinpath("substrates.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def substrate_names() -> tuple[str, ...]:
+    """Name what `drawn_substrate` takes: the finishes, and `any` for one of the hard ones and the matt plate."""
+    return (*_ranges(), "any")
+
+
+def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) -> Substrate:
+    """Draw a substrate of a finish, or of a custom one."""
+    if custom is None and name not in substrate_names():
+        raise ValueError(f"substrate must be one of {', '.join(substrate_names())}; got {name!r}")
+    random = np.random.Generator(np.random.PCG64([seed, 1]))
+    finish = str(random.choice(["matt", *HARD])) if name == "any" else name
+    ranges = _ranges()[finish] if custom is None else custom.model_dump()
+    color = np.array(ranges.get("tint", (1.0, 1.0, 1.0)))
+    if finish == "cloth":
+        color = 0.15 + 0.85 * random.random(3)
+    r, g, b = (color / color.mean()).tolist()
+    return Substrate(
+        name=finish,
+        albedo=float(random.uniform(*ranges["albedo"])),
+        roughness=float(random.uniform(*ranges["roughness"])),
+        metallic=ranges["metallic"],
+        specular=ranges["specular"],
+        grain=ranges["grain"],
+        seed=int(random.integers(2**31)),
+        tint=(r, g, b),
+    )
+
+
+def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDArray[np.float32]:
+    """Return what the floor's marks and colour do to its light in each pixel, shape (height, width, 3).
+
+    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m].
+    """
+    inverse = np.array(  # of the camera's matrix: from a pixel (column, row, 1) to its ray, in the camera's axes
+        [[1 / camera.fx, 0, -camera.cx / camera.fx], [0, 1 / camera.fy, -camera.cy / camera.fy], [0, 0, 1]]
+    )
+    rays = np.ascontiguousarray(np.asarray(camera.rotation).T @ inverse)
+    density, place = GRAIN_SIZE / GRAIN_EXTENT, np.array(camera.position, dtype=np.float64)
+    size = camera.width, camera.height
+    factor = _raster.tiled(_marks(substrate), density, rays, place, height, size, _SUBSAMPLES)
+    tinted: npt.NDArray[np.float32] = factor[..., None] * np.asarray(substrate.tint, dtype=np.float32)
+    return tinted
+
+
+def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
+    """Return the factor of a square of the floor that repeats, shape (GRAIN_SIZE, GRAIN_SIZE)."""
+    random = np.random.Generator(np.random.PCG64(substrate.seed))
+    if substrate.name == "cloth":  # a plain weave, drawn four times too coarse to be seen at all
+        thread = np.arange(GRAIN_SIZE) // 4
+        over = (thread[:, None] + thread[None, :]) % 2
+        marks = np.where(over == 1, 0.5, -0.5) + 0.5 * _spots(random, 4.0)
+    else:
+        marks = 0.5 * _spots(random, 10.0) + 0.5 * _spots(random, 30.0)  # finer ones would be noise far away
+    factor: npt.NDArray[np.float64] = np.clip(1.0 + substrate.grain * marks, 0.2, 1.8)
+    return factor
+
+
+def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64]:
+    """Return smooth noise of unit deviation that repeats; `extent` of its spots [texels]."""
+    down, along = np.fft.fftfreq(GRAIN_SIZE)[:, None], np.fft.rfftfreq(GRAIN_SIZE)
+    decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (down**2 + along**2))
+    spectrum = np.fft.rfft2(random.standard_normal((GRAIN_SIZE, GRAIN_SIZE)))
+    noise = np.fft.irfft2(spectrum * decay, (GRAIN_SIZE, GRAIN_SIZE))
+    spots: npt.NDArray[np.float64] = noise / noise.std()
+    return spots

@@ -1,0 +1,149 @@
+"""The cloth that is seen: the solver's mesh refined, with weak creases and a hem of some thickness.
+
+The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at most; a label says
+how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer 6 mm.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from stickslip_blender.cloth.subdivision import Subdivision, subdivide
+from stickslip_blender.raster import _raster
+
+FINE_VERTICES = 6000
+"""A mesh is subdivided until it has so many vertices: a facet is then below a pixel."""
+
+CREASE = 0.0005
+"""Height of the strongest crease at strength 1 [m]."""
+_CREASES = 14
+
+# Of the hem, from its inner edge over the upper side to the outer edge and back below: how far inside the edge of the
+# sheet [m], and how high over its middle surface, in units of half the hem's thickness.
+_PROFILE = np.array(
+    [(6.5e-3, 0.0), (6.0e-3, 1.0), (0.7e-3, 1.0), (-0.3e-3, 0.0), (0.7e-3, -1.0), (6.0e-3, -1.0), (6.5e-3, 0.0)]
+)
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int32]
+
+
+class Surface:
+    """A mesh refined, from positions of the solver's vertices to those that are seen."""
+
+    triangles: Indices
+    """Shape (T, 3)."""
+    uv: Array
+    """Texture coordinates in [0, 1], shape (V, 2)."""
+
+    def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike) -> None:
+        """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]."""
+        faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        self._levels: list[Subdivision] = []
+        while len(flat) < FINE_VERTICES:
+            self._levels.append(subdivide(faces, flat))
+            faces, flat = self._levels[-1].triangles, self._levels[-1](flat)
+        self._sheet = faces
+        self._count = len(flat)
+        rim = _rim(faces)
+        self._profile = np.repeat(_PROFILE[:, 1], len(rim))[:, None]
+        inside = np.concatenate([flat[rim] + offset * _inward(flat[rim]) for offset in _PROFILE[:, 0]])
+        self._corners, self._weights = _located(inside, flat, faces)
+        self.triangles = np.ascontiguousarray(np.concatenate([faces, _ring_faces(len(rim), self._count)]))
+        uv = (np.concatenate([flat, inside]) - low) / (high - low)
+        self.uv = np.ascontiguousarray(np.clip(uv, 0.0, 1.0))
+        self.dress(hem=0.0)
+
+    def dress(self, *, hem: float, creases: float = 0.0, seed: int = 0) -> None:
+        """Set half the thickness of the hem [m], and the strength (0 to 1) and seed of the creases."""
+        self._hem = hem * self._profile
+        self._height = creases * CREASE * _creases(self.uv[: self._count], seed) if creases > 0.0 else None
+
+    def __call__(self, positions: npt.ArrayLike) -> Array:
+        """Return the vertices (V, 3) that are seen of the solver's positions (V', 3) [m]."""
+        sheet = np.asarray(positions, dtype=np.float64)
+        for level in self._levels:
+            sheet = level(sheet)
+        normals = _raster.normals(sheet, self._sheet)
+        if self._height is not None:
+            lifted = sheet + self._height[:, None] * normals
+            lifted[:, 2] = np.maximum(lifted[:, 2], np.minimum(sheet[:, 2], 0.0))  # not into the floor
+            sheet = lifted
+        middle = np.einsum("hk,hkx->hx", self._weights, sheet[self._corners])
+        upward = np.einsum("hk,hkx->hx", self._weights, normals[self._corners])
+        return np.concatenate([sheet, middle + self._hem * upward])
+
+
+def _creases(uv: Array, seed: int) -> Array:
+    """Return the height of creases in [-1, 1] at (n, 2): straight ridges and furrows that fade along their length."""
+    random = np.random.Generator(np.random.PCG64([seed, 2]))
+    height = np.zeros(len(uv))
+    for _ in range(_CREASES):
+        middle, angle = random.random(2), random.uniform(0.0, np.pi)
+        width, length = random.uniform(0.015, 0.03), random.uniform(0.1, 0.4)
+        along = (uv - middle) @ [np.cos(angle), np.sin(angle)]
+        across = (uv - middle) @ [-np.sin(angle), np.cos(angle)]
+        ridge = np.exp(-((across / width) ** 2) - (along / length) ** 2)
+        height += random.choice([-1.0, 1.0]) * random.uniform(0.4, 1.0) * ridge
+    return np.clip(height, -1.0, 1.0)
+
+
+def _rim(faces: Indices) -> npt.NDArray[np.int64]:
+    """Return the vertices of the boundary in order, the sheet on their left."""
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, index, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    after = dict(sides[uses[index.reshape(-1)] == 1].tolist())
+    start = vertex = min(after)
+    loop = [start]
+    while (vertex := after[vertex]) != start:
+        loop.append(vertex)
+    if len(loop) != len(after):
+        raise ValueError("the cloth must have one edge all around")
+    return np.array(loop)
+
+
+def _inward(rim: Array) -> Array:
+    """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides there by 1."""
+
+    def unit(v: Array) -> Array:
+        scaled: Array = v / np.linalg.norm(v, axis=1, keepdims=True)
+        return scaled
+
+    def left(v: Array) -> Array:
+        return np.stack([-v[:, 1], v[:, 0]], axis=1)
+
+    before, after = unit(rim - np.roll(rim, 1, axis=0)), unit(np.roll(rim, -1, axis=0) - rim)
+    mean = unit(left(before) + left(after))
+    inward: Array = mean / (mean * left(after)).sum(axis=1, keepdims=True)
+    return inward
+
+
+def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:
+    """Return the corners (n, 3) and barycentric weights (n, 3) of flat points: of the triangle they are most inside."""
+    a, b, c = (flat[faces[:, k]] for k in range(3))
+    inverse = np.linalg.inv(np.stack([b - a, c - a], axis=-1))  # (T, 2, 2)
+    middle, reach = (a + b + c) / 3.0, 2.0 * np.abs(np.concatenate([b - a, c - a, c - b])).max()
+    corners, weights = np.empty((len(points), 3), dtype=np.int32), np.empty((len(points), 3))
+    for number, point in enumerate(points):
+        near = np.flatnonzero((np.abs(middle - point) < reach).all(axis=1))
+        bc = np.einsum("tij,tj->ti", inverse[near], point - a[near])
+        all_three = np.column_stack([1.0 - bc.sum(axis=1), bc])
+        best = int(all_three.min(axis=1).argmax())
+        corners[number], weights[number] = faces[near[best]], all_three[best]
+    return corners, weights
+
+
+def _ring_faces(around: int, first: int) -> npt.NDArray[Any]:
+    """Return the triangles of a strip about the edge: len(_PROFILE) rings of so many vertices."""
+    here = np.arange(around)
+    following = np.roll(here, -1)
+    faces = []
+    for ring in range(len(_PROFILE) - 1):
+        outer, inner = first + ring * around, first + (ring + 1) * around
+        faces += [np.stack([outer + here, inner + here, outer + following], axis=1)]
+        faces += [np.stack([outer + following, inner + here, inner + following], axis=1)]
+    return np.concatenate(faces).astype(np.int32)

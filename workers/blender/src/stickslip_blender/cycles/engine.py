@@ -1,0 +1,118 @@
+"""Settings of the render engine that all scenes share: Cycles on one device, one thread, a fixed seed."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from stickslip_schemas.spec.jobs import Quality
+
+from stickslip_blender.cycles.blender import CPU, device, import_bpy, use_device
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What a quality means to Cycles."""
+
+    samples: int
+    """Paths per pixel, the same for every pixel (no adaptive sampling)."""
+    denoiser: Literal["none", "plain", "guided"] = "none"
+    """OpenImageDenoise, fast; `guided` by albedo and normal, for textures have edges.
+
+    Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even cloth is `plain`.
+    """
+    seed: int = 0
+    """Of the sampling noise, the same for every frame: what is left of it does not flicker, and clips compress."""
+
+
+@dataclass(frozen=True)
+class ClothSampling:
+    """What a quality means to a clip of cloth, whose light is denoised."""
+
+    frame: int
+    """Paths per pixel in the whole frame."""
+    window: int
+    """Paths per pixel in the window that the cloth is in."""
+
+
+# Frozen: a change makes other pictures, and the build digest says so. benchmarks/render_rods.py measures them.
+SAMPLING = {
+    Quality.preview: Sampling(samples=4),
+    Quality.draft: Sampling(samples=8),
+    Quality.standard: Sampling(samples=28),
+    Quality.high: Sampling(samples=128),
+}
+# The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
+CLOTH_SAMPLING = {
+    Quality.preview: ClothSampling(frame=1, window=3),
+    Quality.draft: ClothSampling(frame=2, window=8),
+    Quality.standard: ClothSampling(frame=2, window=16),
+    Quality.high: ClothSampling(frame=8, window=64),
+}
+REFERENCE = Sampling(samples=256, seed=1)
+"""What pictures are compared with; its seed is another, so that it shares no noise with them."""
+
+
+def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: bool = True) -> Any:
+    """Empty Blender and return its one scene, with the engine set up and a world.
+
+    Blender holds one scene per process: a second one in the same process would empty the first.
+    """
+    bpy = import_bpy()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    with suppress(OSError):
+        Path(bpy.app.tempdir).rmdir()  # never used, empty, and left behind by a process that is killed
+    scene = bpy.context.scene
+    _set_up_cycles(scene)
+    scene.cycles.max_bounces = max_bounces
+    scene.cycles.diffuse_bounces = diffuse_bounces
+    scene.cycles.glossy_bounces = 1
+    scene.cycles.use_light_tree = light_tree
+    _set_up_colors(scene)
+    scene.world = bpy.data.worlds.new("world")
+    return scene
+
+
+def _set_up_cycles(scene: Any) -> None:
+    render, cycles = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    render.threads_mode = "FIXED"
+    render.threads = 1
+    render.use_persistent_data = True
+    render.use_compositing = False
+    render.use_sequencer = False
+    render.resolution_percentage = 100
+    use_device(scene)
+    cycles.use_animated_seed = False
+    cycles.use_adaptive_sampling = False
+    cycles.time_limit = 0.0
+    cycles.pixel_filter_type = "BOX"  # a pixel is the mean over its own area, as on a sensor
+    cycles.caustics_reflective = False
+    cycles.caustics_refractive = False
+
+
+def _set_up_colors(scene: Any) -> None:
+    """Make 8-bit values the sRGB encoding of the light itself, without filmic curve or dither: colors keep meaning."""
+    scene.display_settings.display_device = "sRGB"
+    view = scene.view_settings
+    view.view_transform = "Standard"
+    view.look = "None"
+    view.exposure = 0.0
+    view.gamma = 1.0
+    scene.render.dither_intensity = 0.0
+
+
+def set_sampling(scene: Any, sampling: Sampling) -> None:
+    """Set the parameters that a quality names."""
+    cycles = scene.cycles
+    cycles.samples = sampling.samples
+    cycles.seed = sampling.seed
+    cycles.use_denoising = sampling.denoiser != "none"
+    if sampling.denoiser != "none":
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.denoising_quality = "FAST"
+        cycles.denoising_prefilter = "NONE"
+        cycles.denoising_input_passes = "RGB" if sampling.denoiser == "plain" else "RGB_ALBEDO_NORMAL"
+        cycles.denoising_use_gpu = device() != CPU

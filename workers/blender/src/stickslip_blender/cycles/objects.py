@@ -1,0 +1,164 @@
+"""Objects of a Blender scene: meshes, materials, the lamp and the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.spec.cameras import Camera
+
+from stickslip_blender.cycles.blender import import_bpy
+
+SENSOR_WIDTH = 36.0  # [mm]; only the ratio of focal length to sensor width matters
+_CLIP = (1e-3, 1e3)  # [scene units]
+
+Array = npt.NDArray[np.float64]
+
+
+def add_mesh(
+    scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]], *, is_smooth: bool = False
+) -> Any:
+    """Add a mesh of vertices (n, 3) and polygons, and return its data."""
+    bpy = import_bpy()
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(np.asarray(vertices).tolist(), [], [list(face) for face in faces])
+    scene.collection.objects.link(bpy.data.objects.new(name, mesh))
+    if is_smooth:
+        mesh.shade_smooth()
+    return mesh
+
+
+def move_mesh(mesh: Any, points: npt.ArrayLike) -> None:
+    """Move the vertices of a mesh to points (n, 3)."""
+    mesh.attributes["position"].data.foreach_set("vector", np.asarray(points, dtype=np.float32).ravel())
+    mesh.update()
+
+
+def add_material(mesh: Any, name: str, **inputs: Any) -> Any:
+    """Give a mesh a material of the Principled shader with inputs, as for `set_inputs`, and return the shader."""
+    material = import_bpy().data.materials.new(name)
+    shader = material.node_tree.nodes["Principled BSDF"]
+    set_inputs(shader, **inputs)
+    mesh.materials.append(material)
+    return shader
+
+
+def set_inputs(shader: Any, **inputs: Any) -> None:
+    """Set inputs of a shader by name, `_` for a blank."""
+    for words, value in inputs.items():
+        shader.inputs[words.replace("_", " ")].default_value = value
+
+
+class Lamp:
+    """A round area lamp that cameras do not see."""
+
+    def __init__(self, scene: Any, diameter: float) -> None:
+        data = import_bpy().data.lights.new("lamp", "AREA")
+        data.shape = "DISK"
+        data.size = diameter
+        self._lamp = import_bpy().data.objects.new("lamp", data)
+        self._lamp.visible_camera = False
+        scene.collection.objects.link(self._lamp)
+
+    def set_power(self, watts: float) -> None:
+        """Set the power [W]."""
+        self._lamp.data.energy = watts
+
+    def aim(self, at: Array, outward: Array, distance: float) -> None:
+        """Place the lamp at a distance from a point, in the direction `outward`, and turn it to the point."""
+        from mathutils import Vector
+
+        self._lamp.location = at + distance * outward
+        self._lamp.rotation_euler = Vector(outward.tolist()).to_track_quat("Z", "Y").to_euler()
+
+
+class Fabric:
+    """The material of a cloth, with one colour or a picture: the Principled shader, mixed with translucency."""
+
+    def __init__(self, mesh: Any, uv: Array, corners: npt.NDArray[np.int32]) -> None:
+        """Give a mesh texture coordinates (V, 2), by its corners in the order of its faces, and the material."""
+        mesh.uv_layers.new(name="rest").uv.foreach_set("vector", uv[corners].astype(np.float32).ravel())
+        self._shader = add_material(mesh, "fabric", Sheen_Roughness=0.5)
+        self._tree = tree = mesh.materials[0].node_tree
+        self._picture = tree.nodes.new("ShaderNodeTexImage")
+        self._picture.extension = "EXTEND"
+        self._even = tree.nodes.new("ShaderNodeRGB")
+        self._color = tree.nodes.new("NodeReroute")
+        through = tree.nodes.new("ShaderNodeBsdfTranslucent")
+        self._both = tree.nodes.new("ShaderNodeMixShader")
+        tree.links.new(self._color.outputs[0], self._shader.inputs["Base Color"])
+        tree.links.new(self._color.outputs[0], through.inputs["Color"])
+        tree.links.new(self._shader.outputs["BSDF"], self._both.inputs[1])
+        tree.links.new(through.outputs["BSDF"], self._both.inputs[2])
+        tree.links.new(self._both.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"])
+        self._from: Any = None
+
+    def set_look(self, *, roughness: float, specular: float, sheen: float, translucency: float) -> None:
+        """Set the gloss, the sheen and the share of light that the fabric transmits."""
+        set_inputs(self._shader, Roughness=roughness, Specular_IOR_Level=specular, Sheen_Weight=sheen)
+        set_inputs(self._both, Fac=translucency)
+
+    def set_color(self, color: tuple[float, float, float]) -> None:
+        """Give the cloth one linear colour."""
+        self._even.outputs["Color"].default_value = (*color, 1.0)
+        self._connect(self._even)
+
+    def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
+        """Print a picture on the cloth, (size, size, 3), 8-bit sRGB, row 0 at its lower edge."""
+        images, old = import_bpy().data.images, self._picture.image
+        image = images.new("print", *picture.shape[:2])  # a new one: Cycles does not read a changed image again
+        set_pixels(image, picture / np.float32(255))
+        image.update()
+        self._picture.image = image
+        if old is not None:
+            images.remove(old)
+        self._connect(self._picture)
+
+    def _connect(self, node: Any) -> None:
+        if self._from is not node:
+            self._tree.links.new(node.outputs["Color"], self._color.inputs[0])
+            self._from = node
+
+
+def set_pixels(image: Any, color: npt.NDArray[np.float32]) -> None:
+    """Set the pixels of an image from colours (height, width, 3), or (height, width, 1) for grey."""
+    rgba = np.ones((*color.shape[:2], 4), dtype=np.float32)
+    rgba[..., :3] = color
+    image.pixels.foreach_set(rgba.ravel())
+
+
+def add_view(scene: Any) -> Any:
+    """Add a camera object, make it the scene's, and return it."""
+    bpy = import_bpy()
+    data = bpy.data.cameras.new("view")
+    data.type = "PERSP"
+    data.sensor_fit = "HORIZONTAL"
+    data.sensor_width = SENSOR_WIDTH
+    data.clip_start, data.clip_end = _CLIP
+    view = bpy.data.objects.new("view", data)
+    scene.collection.objects.link(view)
+    scene.camera = view
+    return view
+
+
+def set_view(scene: Any, camera: Camera) -> None:
+    """Make the scene's camera project as `camera` does.
+
+    Blender's camera looks along -z with y up, and its shifts are in units of the image's width, in square pixels.
+    """
+    from mathutils import Matrix
+
+    render, view = scene.render, scene.camera
+    render.resolution_x, render.resolution_y = camera.width, camera.height
+    # Pixels that are not square: Blender takes aspects >= 1 and measures in the narrower of the two.
+    ratio = camera.fx / camera.fy  # a pixel's height over its width
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, 1.0 / ratio), max(1.0, ratio)
+    view.data.lens = camera.fx / camera.width * SENSOR_WIDTH
+    view.data.shift_x = ((camera.width - 1) / 2 - camera.cx) / camera.width
+    view.data.shift_y = (camera.cy - (camera.height - 1) / 2) / camera.width * ratio
+    pose = np.eye(4)
+    pose[:3, :3] = np.asarray(camera.rotation).T @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = camera.position
+    view.matrix_world = Matrix(pose.tolist())

@@ -1,0 +1,118 @@
+"""Read rendered frames from Blender as linear light, and encode light as sRGB.
+
+Headless Blender gives no access to its pixels in memory, so a frame goes through an uncompressed file. On Linux that is
+an anonymous file in memory, and a killed process leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from stickslip_blender.cycles.blender import import_bpy
+from stickslip_blender.cycles.exr import read_exr
+from stickslip_blender.raster import Window
+
+_LEVELS = 65536  # of the table that encodes linear light
+
+
+def _encoding() -> npt.NDArray[np.uint8]:
+    light = np.arange(_LEVELS) / (_LEVELS - 1)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return np.rint(255.0 * srgb).astype(np.uint8)
+
+
+_ENCODED = _encoding()
+
+
+def encode(light: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Return linear light as 8-bit sRGB [IEC 61966-2-1], clipped to [0, 1]."""
+    scaled = np.clip(light, 0.0, 1.0)
+    scaled *= _LEVELS - 1
+    scaled += 0.5
+    coded: npt.NDArray[np.uint8] = _ENCODED[scaled.astype(np.uint16)]
+    return coded
+
+
+class FrameReader:
+    """Renders a scene into arrays. With a scratch folder given, frames go through a file there instead of memory."""
+
+    def __init__(self, scene: Any, scratch: str | Path | None = None) -> None:
+        self._memory: int | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        if scratch is None and hasattr(os, "memfd_create"):
+            self._memory = os.memfd_create("frame")
+            self._path = Path(f"/proc/self/fd/{self._memory}")
+        else:
+            self._folder = tempfile.TemporaryDirectory(prefix="stickslip-frames-", dir=scratch)
+            self._path = Path(self._folder.name) / "frame"
+        self._scene = scene
+        image, render = scene.render.image_settings, scene.render
+        image.color_management = "FOLLOW_SCENE"
+        image.file_format = "OPEN_EXR"
+        image.color_depth = "16"
+        image.exr_codec = "NONE"
+        render.use_stamp = False
+        render.use_file_extension = False
+        render.filepath = str(self._path)
+
+    def close(self) -> None:
+        """Close or delete the file."""
+        if self._folder is not None:
+            self._folder.cleanup()
+        if self._memory is not None:
+            os.close(self._memory)
+        self._memory = self._folder = None
+
+    def read_light(self, window: Window | None = None) -> npt.NDArray[np.float16]:
+        """Render the scene as it stands, or a window of it: linear light, not clipped, shape (height, width, 3).
+
+        A window has the very values that it would have in the whole frame.
+        """
+        return read_exr(self._rendered("RGB", window), "RGB")
+
+    def read_matte(self, window: Window | None = None) -> npt.NDArray[np.float16]:
+        """Render as `read_light` does, before nothing: light times coverage, and coverage, shape (height, width, 4)."""
+        return read_exr(self._rendered("RGBA", window), "RGBA")
+
+    def _rendered(self, channels: Literal["RGB", "RGBA"], window: Window | None) -> bytes:
+        self._scene.render.film_transparent = channels == "RGBA"
+        self._scene.render.image_settings.color_mode = channels
+        _set_window(self._scene.render, window)
+        self._path.write_bytes(b"")  # so that a frame is never an old one
+        with _quiet():
+            import_bpy().ops.render.render(write_still=True)
+        return self._path.read_bytes()
+
+
+def _set_window(render: Any, window: Window | None) -> None:
+    render.use_border = render.use_crop_to_border = window is not None
+    if window is not None:
+        width, height = render.resolution_x, render.resolution_y
+        # Blender truncates to whole pixels: half a pixel keeps rounding out of it. It counts rows from below.
+        render.border_min_x = (window.left + 0.5) / width
+        render.border_max_x = (window.right + 0.5) / width
+        render.border_min_y = (height - window.bottom + 0.5) / height
+        render.border_max_y = (height - window.top + 0.5) / height
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Send file descriptor 1 nowhere: Blender logs every saved frame there and, as a module, has no switch for it."""
+    sys.stdout.flush()
+    stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
+        os.close(nowhere)

@@ -1,0 +1,1 @@
+"""Pictures of rods: the tube, its colour, and the renderer."""

@@ -1,0 +1,177 @@
+"""What is compiled beside the rasteriser, against numpy."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from stickslip_blender.cloth.shading import ALBEDOS, TOLERANCE
+from stickslip_blender.raster import Window, _raster
+from stickslip_schemas.spec.cameras import Camera
+
+RANDOM = np.random.Generator(np.random.PCG64(0))
+
+
+def _srgb(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    bounded = np.clip(light, 0.0, 1.0)
+    return 255.0 * np.where(bounded <= 0.0031308, 12.92 * bounded, 1.055 * bounded ** (1.0 / 2.4) - 0.055)
+
+
+def test_composed_pictures_are_what_the_formula_says() -> None:
+    """In numpy, and in double precision: gloss, light once and twice scattered, from light that has all three."""
+    height, width, count = 9, 12, 3
+    window, around = Window(2, 1, 8, 7), Window(5, 3, 12, 9)
+    gloss, once, twice = RANDOM.uniform(-0.02, 0.4, (3, height, width))
+    light = np.stack([gloss + once * a + twice * a * a for a in ALBEDOS], axis=-1).astype(np.float16)
+    coverage = RANDOM.uniform(0.0, 1.0, (6, 6)).astype(np.float32) * (RANDOM.random((6, 6)) < 0.7)
+    seen, reflected, overall = (
+        RANDOM.uniform(0.0, 1.0, shape).astype(np.float32) for shape in [(6, 6, 9), (6, 7, 9), (9,)]
+    )
+    floor = RANDOM.uniform(0.5, 1.5, (height, width, 3)).astype(np.float32)
+    pictures = np.empty((count, 2, height, width, 3), dtype=np.uint8)[:, 1]
+    _raster.compose(
+        light.view(np.uint16),
+        ALBEDOS[1:],
+        overall,
+        coverage,
+        seen,
+        window.place,
+        reflected,
+        around.place,
+        floor,
+        0.3,
+        pictures,
+    )
+
+    at = [light[..., k].astype(np.float64) for k in range(3)]
+    S, *rest = np.linalg.solve(np.vander(ALBEDOS, 3, increasing=True), np.stack([a.ravel() for a in at]))
+    D, I = (part.reshape(height, width, 1) for part in rest)  # noqa: E741
+    albedo = np.tile(overall.astype(np.float64), (height, width, 1))
+    albedo[around.slices] = reflected
+    cover = np.zeros((height, width, 1))
+    cover[window.slices] = coverage[..., None]
+    share = cover / np.maximum(cover + (1.0 - cover) * 0.3, 1e-12)
+    over = np.zeros_like(albedo)
+    over[window.slices] = seen
+    albedo += share * (over - albedo)
+    expected = (S.reshape(height, width, 1) + (D + I * overall) * albedo).reshape(height, width, count, 3)
+    expected *= (1.0 + (1.0 - cover) * (floor - 1.0))[:, :, None]
+    expected = np.moveaxis(expected, 2, 0)
+    np.testing.assert_allclose(pictures, _srgb(expected), atol=1.1)
+    for picture, exact in zip(pictures, expected, strict=True):  # their levels are chosen as for any light
+        unlike = (picture != _raster.settled(exact.astype(np.float32))).any(axis=(1, 2))
+        assert unlike.mean() < 0.15  # rows in which single precision has crossed a threshold
+
+
+def _settled_slowly(exact: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    """Choose the levels of exact values (height, width, 3) as raster/composition.hpp says."""
+    picture = np.empty(exact.shape, dtype=np.uint8)
+    for values, row in zip(exact, picture, strict=True):
+        column = 0
+        while column < len(row):
+            rest = np.abs(values[column:] - row[column - 1]) <= 1.0
+            run = int(np.append(rest.all(axis=1), False).argmin()) if column else 0
+            if run >= 3 or (run and column + run == len(row)):
+                row[column : column + run] = row[column - 1]
+                column += run
+                continue
+            for color in range(3):
+                level = int(np.floor(values[column, color] + 0.5))
+                row[column, color] = level
+                if color and abs(values[column, color] - row[column, color - 1]) <= 1.0:
+                    row[column, color] = row[column, color - 1]
+            column += 1
+    return picture
+
+
+def _noisy_light(random: np.random.Generator) -> npt.NDArray[np.float32]:
+    """Return a dark, nearly grey slope of light, some of it noise, and a band of strong colours across it."""
+    slope = np.linspace(0.004, 0.02, 60)[None, :, None] * np.linspace(0.9, 1.1, 24)[:, None, None]
+    light = slope * (1.0 + 0.03 * random.standard_normal((24, 60, 3))) * [1.0, 1.02, 0.97]
+    light[8:14] = random.uniform(-0.1, 1.2, (6, 60, 3))
+    return light.astype(np.float32)
+
+
+def test_levels_are_near_the_exact_values_and_the_same_for_neighbours() -> None:
+    light = _noisy_light(np.random.Generator(np.random.PCG64(4)))
+    exact = np.rint(256.0 * _srgb(np.rint(np.clip(light, 0.0, 1.0) * 65535.0) / 65535.0)) / 256.0
+    picture = _raster.settled(light)
+    np.testing.assert_array_equal(picture, _settled_slowly(exact))
+    error = np.abs(picture - exact)
+    assert error.max() <= TOLERANCE
+    rounded = np.abs(np.rint(exact) - picture)
+    assert 0.1 < (rounded > 0).mean() < 0.9, "some levels are those of neighbours, and others the nearest"
+    runs = (picture[:, 1:] == picture[:, :-1]).all(axis=2)
+    plain = (np.rint(exact)[:, 1:] == np.rint(exact)[:, :-1]).all(axis=2)
+    assert runs.mean() > 2.0 * plain.mean()
+    assert (rounded[8:14] == 0).mean() > 0.95, "colours that differ are rounded"
+
+
+def test_levels_depend_on_the_picture_alone() -> None:
+    """What stands still has the same bytes in all frames, and a row does not depend on the others."""
+    light = _noisy_light(np.random.Generator(np.random.PCG64(5)))
+    np.testing.assert_array_equal(_raster.settled(light), _raster.settled(light))
+    np.testing.assert_array_equal(_raster.settled(light)[5:9], _raster.settled(np.ascontiguousarray(light[5:9])))
+    with pytest.raises(ValueError, match=r"light: must be of shape \(height, width, 3\)"):
+        _raster.settled(np.zeros((4, 4, 2), dtype=np.float32))
+
+
+def _side(inside: Any, middle: int, radius: float) -> npt.NDArray[np.float64]:
+    """Return the shares of cells that a side of a box covers, about the middle of one of them."""
+    half = np.sqrt(0.25 + radius**2)
+    low, high = middle + 0.5 - half, middle + 0.5 + half
+    covered: npt.NDArray[np.float64] = np.clip(np.minimum(inside + 1, high) - np.maximum(inside, low), 0.0, 1.0)
+    return covered / (2.0 * half)
+
+
+def test_blurring_is_a_box_twice() -> None:
+    height, width = 7, 9
+    values = RANDOM.uniform(0.0, 1.0, (height, width, 2)).astype(np.float32)
+    down, across = (RANDOM.uniform(0.0, 2.5, (height, width)).astype(np.float32) for _ in range(2))
+    down[2, 3] = across[2, 3] = 0.0
+    expected = values.astype(np.float64)
+    for _ in range(2):
+        blurred = np.empty_like(expected)
+        for row, column in np.ndindex(height, width):
+            box = np.outer(
+                _side(np.arange(height), row, down[row, column]), _side(np.arange(width), column, across[row, column])
+            )
+            blurred[row, column] = np.einsum("hw,hwk->k", box, expected)
+        expected = blurred
+    np.testing.assert_allclose(_raster.blurred(values, down, across), expected, atol=1e-6)
+    with pytest.raises(ValueError, match="radii must be at least 0"):
+        _raster.blurred(values, down - 1.0, across)
+
+
+def test_a_tiled_picture_repeats_over_the_plane() -> None:
+    """Of a picture that is a wave, with one sample a pixel: the wave at the place that the pixel sees."""
+    camera = Camera.looking_at(
+        (0.1, 0.0, 0.0), azimuth=20.0, elevation=35.0, distance=1.0, name="a", width=40, height=30, focal=60.0
+    )
+    size, density = 256, 512.0
+    angle = 2.0 * np.pi * np.arange(size) / size
+    picture = np.sin(angle)[None, :] + 0.5 * np.cos(3.0 * angle)[:, None]
+    matrix = np.array([[60.0, 0.0, camera.cx], [0.0, 60.0, camera.cy], [0.0, 0.0, 1.0]])
+    rays = np.ascontiguousarray(np.asarray(camera.rotation).T @ np.linalg.inv(matrix))
+    seen = _raster.tiled(picture, density, rays, np.array(camera.position), -0.02, (40, 30), 1)
+    rows, columns = np.indices(seen.shape)
+    way = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ rays.T
+    reach = (-0.02 - camera.position[2]) / way[..., 2]
+    x, y = (camera.position[k] + reach * way[..., k] for k in range(2))
+    wave = 2.0 * np.pi * density / size
+    np.testing.assert_allclose(seen, np.sin(wave * x) + 0.5 * np.cos(3.0 * wave * y), atol=2e-3)
+
+
+def test_normals_point_off_the_surface() -> None:
+    """Of a strip of a cylinder, its radii; a vertex of no triangle has none."""
+    angle, height = np.meshgrid(np.linspace(0.0, 1.0, 41), np.linspace(0.0, 0.2, 9), indexing="ij")
+    points = np.stack([np.cos(angle), np.sin(angle), height], axis=-1).reshape(-1, 3)
+    number = np.arange(41 * 9).reshape(41, 9)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    triangles = np.concatenate(
+        [np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([b, d, c], axis=-1).reshape(-1, 3)]
+    )
+    normals = _raster.normals(np.concatenate([points, [[9.0, 9.0, 9.0]]]), triangles.astype(np.int32))
+    inner = number[1:-1, 1:-1].ravel()
+    np.testing.assert_allclose(normals[inner], (points * [1.0, 1.0, 0.0])[inner], atol=1e-3)
+    assert not normals[-1].any()

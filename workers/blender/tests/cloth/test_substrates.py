@@ -1,0 +1,57 @@
+"""Floors and lamps keep within their ranges, and a seed says which."""
+
+import numpy as np
+import pytest
+from stickslip_blender.cloth.geometry import FLOOR
+from stickslip_blender.cloth.looks import LIGHTS, drawn_light, grained, look_of, looks
+from stickslip_blender.cloth.substrates import HARD, drawn_substrate, floor_factor, substrate_names
+from stickslip_schemas.kinds.cloth.spec import Lighting, Substrate
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.fabrics import Material
+
+
+def test_the_contract_and_the_renderer_name_the_same_things() -> None:
+    assert tuple(Lighting) == LIGHTS
+    assert tuple(Substrate) == substrate_names()
+    assert set(Material) == set(looks())
+
+
+@pytest.mark.parametrize("name", substrate_names())
+def test_a_substrate_is_drawn_by_its_seed(name: str) -> None:
+    drawn = [drawn_substrate(name, seed) for seed in range(60)]
+    assert drawn[7] == drawn_substrate(name, 7)
+    assert len({substrate.numbers[1] for substrate in drawn}) == 60
+    names = {substrate.name for substrate in drawn}
+    assert names == ({"matt", *HARD} if name == "any" else {name})
+    assert all(0.0 < substrate.albedo < 1.0 for substrate in drawn)
+    assert all(np.mean(substrate.tint) == pytest.approx(1.0) for substrate in drawn)
+    assert (len({substrate.tint for substrate in drawn}) > 1) == (name == "cloth")
+
+
+def test_held_out_lamps_are_not_among_those_to_train_with() -> None:
+    usual, other = ([drawn_light(name, seed).numbers for seed in range(200)] for name in ("drawn", "held-out"))
+    low, high = np.min(usual, axis=0), np.max(usual, axis=0)
+    assert not ((low <= other) & (other <= high)).any()
+
+
+def test_marks_lie_still_on_the_floor() -> None:
+    """Two cameras see the same mark at the same place of the floor."""
+    substrate = drawn_substrate("matt", 3)
+    one, other = load_rig("drag")[:2]
+    place = np.array([[x, y, FLOOR] for x in np.linspace(0.0, 0.3, 12) for y in np.linspace(-0.1, 0.1, 9)])
+    seen = []
+    for camera in (one, other):
+        factor = floor_factor(substrate, camera, FLOOR)
+        column, row = np.rint(camera.project(place)[0]).astype(int).T
+        seen.append(factor[row, column, 0])
+    assert np.std(seen[0]) > 0.1
+    assert np.corrcoef(seen)[0, 1] > 0.7  # a pixel apart at most
+
+
+def test_fabrics_differ_in_their_grain() -> None:
+    white = np.full((256, 256, 3), 200, dtype=np.uint8)
+    prints = {material: grained(white, look_of(material)) for material in looks()}
+    assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
+    assert prints["11oz-black-denim"].std() > 4 * prints["camel-ponte-roma"][20:-20, 20:-20].std()
+    for picture in prints.values():
+        assert 170 < picture.mean() < 230

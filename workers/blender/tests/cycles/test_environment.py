@@ -1,0 +1,51 @@
+"""The panorama lights from where it says."""
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stickslip_blender.cycles.blender import import_bpy
+from stickslip_blender.cycles.engine import Sampling, new_scene, set_sampling
+from stickslip_blender.cycles.environment import SoftBox, panorama, set_environment
+from stickslip_blender.cycles.objects import add_view, set_view
+from stickslip_blender.cycles.pixels import FrameReader
+from stickslip_schemas.spec.cameras import Camera
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "bright"),
+    [(0.0, 0.0, "right"), (180.0, 0.0, "left"), (90.0, 90.0, "top"), (0.0, -90.0, "bottom"), (270.0, 0.0, "middle")],
+)
+def test_a_ball_is_lit_from_where_the_soft_box_stands(
+    azimuth: float, elevation: float, bright: str, tmp_path: Path
+) -> None:
+    scene = new_scene()
+    set_sampling(scene, Sampling(samples=32))
+    set_environment(scene, panorama([SoftBox(azimuth, elevation, radiance=1.0, sharpness=8.0)], 0.0), ground=0.0)
+    import_bpy().ops.mesh.primitive_uv_sphere_add(segments=48, ring_count=24, radius=1.0)
+    add_view(scene)
+    set_view(  # from -y, so that +x is on the right
+        scene,
+        Camera.looking_at(
+            (0.0, 0.0, 0.0), azimuth=270.0, elevation=0.0, distance=10.0, name="a", width=33, height=33, focal=130.0
+        ),
+    )
+    with closing(FrameReader(scene, tmp_path)) as reader:
+        frame = reader.read_light().astype(float).mean(axis=2)
+    spots = {
+        "left": frame[16, 6],
+        "right": frame[16, 26],
+        "top": frame[6, 16],
+        "bottom": frame[26, 16],
+        "middle": frame[16, 16],
+    }
+    assert max(spots, key=lambda name: spots[name]) == bright, spots
+    assert frame[0, 0] == 0.0
+
+
+def test_the_panorama_is_as_bright_as_it_says() -> None:
+    light = panorama([SoftBox(30.0, 20.0, radiance=2.0, sharpness=4.0)], 0.25)
+    assert light.dtype == np.float32
+    assert light.min() == pytest.approx(0.25)
+    assert light.max() == pytest.approx(2.25, abs=0.01)
