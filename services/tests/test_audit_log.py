@@ -116,9 +116,9 @@ def test_the_command_line_shows_it(settings: Settings, monkeypatch: pytest.Monke
     cli("keys", "create", "bert", "--scope", "read")
     with serving(make_app(settings)) as url:
         job = httpx.post(f"{url}/v1/jobs", json=rods(), trust_env=False, timeout=30).json()["id"]
-    (line,) = (json.loads(text) for text in cli("journal", job, "--json").stdout.splitlines())
+    (line,) = (json.loads(text) for text in cli("audit-log", job, "--json").stdout.splitlines())
     assert (line["actor"], line["action"], line["subject"]) == (NOBODY, "job.submit", job)
-    shown = cli("journal").stdout
+    shown = cli("audit-log").stdout
     assert "user ada" in shown
     assert "key.create" in shown
-    assert len(cli("journal", "--json", "--limit", "1").stdout.splitlines()) == 1
+    assert len(cli("audit-log", "--json", "--limit", "1").stdout.splitlines()) == 1

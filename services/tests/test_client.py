@@ -1,6 +1,7 @@
 """The client: a job from its spec to its files, also from asynchronous programs, and restarts of the coordinator."""
 
 import asyncio
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -55,14 +56,16 @@ def test_asynchronous_programs_call_the_client_in_threads(app: FastAPI) -> None:
 
 
 def test_a_missing_coordinator_is_reported_at_once_and_a_restart_is_waited_for() -> None:
-    answers = iter([httpx.Response(200, json=[]), httpx.ConnectError("gone"), httpx.Response(200, json=[])])
+    answers: Iterator[httpx.Response | httpx.ConnectError] = iter(
+        [httpx.Response(200, json=[]), httpx.ConnectError("gone"), httpx.Response(200, json=[])]
+    )
     slept: list[float] = []
 
     def handler(_: httpx.Request) -> httpx.Response:
         answer = next(answers)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+        if isinstance(answer, httpx.Response):
+            return answer
+        raise answer
 
     with Client("http://127.0.0.1:9", patience=60, sleep=slept.append) as client, pytest.raises(UnreachableError):
         client.workers()

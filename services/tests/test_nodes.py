@@ -22,9 +22,9 @@ import pytest
 from sqlalchemy import select
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import open_store
-from stickslip_services import upkeep
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.catalog.versions import damaged_files
+from stickslip_services.cli import app
 from stickslip_services.database.opening import connect
 from stickslip_services.database.tables import dataset_versions
 from stickslip_services.local.process import listen
@@ -32,6 +32,7 @@ from stickslip_services.queue.audit import audit
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import wait_until
+from typer.testing import CliRunner
 
 if TYPE_CHECKING:
     from stickslip_testing.postgresql import PostgresqlServer
@@ -195,10 +196,8 @@ def test_every_sample_once_whoever_is_killed(
 
     database, store = connect(settings), open_store(settings.store_place)
     words = ["gc", "--older-than", "0", "--data", str(settings.data), "--store", settings.store_place]
-    assert upkeep.main([*words, "--delete"]) == 0  # what calls that were killed had written
-    capsys.readouterr()
-    assert upkeep.main(words) == 0
-    assert capsys.readouterr().out.startswith("0 files")
+    assert CliRunner().invoke(app, [*words, "--delete"]).exit_code == 0  # what calls that were killed had written
+    assert CliRunner().invoke(app, words).output.startswith("0 files")
     with database.read() as connection:
         assert audit(connection) == []
         versions = connection.execute(select(dataset_versions)).all()

@@ -21,7 +21,7 @@ from stickslip_schemas.base.states import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.cli import app
-from stickslip_services.coordinator import main, reindex
+from stickslip_services.coordinator import main
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, connect, opened
 from stickslip_services.database.tables import dataset_versions, tasks
@@ -353,10 +353,12 @@ def test_a_lost_database_is_built_again(settings: Settings, postgresql: "Postgre
     PretendWorker(coordinator, coordinator.store).register().work()
     known = list_datasets(coordinator)
     coordinator.close()
-    lost = Settings.chosen(data=settings.data, durable=False, database=postgresql.empty())
+    empty = postgresql.empty()
+    lost = Settings.chosen(data=settings.data, durable=False, database=empty)
     with pytest.raises(DatabaseRefusedError, match=r"is gone: run `stickslip reindex .*` with the same --database"):
         check(lost, Role.coordinator, with_store=True)
-    assert reindex(lost) == 0
+    found_again = CliRunner().invoke(app, ["reindex", "--data", str(settings.data), "--database", empty])
+    assert found_again.exit_code == 0, found_again.output
     again = Coordinator(lost)
     again.start()
     (found,) = list_datasets(again)

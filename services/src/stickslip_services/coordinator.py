@@ -13,7 +13,6 @@ import json
 import logging
 import socket
 import sys
-from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
@@ -24,7 +23,6 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
 from stickslip_schemas import tracing
-from stickslip_schemas.store import open_store
 
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, local_worker_key
@@ -46,7 +44,6 @@ from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.local.process import configure_logging, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.reindexing import reindex as find_versions
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -141,23 +138,6 @@ class _Server(uvicorn.Server):
             sys.stdout.flush()
 
 
-def reindex(settings: Settings) -> int:
-    """Find the datasets in the store again; return the exit status."""
-    counts = Counter[str]()
-    with locked(settings.data), opened(settings, Role.upkeep) as database:
-        for found in find_versions(database, open_store(settings.store_place)):
-            if found.fault:
-                sys.stderr.write(f"left out: {found.name}: {found.fault}\n")
-            elif found.is_new:
-                sys.stdout.write(f"{found.name}  {found.samples} samples\n")
-            counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
-    sys.stderr.write(
-        f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out\n"
-        "certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`\n"
-    )
-    return 1 if counts["bad"] else 0
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run until a signal comes; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
@@ -172,15 +152,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
     parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
-    parser.add_argument("--reindex", action="store_true", default=None, help="find the datasets in the store, and end")
     parser.add_argument("--migrate", action="store_true", default=None, help="bring the database up to date, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
     chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
     if chosen.pop("openapi", False):
         sys.stdout.write(openapi_text())
         return 0
-    descriptor, is_reindexing = chosen.pop("fd", None), chosen.pop("reindex", False)
-    is_migrating = chosen.pop("migrate", False)
+    descriptor, is_migrating = chosen.pop("fd", None), chosen.pop("migrate", False)
     try:
         settings = Settings.chosen(**chosen)
     except SettingsError as error:
@@ -188,8 +166,6 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     configure_logging()
     try:
-        if is_reindexing:
-            return reindex(settings)
         if is_migrating:
             check_database(settings, Role.visitor, with_store=True)
             with opened(settings, Role.visitor):

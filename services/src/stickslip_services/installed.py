@@ -1,4 +1,4 @@
-"""Whether the packages of the server are there: the client and the command line do without them."""
+"""Detection of the server packages, which the client and most commands do without."""
 
 from importlib.util import find_spec
 
@@ -7,11 +7,11 @@ from stickslip_services.errors import ServerNotInstalledError
 _SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
 
 
-def require_server(command: str) -> None:
-    """Raise ServerNotInstalledError where the packages of the server are missing."""
+def require_server() -> None:
+    """Raise ServerNotInstalledError if a package of the server is missing."""
     missing = [name for name in _SERVER_MODULES if find_spec(name) is None]
     if missing:
         raise ServerNotInstalledError(
-            f"`stickslip {command}` needs the server, and {', '.join(missing)} is not installed: "
+            f"this command needs the server, and {', '.join(missing)} is not installed: "
             "pip install 'stickslip-services[server]'"
         )

@@ -1,7 +1,6 @@
 """What commands share: options, a console, JSON output."""
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,8 +9,6 @@ import typer
 from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
-
-from stickslip_services.addresses import DATABASE_VARIABLE
 
 UrlOption = Annotated[str, typer.Option("--url", envvar="STICKSLIP_URL", help="where the coordinator is")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
@@ -26,11 +23,6 @@ StoreOption = Annotated[
 DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
 DEFAULT_DATA = Path("stickslip-data")
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
-
-
-def with_database(database: str | None) -> dict[str, str]:
-    """Return the environment of a program that is to use this database; its command line would show the password."""
-    return dict(os.environ) if database is None else {**os.environ, DATABASE_VARIABLE: database}
 
 
 def console() -> Console:

@@ -12,9 +12,9 @@ from stickslip_services.cli.specs import SpecFileError
 from stickslip_services.client.errors import ClientError, ProblemError, UnreachableError
 from stickslip_services.errors import (
     DatabaseRefusedError,
-    NotFoundError,
     ServerNotInstalledError,
     SettingsError,
+    StickslipError,
     SupervisorError,
 )
 from stickslip_services.local.certifying import CertifyError
@@ -24,7 +24,7 @@ _SHOWN = (
     CertifyError,
     ClientError,
     DatabaseRefusedError,
-    NotFoundError,
+    StickslipError,
     ServerNotInstalledError,
     SettingsError,
     SimulateError,

@@ -1,4 +1,4 @@
-"""The commands of `stickslip`, one file for each noun."""
+"""The commands of `stickslip`, by name."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -6,19 +6,15 @@ from typing import Annotated
 import typer
 
 from stickslip_services import __version__
+from stickslip_services.cli.admin import audit_log, keys, projects, webhooks
 from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import app as datasets
 from stickslip_services.cli.datasets import export, pull_dataset, verify
 from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
-from stickslip_services.cli.journal import journal
-from stickslip_services.cli.keys import app as keys
-from stickslip_services.cli.projects import app as projects
-from stickslip_services.cli.reindex import reindex
+from stickslip_services.cli.maintenance import gc, reindex, rm
 from stickslip_services.cli.scenes import simulate
 from stickslip_services.cli.textures import upload
 from stickslip_services.cli.up import up
-from stickslip_services.cli.upkeep import gc, rm
-from stickslip_services.cli.webhooks import app as webhooks
 from stickslip_services.cli.workers import workers
 
 app = typer.Typer(
@@ -60,7 +56,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "certify": certify,
     "register": register,
     "certificates": certificates,
-    "journal": journal,
+    "audit-log": audit_log,
 }
 
 for _name, _command in _COMMANDS.items():

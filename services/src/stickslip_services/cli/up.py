@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
-from stickslip_services.cli.common import DatabaseOption, StoreOption, console
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, console
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.installed import require_server
 
@@ -28,7 +28,7 @@ def _name(settings: "Settings") -> str:
 
 @shows_errors
 def up(
-    data: Annotated[Path, typer.Option(help="directory of everything: database, store, logs")] = Path("stickslip-data"),
+    data: Annotated[Path, typer.Option(help="directory of everything: database, store, logs")] = DEFAULT_DATA,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
     host: Annotated[
         str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
@@ -52,7 +52,7 @@ def up(
     dispatcher: Annotated[str | None, typer.Option(hidden=True, help="another dispatcher, for tests")] = None,
 ) -> None:
     """Run a coordinator and a dispatcher with their workers on this machine, until Ctrl-C."""
-    require_server("up")
+    require_server()
     from stickslip_services.database.database import Role  # the server's packages may be missing
     from stickslip_services.database.opening import check
     from stickslip_services.local import supervisor

@@ -1,0 +1,113 @@
+"""Maintenance of a stopped coordinator's data: removing versions and unused files, and recovering a lost database."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, say
+from stickslip_services.cli.errors import shows_errors
+from stickslip_services.client.errors import ClientError
+from stickslip_services.installed import require_server
+
+if TYPE_CHECKING:
+    from stickslip_schemas.store import Store
+
+    from stickslip_services.database.database import Database
+
+StoppedDataOption = Annotated[Path, typer.Option("--data", help="data directory of a coordinator that is stopped")]
+
+
+@contextmanager
+def _owned(
+    data: Path, store: str | None, database: str | None, *, is_new: bool = False
+) -> Iterator[tuple["Database", "Store"]]:
+    """Open the database and the store of a coordinator that is stopped, and keep others from starting one.
+
+    Raise DatabaseRefusedError if one runs, or if there is no database and `is_new` does not allow to make one.
+    """
+    require_server()
+    from stickslip_schemas.store import open_store
+
+    from stickslip_services.access.audit_log import acting, this_user
+    from stickslip_services.database.database import Role
+    from stickslip_services.database.opening import check, opened
+    from stickslip_services.errors import DatabaseRefusedError
+    from stickslip_services.local.process import locked
+    from stickslip_services.settings import Settings
+
+    given = {name: value for name, value in (("store", store), ("database", database)) if value is not None}
+    settings = Settings.chosen(data=data, **given)
+    if not is_new and not check(settings, Role.upkeep, with_store=True):
+        raise DatabaseRefusedError(
+            f"the database {settings.database_name} does not exist or is empty: name the "
+            f"{settings.database_option} of a coordinator"
+        )
+    with locked(data), acting(this_user()), opened(settings, Role.upkeep) as opened_database:
+        yield opened_database, open_store(settings.store_place)
+
+
+@shows_errors
+def rm(
+    version: Annotated[str, typer.Argument(metavar="DATASET:vN", help="the version to remove")],
+    data: StoppedDataOption = DEFAULT_DATA,
+    store: StoreOption = None,
+    database: DatabaseOption = None,
+) -> None:
+    """Remove a version of a dataset, with its jobs and the results that no other job needs.
+
+    `stickslip gc --delete` then frees the space. Submitting its spec again makes the dataset again.
+    """
+    parts = re.fullmatch(r"(ds-[0-9a-f]{16}):v([1-9]\d{0,8})", version)
+    if parts is None:
+        raise ClientError(f"a version is written ds-0123456789abcdef:v1, and this is {version!r}")
+    with _owned(data, store, database) as (opened, files):
+        from stickslip_services.queue.removing import remove
+
+        removed = remove(opened, files, parts[1], int(parts[2]))
+    typer.echo(f"{version} is removed, with {removed.jobs} jobs and {removed.tasks} results that no other job needs")
+    typer.echo("to free the space: stickslip gc --delete --older-than 0")
+
+
+@shows_errors
+def gc(
+    data: StoppedDataOption = DEFAULT_DATA,
+    store: StoreOption = None,
+    older_than: Annotated[float, typer.Option(min=0, metavar="HOURS", help="keep files that are younger")] = 24.0,
+    delete: Annotated[bool, typer.Option("--delete", help="delete the files; default: only count them")] = False,
+    database: DatabaseOption = None,
+) -> None:
+    """Find the files of the store that nothing refers to, and delete them with --delete."""
+    count = size = 0
+    with _owned(data, store, database) as (opened, files):
+        from stickslip_services.queue.unused import unused
+
+        for file in unused(opened, files, older_than=3600 * older_than):
+            count += 1
+            size += file.bytes
+            if delete:
+                files.delete(file.name)
+    done = "were deleted" if delete else "may be deleted: add --delete"
+    typer.echo(f"{count} files, {size / 1e6:,.1f} MB, that nothing refers to {done}")
+
+
+@shows_errors
+def reindex(data: StoppedDataOption = DEFAULT_DATA, store: StoreOption = None, database: DatabaseOption = None) -> None:
+    """Recover the datasets in the store after the database was lost. Known datasets stay as they are."""
+    counts = Counter[str]()
+    with _owned(data, store, database, is_new=True) as (opened, files):
+        from stickslip_services.queue.reindexing import reindex
+
+        for found in reindex(opened, files):
+            if found.fault:
+                say(f"left out: {found.name}: {found.fault}")
+            elif found.is_new:
+                typer.echo(f"{found.name}  {found.samples} samples")
+            counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
+    say(f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out")
+    say("certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`")
+    raise typer.Exit(1 if counts["bad"] else 0)
