@@ -11,14 +11,15 @@ from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import KINDS, UnknownKindError, job_spec_adapter
-from stickslip_schemas.kinds.cloth.spec import KERNELS, SELF_FRICTION, ClothSpec, PresetName
+from stickslip_schemas.kinds.cloth.arrays import KERNELS
+from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION, ClothSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.kinds.shawl import BONES, SKIN_TRIANGLES, SKIN_VERTICES, ShawlSpec, Swing
 from stickslip_schemas.plan.points import keyed_points, samples
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
 from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
 from stickslip_services.queue.terms import terms_for

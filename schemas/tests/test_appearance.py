@@ -13,7 +13,8 @@ from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.pictures import MAX_BYTES, UnfitPictureError, read_picture
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth.spec import ClothRender, Lighting, Substrate
+from stickslip_schemas.kinds.cloth.names import Lighting, Substrate
+from stickslip_schemas.kinds.cloth.spec import ClothRender
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import samples

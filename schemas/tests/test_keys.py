@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from stickslip_schemas.base.keys import canonical_json, content_key, derived_seed
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth.spec import KERNELS
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
@@ -22,8 +22,8 @@ from stickslip_schemas.plan.points import (
     simulation_key,
     split_of,
 )
+from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.fabrics import Material, Texture
-from stickslip_schemas.spec.jobs import SPLITS
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 

@@ -19,8 +19,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import dataset_id, samples
-from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout, describe
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import FORMAT, SPLITS, ArrayLayout, describe
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
 POINTS = 150

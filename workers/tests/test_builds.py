@@ -18,7 +18,7 @@ STAGES = ("simulate", "pack")
 SIMULATIONS = {
     "rod_hang": {"gamma": 50.0, "phi0": 1.0, "phi1": 6.0, "poisson": 0.5},
     "cloth_drag": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
-    | {"seed": 1},
+    | {"seed": 1, "self_friction": None},
     "cloth_sphere": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
     | {"seed": 1, "angular_speed": 1.0},
     "cloth_on_cloth": {
@@ -135,8 +135,8 @@ def test_a_kinds_own_files_are_in_its_builds_and_in_no_others() -> None:
     ("file", "stage", "kinds"),
     [
         ("fabrics.toml", "simulate", set(KINDS) - {"rod_hang"}),
-        ("textures.py", "simulate", set()),
-        ("textures.py", "pack", set(KINDS) - {"rod_hang"}),
+        ("fabrics.py", "simulate", set()),
+        ("fabrics.py", "pack", set(KINDS) - {"rod_hang"}),
         ("arrays.py", "pack", set(KINDS)),
         ("chunks.py", "pack", set(KINDS)),
     ],

@@ -102,7 +102,7 @@ def _simulate(count: int) -> dict[str, SimulateTask]:
 
 def _cloth() -> SimulateTask:
     cloth = ClothDragSimulation(
-        material="gray-interlock", fabric=None, mu=0.3, preset="fast", mesh=21, frames=300, seed=1
+        material="gray-interlock", fabric=None, mu=0.3, preset="fast", mesh=21, frames=300, seed=1, self_friction=None
     )
     return SimulateTask(simulation=cloth)
 

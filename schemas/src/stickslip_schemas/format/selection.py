@@ -16,8 +16,7 @@ from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import GROUP_NAME, Contents, FileEntry
-from stickslip_schemas.spec.arrays import ArrayLayout
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 
 SELECTION_NAME = "selection.json"
 """The file that says which part of a version a directory holds; it is not in a directory that holds all of it."""

@@ -1,40 +1,39 @@
-"""The kinds of dataset. A kind is one module here; this one only lists them.
+"""The kinds of dataset: every module of this package is one, and has the name of its kind."""
 
-To add a kind, import its module and add its classes to the table and to the three unions.
-"""
-
-from typing import Annotated
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING, Annotated, Union
 
 from pydantic import Field, TypeAdapter
 
-from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSimulation, ClothDragSpec
-from stickslip_schemas.kinds.cloth_on_cloth import ClothOnClothRender, ClothOnClothSimulation, ClothOnClothSpec
-from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender, ClothSphereSimulation, ClothSphereSpec
-from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation, RodHangSpec
-from stickslip_schemas.kinds.shawl import ShawlRender, ShawlSimulation, ShawlSpec
-from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.jobs import JobSpec, Render, Simulation
+
+
+def _spec_type(kind: str) -> type[JobSpec]:
+    """Return the class of specs that the module of a kind defines."""
+    module = import_module(f"{__name__}.{kind}")
+    (found,) = (
+        value
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, JobSpec) and value.__module__ == module.__name__
+    )
+    return found
+
 
 KINDS: dict[str, type[JobSpec]] = {
-    "rod_hang": RodHangSpec,
-    "cloth_drag": ClothDragSpec,
-    "cloth_sphere": ClothSphereSpec,
-    "cloth_on_cloth": ClothOnClothSpec,
-    "shawl": ShawlSpec,
+    module.name: _spec_type(module.name) for module in iter_modules(__path__) if not module.ispkg
 }
-"""The class of the specs of each kind, by name."""
+"""Class of the specs of each kind, by name."""
 
-AnyJobSpec = Annotated[
-    RodHangSpec | ClothDragSpec | ClothSphereSpec | ClothOnClothSpec | ShawlSpec,
-    Field(discriminator="kind"),
-]
-AnySimulation = Annotated[
-    RodHangSimulation | ClothDragSimulation | ClothSphereSimulation | ClothOnClothSimulation | ShawlSimulation,
-    Field(discriminator="kind"),
-]
-AnyRender = Annotated[
-    RodHangRender | ClothDragRender | ClothSphereRender | ClothOnClothRender | ShawlRender,
-    Field(discriminator="kind"),
-]
+if TYPE_CHECKING:  # checkers know what all kinds have in common
+    AnyJobSpec = JobSpec
+    AnySimulation = Simulation
+    AnyRender = Render
+else:
+    _BY_KIND = Field(discriminator="kind")
+    AnyJobSpec = Annotated[Union[tuple(KINDS.values())], _BY_KIND]  # noqa: UP007
+    AnySimulation = Annotated[Union[tuple(spec.simulation_type for spec in KINDS.values())], _BY_KIND]  # noqa: UP007
+    AnyRender = Annotated[Union[tuple(spec.render_type for spec in KINDS.values())], _BY_KIND]  # noqa: UP007
 
 job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
 """Validates and dumps the spec of any kind."""

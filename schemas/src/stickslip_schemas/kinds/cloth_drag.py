@@ -1,31 +1,18 @@
 """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
 from stickslip_schemas.base.document import Float
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, Viewpoint, ViewpointName
-from stickslip_schemas.kinds.cloth.spec import (
-    CUSTOM_LOOKS,
-    PHYSICAL_AXES,
-    SELF_FRICTION,
-    ClothAxes,
-    ClothRender,
-    ClothSimulation,
-    ClothSpec,
-    Custom,
-    Lighting,
-    LightingAxis,
-    Substrate,
-    SubstrateAxis,
-    TextureAxis,
-)
-from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
-from stickslip_schemas.spec.arrays import NAN, ArrayLayout
-from stickslip_schemas.spec.axes import SHORTHAND, ListAxis
+from stickslip_schemas.kinds.cloth.arrays import clip_arrays, forces, mesh_arrays, physical_arrays, solver_arrays
+from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, DragSceneSpec, LampAxis, ViewpointAxis
+from stickslip_schemas.kinds.cloth.names import Custom, Substrate, SubstrateAxis, TextureAxis
+from stickslip_schemas.kinds.cloth.spec import PHYSICAL_AXES, SELF_FRICTION, ClothAxes, ClothRender, ClothSimulation
+from stickslip_schemas.spec.appearance import FloorNumbers
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.fabrics import CustomName
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
@@ -33,15 +20,9 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 class ClothDragAxes(ClothAxes):
     """What a clip of dragged cloth depends on."""
 
-    texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
-    )
-    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or a custom one under `viewpoints`"
-    )
-    lighting: LightingAxis | None = Field(
-        default=None, description="range of lamps, or a custom one under `lamps`; by default `drawn`"
-    )
+    texture: TextureAxis
+    viewpoint: ViewpointAxis
+    lighting: LampAxis = None
     substrate: SubstrateAxis | None = Field(
         default=None, description="finish of the floor, or a custom one under `substrates`; by default `matt`"
     )
@@ -60,7 +41,7 @@ class ClothDragRender(ClothRender):
     kind: Literal["cloth_drag"] = "cloth_drag"
 
 
-class ClothDragSpec(ClothSpec):
+class ClothDragSpec(DragSceneSpec):
     """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
 
     simulation_type = ClothDragSimulation
@@ -70,14 +51,7 @@ class ClothDragSpec(ClothSpec):
         SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint", "lighting", "substrate")),
         SeedRule("crease_seed", "creases", PHYSICAL_AXES),
     )
-    instants = 300
-    instants_per_second = 2.4
-    rig = "drag"
-    custom = CUSTOM_LOOKS | {
-        "viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint)),
-        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
-        "substrate": Custom("substrates", "finish", tuple(Substrate)),
-    }
+    custom = DragSceneSpec.custom | {"substrate": Custom("substrates", "finish", tuple(Substrate))}
 
     kind: Literal["cloth_drag"]
     axes: ClothDragAxes
@@ -89,12 +63,6 @@ class ClothDragSpec(ClothSpec):
         json_schema_extra={
             "x-cost": "1.1 to 1.2 times the CPU time of null, up to 1.7 times where the cloth folds over itself"
         },
-    )
-    lamps: dict[CustomName, LampNumbers] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="custom lamps, by the names that the axis `lighting` uses",
-        json_schema_extra={"additionalProperties": False},
     )
     substrates: dict[CustomName, FloorNumbers] = Field(
         default_factory=dict,
@@ -119,15 +87,15 @@ class ClothDragSpec(ClothSpec):
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of dragged cloth."""
-        forces = (
-            ("contact_force", "force of the floor on the cloth [N]"),
-            ("holder_force", "force of the holders on the cloth [N]"),
-        )
         return (
-            *self.clip_arrays(),
-            *self.physical_arrays(),
+            *clip_arrays(self),
+            *physical_arrays(self),
             *DROP_LABELS,
-            *self.solver_arrays(),
-            *(self.over_time(name, "float32", (3,), ("xyz",), text, fill=NAN) for name, text in forces),
-            *self.mesh_arrays(),
+            *solver_arrays(self),
+            *forces(
+                self,
+                contact_force="force of the floor on the cloth",
+                holder_force="force of the holders on the cloth",
+            ),
+            *mesh_arrays(self),
         )

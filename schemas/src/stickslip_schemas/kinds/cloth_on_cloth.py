@@ -1,32 +1,30 @@
 """A square of cloth dropped on a stretched cloth and dragged to and fro [thesis, 4.2.2]."""
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
 from stickslip_schemas.base.document import Float
-from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, Viewpoint, ViewpointName
+from stickslip_schemas.kinds.cloth.arrays import (
+    clip_arrays,
+    codes,
+    forces,
+    mesh_arrays,
+    physical_arrays,
+    solver_arrays,
+)
+from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, DragSceneSpec, LampAxis, ViewpointAxis
+from stickslip_schemas.kinds.cloth.names import Custom, MaterialAxis, Substrate, TextureAxis
 from stickslip_schemas.kinds.cloth.spec import (
-    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     SELF_FRICTION,
     ClothAxes,
     ClothRender,
     ClothSimulation,
-    ClothSpec,
-    Custom,
-    Lighting,
-    LightingAxis,
-    MaterialAxis,
     MuAxis,
-    Substrate,
-    TextureAxis,
-    codes,
 )
-from stickslip_schemas.spec.appearance import LampNumbers
-from stickslip_schemas.spec.arrays import NAN, ArrayLayout
-from stickslip_schemas.spec.axes import SHORTHAND, ListAxis
-from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
 
@@ -37,15 +35,9 @@ class ClothOnClothAxes(ClothAxes):
     substrate_material: MaterialAxis = Field(
         description="fabric of the stretched cloth, a measured one, or a custom one under `materials`"
     )
-    texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
-    )
-    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or a custom one under `viewpoints`"
-    )
-    lighting: LightingAxis | None = Field(
-        default=None, description="range of lamps, or a custom one under `lamps`; by default `drawn`"
-    )
+    texture: TextureAxis
+    viewpoint: ViewpointAxis
+    lighting: LampAxis = None
 
 
 _PHYSICAL_AXES = (*PHYSICAL_AXES, "substrate_material")
@@ -68,7 +60,7 @@ class ClothOnClothRender(ClothRender):
     kind: Literal["cloth_on_cloth"] = "cloth_on_cloth"
 
 
-class ClothOnClothSpec(ClothSpec):
+class ClothOnClothSpec(DragSceneSpec):
     """A square of cloth dropped on a stretched cloth and dragged to and fro [thesis, 4.2.2]."""
 
     simulation_type = ClothOnClothSimulation
@@ -78,30 +70,17 @@ class ClothOnClothSpec(ClothSpec):
         SeedRule("light_seed", "light", (*_PHYSICAL_AXES, "viewpoint", "lighting")),
         SeedRule("crease_seed", "creases", _PHYSICAL_AXES),
     )
-    instants = 300
-    instants_per_second = 2.4
-    rig = "drag"
-    custom = CUSTOM_LOOKS | {
-        "substrate_material": Custom("materials", "substrate_fabric", tuple(Material)),
-        "viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint)),
-        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
-    }
+    custom = DragSceneSpec.custom | {"substrate_material": Custom("materials", "substrate_fabric", tuple(Material))}
 
     kind: Literal["cloth_on_cloth"]
     axes: ClothOnClothAxes
     self_friction: Float = Field(
         default=SELF_FRICTION, ge=0, le=10, description="friction coefficient of each cloth with itself"
     )
-    lamps: dict[CustomName, LampNumbers] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="custom lamps, by the names that the axis `lighting` uses",
-        json_schema_extra={"additionalProperties": False},
-    )
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
-        """Those of contact."""
+        """Return the protocols of contact."""
         return CONTACT_PROTOCOLS
 
     def simulation_settings(self) -> dict[str, Any]:
@@ -114,24 +93,20 @@ class ClothOnClothSpec(ClothSpec):
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of cloth that is dragged over cloth."""
-        forces = (
-            ("contact_force", "force of the stretched cloth on the cloth [N]"),
-            ("holder_force", "force of the holders on the cloth [N]"),
-        )
         return (
-            *self.clip_arrays(),
-            *self.physical_arrays(),
+            *clip_arrays(self),
+            *physical_arrays(self),
             codes("substrate_material", self.names("substrate_material")),
             *DROP_LABELS,
-            ArrayLayout(
+            array(
                 "least_distance",
-                "float64",
-                (),
-                (),
                 "of two pieces of cloth that do not hang together, at the ends of all steps of the solver [m]",
-                fill=NAN,
             ),
-            *self.solver_arrays(),
-            *(self.over_time(name, "float32", (3,), ("xyz",), text, fill=NAN) for name, text in forces),
-            *self.mesh_arrays(),
+            *solver_arrays(self),
+            *forces(
+                self,
+                contact_force="force of the stretched cloth on the cloth",
+                holder_force="force of the holders on the cloth",
+            ),
+            *mesh_arrays(self),
         )

@@ -5,19 +5,25 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from stickslip_schemas.kinds.cloth.arrays import (
+    clip_arrays,
+    forces,
+    mesh_arrays,
+    over_time,
+    physical_arrays,
+    solver_arrays,
+)
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, TextureAxis
 from stickslip_schemas.kinds.cloth.spec import (
-    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
-    Custom,
     MuAxis,
-    TextureAxis,
 )
-from stickslip_schemas.spec.arrays import NAN, ArrayLayout
-from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, name_schema
 from stickslip_schemas.spec.jobs import SeedRule
 
@@ -28,7 +34,7 @@ AngularSpeed = Annotated[
 ]
 AngularSpeedAxis = Annotated[
     ListAxis[AngularSpeed] | LinspaceAxis[AngularSpeed] | RandomAxis[AngularSpeed] | SobolAxis[AngularSpeed],
-    Field(discriminator="type"),
+    TAGGED,
     SHORTHAND,
 ]
 
@@ -44,7 +50,9 @@ class SphereViewpoint(StrEnum):
     high = "high"
 
 
-ViewpointName = Annotated[CustomName, quantity("SphereViewpoint"), name_schema(SphereViewpoint)]
+ViewpointAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("SphereViewpoint"), name_schema(SphereViewpoint)]], SHORTHAND
+]
 
 
 class ClothSphereAxes(ClothAxes):
@@ -52,12 +60,8 @@ class ClothSphereAxes(ClothAxes):
 
     mu: MuAxis = Field(description="friction coefficient of the cloth with sphere and floor")
     angular_speed: AngularSpeedAxis = Field(description="angular speed of the sphere about its vertical axis [rad/s]")
-    texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
-    )
-    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or a custom one under `viewpoints`"
-    )
+    texture: TextureAxis
+    viewpoint: ViewpointAxis = Field(description="camera of the rig, or a custom one under `viewpoints`")
 
 
 class ClothSphereSimulation(ClothSimulation):
@@ -94,19 +98,19 @@ class ClothSphereSpec(ClothSpec):
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of cloth on a turning sphere."""
-        forces = (
-            ("contact_force", "force of floor and sphere on the cloth [N]"),
-            ("floor_force", "force of the floor on the cloth [N]"),
-            ("sphere_force", "force of the sphere on the cloth [N]"),
-        )
         bias = "what broke the symmetry: horizontal (x, y) over vertical gravity until the sphere turns"
         return (
-            *self.clip_arrays(),
-            *self.physical_arrays(),
-            ArrayLayout("angular_speed", "float64", (), (), "of the sphere about its vertical axis [rad/s]", fill=NAN),
-            ArrayLayout("bias", "float64", (2,), ("xy",), bias, fill=NAN),
-            *self.solver_arrays(),
-            self.over_time("angle", "float32", (), (), "by which the sphere has turned [rad]", fill=NAN),
-            *(self.over_time(name, "float32", (3,), ("xyz",), text, fill=NAN) for name, text in forces),
-            *self.mesh_arrays(),
+            *clip_arrays(self),
+            *physical_arrays(self),
+            array("angular_speed", "of the sphere about its vertical axis [rad/s]"),
+            array("bias", bias, of={"xy": 2}),
+            *solver_arrays(self),
+            over_time(self, "angle", "by which the sphere has turned [rad]"),
+            *forces(
+                self,
+                contact_force="force of floor and sphere on the cloth",
+                floor_force="force of the floor on the cloth",
+                sphere_force="force of the sphere on the cloth",
+            ),
+            *mesh_arrays(self),
         )

@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from stickslip_schemas.base.document import Document, Float
-from stickslip_schemas.spec.arrays import NAN, ArrayLayout
-from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.spec.jobs import JobSpec, Quality, Render, SeedRule, Simulation
 
@@ -23,9 +23,8 @@ Phi = Annotated[
     float, quantity("Phi"), Field(strict=True, ge=-40, le=40, description="an angle over the length of the rod [rad]")
 ]
 
-_TAGGED = Field(discriminator="type")
-GammaAxis = Annotated[ListAxis[Gamma] | LinspaceAxis[Gamma] | RandomAxis[Gamma] | SobolAxis[Gamma], _TAGGED, SHORTHAND]
-PhiAxis = Annotated[ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolAxis[Phi], _TAGGED, SHORTHAND]
+GammaAxis = Annotated[ListAxis[Gamma] | LinspaceAxis[Gamma] | RandomAxis[Gamma] | SobolAxis[Gamma], TAGGED, SHORTHAND]
+PhiAxis = Annotated[ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolAxis[Phi], TAGGED, SHORTHAND]
 
 
 class RodHangAxes(Document):
@@ -103,47 +102,35 @@ class RodHangSpec(JobSpec):
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of rods."""
-        return (*_curves(), *(() if self.views is None else _views(len(self.cameras()))), *_labels())
+        views = len(self.cameras())
+        return (*_curves(), *(_views(views) if views else ()), *_labels())
 
 
 def _curves() -> tuple[ArrayLayout, ...]:
-    points = RodHangSimulation.model_fields["points"].default
+    points = {"point": RodHangSimulation.model_fields["points"].default}
     curves = (
-        ("centerline", (points, 3), ("point", "xyz"), "positions over L at uniform arc length, clamp first"),
-        ("curvature", (points, 3), ("point", "strain"), "(twist, bend1, bend2) times L"),
-        ("frame", (points, 3, 3), ("point", "xyz", "director"), "columns d1 (tangent), d2, d3"),
+        ("centerline", {"xyz": 3}, "positions over L at uniform arc length, clamp first"),
+        ("curvature", {"strain": 3}, "(twist, bend1, bend2) times L"),
+        ("frame", {"xyz": 3, "director": 3}, "columns d1 (tangent), d2, d3"),
     )
-    return tuple(
-        ArrayLayout(name, "float32", shape, names, text, fill=NAN, is_recorded=True)
-        for name, shape, names, text in curves
-    )
+    return tuple(array(name, text, "float32", points | of, is_recorded=True) for name, of, text in curves)
 
 
 def _views(count: int) -> tuple[ArrayLayout, ...]:
-    shape, dimensions = (count, 224, 224, 3), ("view", "y", "x", "rgb")
     return (
-        ArrayLayout("views", "uint8", shape, dimensions, "sRGB pictures", per_sample=True),
-        ArrayLayout("color", "float32", (3,), ("rgb",), "colour of the rod, linear RGB, 0 to 1", fill=NAN),
+        array("views", "sRGB pictures", "uint8", {"view": count, "y": 224, "x": 224, "rgb": 3}, per_sample=True),
+        array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),
     )
 
 
 def _labels() -> tuple[ArrayLayout, ...]:
-    labels = (
-        ("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
-        ("phi0", "natural twist times L [rad]"),
-        ("phi1", "natural curvature times L [rad]"),
-        ("energy", "elastic and gravity energy over EI/L"),
-    )
-    distances = (
-        (
-            "self_contact_distance",
-            "least distance over L at which the centreline passes another part of itself; infinite where it does not",
-        ),
-        ("reach", "largest distance over L from the vertical of the clamp"),
-    )
-    other = "another stable shape of the same rod was found"
+    distance = "least distance over L at which the centreline passes another part of itself; infinite where it does not"
     return (
-        *(ArrayLayout(name, "float64", (), (), text, fill=NAN) for name, text in labels),
-        ArrayLayout("multistable", "bool", (), (), other, fill=False, is_recorded=True),
-        *(ArrayLayout(name, "float64", (), (), text, fill=NAN, is_recorded=True) for name, text in distances),
+        array("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
+        array("phi0", "natural twist times L [rad]"),
+        array("phi1", "natural curvature times L [rad]"),
+        array("energy", "elastic and gravity energy over EI/L"),
+        array("multistable", "another stable shape of the same rod was found", "bool", is_recorded=True),
+        array("self_contact_distance", distance, is_recorded=True),
+        array("reach", "largest distance over L from the vertical of the clamp", is_recorded=True),
     )

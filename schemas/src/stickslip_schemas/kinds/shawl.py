@@ -1,24 +1,30 @@
 """A shawl over the shoulders of a figure that moves [thesis, 4.6]."""
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from stickslip_schemas.base.document import Int
+from stickslip_schemas.kinds.cloth.arrays import (
+    clip_arrays,
+    forces,
+    mesh_arrays,
+    over_time,
+    physical_arrays,
+    solver_arrays,
+)
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, TextureAxis
 from stickslip_schemas.kinds.cloth.spec import (
-    CUSTOM_LOOKS,
     PHYSICAL_AXES,
     ClothAxes,
     ClothRender,
     ClothSimulation,
     ClothSpec,
-    Custom,
     MuAxis,
-    TextureAxis,
 )
-from stickslip_schemas.spec.arrays import NAN, ArrayLayout
-from stickslip_schemas.spec.axes import SHORTHAND, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, name_schema
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
 
@@ -30,11 +36,7 @@ Swing = Annotated[
     quantity("Swing"),
     Field(strict=True, ge=0, le=2, description="size of the figure's motion; 1 is usual, 0 stands still"),
 ]
-SwingAxis = Annotated[
-    ListAxis[Swing] | LinspaceAxis[Swing] | RandomAxis[Swing] | SobolAxis[Swing],
-    Field(discriminator="type"),
-    SHORTHAND,
-]
+SwingAxis = Annotated[ListAxis[Swing] | LinspaceAxis[Swing] | RandomAxis[Swing] | SobolAxis[Swing], TAGGED, SHORTHAND]
 
 
 class ShawlViewpoint(StrEnum):
@@ -48,7 +50,9 @@ class ShawlViewpoint(StrEnum):
     high = "high"
 
 
-ViewpointName = Annotated[CustomName, quantity("ShawlViewpoint"), name_schema(ShawlViewpoint)]
+ViewpointAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("ShawlViewpoint"), name_schema(ShawlViewpoint)]], SHORTHAND
+]
 
 
 class ShawlAxes(ClothAxes):
@@ -57,12 +61,8 @@ class ShawlAxes(ClothAxes):
     mu: MuAxis = Field(description="friction coefficient of the shawl with figure and floor")
     self_friction: MuAxis = Field(description="friction coefficient of the shawl with itself")
     swing: SwingAxis | None = Field(default=None, description="size of the figure's motion; by default 1")
-    texture: TextureAxis = Field(
-        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
-    )
-    viewpoint: Annotated[ListAxis[ViewpointName], SHORTHAND] = Field(
-        description="camera of the rig, or a custom one under `viewpoints`"
-    )
+    texture: TextureAxis
+    viewpoint: ViewpointAxis = Field(description="camera of the rig, or a custom one under `viewpoints`")
 
 
 _PHYSICAL_AXES = (*PHYSICAL_AXES, "self_friction", "swing")
@@ -108,39 +108,30 @@ class ShawlSpec(ClothSpec):
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
-        """Those of contact."""
+        """Return the protocols of contact."""
         return CONTACT_PROTOCOLS
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of shawls."""
-        swing = ArrayLayout("swing", "float64", (), (), "size of the figure's motion; 1 is usual", fill=NAN)
+        swing = array("swing", "size of the figure's motion; 1 is usual")
         return (
-            *self.clip_arrays(),
-            *self.physical_arrays(),
-            ArrayLayout("self_friction", "float64", (), (), "friction coefficient of the shawl with itself", fill=NAN),
+            *clip_arrays(self),
+            *physical_arrays(self),
+            array("self_friction", "friction coefficient of the shawl with itself"),
             *((swing,) if "swing" in self.named_axes else ()),
-            ArrayLayout(
+            array(
                 "bias",
-                "float64",
-                (2,),
-                ("xy",),
                 "what broke the symmetry: horizontal (x, y) over vertical gravity until the figure moves",
-                fill=NAN,
+                of={"xy": 2},
             ),
-            ArrayLayout(
+            array(
                 "least_distance",
-                "float64",
-                (),
-                (),
                 "of two pieces of cloth that do not hang together, and of cloth and figure, at the ends of all steps "
                 "of the solver [m]",
-                fill=NAN,
             ),
-            *self.solver_arrays(),
-            self.over_time(
-                "contact_force", "float32", (3,), ("xyz",), "force of figure and floor on the cloth [N]", fill=NAN
-            ),
-            *self.mesh_arrays(),
+            *solver_arrays(self),
+            *forces(self, contact_force="force of figure and floor on the cloth"),
+            *mesh_arrays(self),
             *self._figure_arrays(),
         )
 
@@ -148,35 +139,18 @@ class ShawlSpec(ClothSpec):
         """Return the figure and its motion: a vertex x of the skin is at sum over bones of weight (A x + b)."""
         if not self.store_positions:
             return ()
-
-        def recorded(name: str, dtype: str, shape: tuple[int, int], of: tuple[str, str], text: str, **more: Any) -> Any:
-            return ArrayLayout(name, dtype, shape, of, text, is_recorded=True, **more)
-
-        skin = ("skin_vertex", "xyz")
+        bones, vertices, triangles = {"bone": BONES}, {"skin_vertex": SKIN_VERTICES}, {"skin_triangle": SKIN_TRIANGLES}
+        weights = "how much each vertex of the skin follows each bone; they add up to 1"
+        motions = "motions (A | b) of the figure's bones: hips, chest, head, left and right arm [m]"
         return (
-            self.over_time(
-                "bones",
-                "float32",
-                (BONES, 3, 4),
-                ("bone", "row", "column"),
-                "motions (A | b) of the figure's bones: hips, chest, head, left and right arm [m]",
-                fill=NAN,
-            ),
-            recorded("skin_rest", "float32", (SKIN_VERTICES, 3), skin, "the figure's skin at rest [m]", fill=NAN),
-            recorded(
-                "skin_weights",
-                "float32",
-                (SKIN_VERTICES, BONES),
-                ("skin_vertex", "bone"),
-                "how much each vertex of the skin follows each bone; they add up to 1",
-                fill=NAN,
-            ),
-            recorded(
+            over_time(self, "bones", motions, of=bones | {"row": 3, "column": 4}),
+            array("skin_rest", "the figure's skin at rest [m]", "float32", vertices | {"xyz": 3}, is_recorded=True),
+            array("skin_weights", weights, "float32", vertices | bones, is_recorded=True),
+            array(
                 "skin_triangles",
-                "int32",
-                (SKIN_TRIANGLES, 3),
-                ("skin_triangle", "corner"),
                 "vertices of the skin's triangles",
-                fill=-1,
+                "int32",
+                triangles | {"corner": 3},
+                is_recorded=True,
             ),
         )

@@ -8,8 +8,9 @@ from math import ceil, prod
 import numpy as np
 
 from stickslip_schemas.base.document import Document
+from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis, range_values
-from stickslip_schemas.spec.jobs import SPLITS, JobSpec, SeedRule
+from stickslip_schemas.spec.jobs import JobSpec, SeedRule
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ sample, and the chunks of a shard group lie in one shard. Every chunk is `bytes(
 those of clips and trajectories: see `stickslip_schemas.format.codecs`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from math import prod
 from typing import Any, Literal
@@ -68,10 +69,25 @@ class ArrayLayout:
         return "/".join([self.name, "c", str(shard), *("0" for _ in self.shape)])
 
 
+def array(
+    name: str, text: str, dtype: str = "float64", of: Mapping[str, int] | None = None, **more: Any
+) -> ArrayLayout:
+    """Return the layout of an array of numbers; a rejected sample has NaN, -1 or false, and 0 if unsigned.
+
+    `of` has the size of each dimension of a sample, by name; a sample is one number without it.
+    """
+    of = of or {}
+    missing = {"f": NAN, "i": -1, "b": False}.get(np.dtype(dtype).kind, 0)
+    return ArrayLayout(name, dtype, tuple(of.values()), tuple(of), text, **{"fill": missing, **more})
+
+
+SPLITS = ("train", "validation", "test")
+"""Names of the splits, in the order of their numbers in the array `split`."""
+
 COMMON_ARRAYS = (
-    ArrayLayout("split", "uint8", (), (), "0 train, 1 validation, 2 test", categories=("train", "validation", "test")),
-    ArrayLayout("valid", "bool", (), (), "false where the sample was rejected; the manifest says why", fill=False),
-    ArrayLayout("sample_key", "uint8", (SAMPLE_KEY_BYTES,), ("byte",), "content key (SHA-256) of the sample"),
+    array("split", "0 train, 1 validation, 2 test", "uint8", categories=SPLITS),
+    array("valid", "false where the sample was rejected; the manifest says why", "bool"),
+    array("sample_key", "content key (SHA-256) of the sample", "uint8", {"byte": SAMPLE_KEY_BYTES}),
 )
 """The arrays of every dataset."""
 

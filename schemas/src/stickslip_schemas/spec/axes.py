@@ -127,6 +127,8 @@ class _Shorthand(BeforeValidator):
 
 SHORTHAND = _Shorthand(_long_form)
 """Lets an axis be written in its short form."""
+TAGGED = Field(discriminator="type")
+"""Stands before `SHORTHAND` where an axis has several forms."""
 
 AnyAxis = ListAxis[Any] | LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from functools import cached_property
 from math import prod
-from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -28,6 +28,21 @@ class Quality(StrEnum):
     draft = "draft"
     standard = "standard"
     high = "high"
+
+
+class PresetName(StrEnum):
+    """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
+
+    certified = "certified"
+    fast = "fast"
+    fine = "fine"
+    thesis_high = "thesis-high"
+    thesis_low_small_dt = "thesis-low-small-dt"
+    thesis_low_big_dt = "thesis-low-big-dt"
+
+
+CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
+"""Protocols that a certificate also needs where cloth touches itself or other cloth."""
 
 
 class Splits(Document):
@@ -122,6 +137,10 @@ class JobSpec(Document):
     )
     seed: Seed = 0
 
+    if TYPE_CHECKING:  # every kind defines these two with its own types, defaults and descriptions
+        axes: Document
+        quality: Quality
+
     # --- what every kind says of itself ---------------------------------------------------------------------------
 
     @property
@@ -161,7 +180,7 @@ class JobSpec(Document):
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         """Return a text that is the same for samples whose `stage` costs about the same; of simulate or render."""
-        return str(self.quality) if stage is Stage.render else ""  # type: ignore[attr-defined]  # all kinds have one
+        return str(self.quality) if stage is Stage.render else ""
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         """Return the fields of documents that a value of an axis sets: by default the one of the axis's name."""
@@ -177,8 +196,7 @@ class JobSpec(Document):
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
         """The axes by name, in the order in which a product is run through (the last one fastest)."""
-        axes: Document = self.axes  # type: ignore[attr-defined]  # every kind has its own
-        named = {name: getattr(axes, name) for name in type(axes).model_fields}
+        named = {name: getattr(self.axes, name) for name in type(self.axes).model_fields}
         return {name: axis for name, axis in named.items() if axis is not None}
 
     @property
@@ -233,11 +251,3 @@ class JobSpec(Document):
         if self.sample_count > MAX_SAMPLES:
             raise ValueError(f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}")
         return self
-
-
-SPLITS = ("train", "validation", "test")
-"""Names of the splits, in the order of their numbers in the array `split`."""
-
-
-CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
-"""What a certificate must have, too, where cloth touches itself or other cloth."""

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from stickslip_schemas.base.document import Document, Float, Int
-from stickslip_schemas.kinds.cloth.spec import PresetName
 from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material
+from stickslip_schemas.spec.jobs import PresetName
 
 MAX_FRAMES = 10_000
 """Of a scene."""

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 from stickslip_schemas.documents.responses import CertificateEntry
-from stickslip_schemas.kinds.cloth.spec import PresetName
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET
+from stickslip_schemas.spec.jobs import PresetName
 
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table

@@ -322,7 +322,7 @@ def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[li
 
 
 def _split(name: str) -> Any:
-    from stickslip_schemas.spec.jobs import SPLITS
+    from stickslip_schemas.spec.arrays import SPLITS
 
     if name not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")

@@ -7,7 +7,7 @@ from typing import Annotated, cast
 import typer
 from rich.console import Console
 from rich.table import Table
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.coco import export_coco

@@ -26,8 +26,8 @@ from stickslip_schemas.format.codecs import decode_sample, empty_in_order, in_or
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry, Manifest, Rejection
 from stickslip_schemas.format.selection import part_files
-from stickslip_schemas.spec.arrays import ArrayLayout
-from stickslip_schemas.spec.jobs import SPLITS, JobSpec
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import (

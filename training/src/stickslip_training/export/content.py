@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.selection import Selection
-from stickslip_schemas.spec.arrays import ArrayLayout, describe
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import CorruptDataError

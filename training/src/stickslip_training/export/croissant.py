@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.spec.arrays import ArrayLayout
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 
 from stickslip_training.export.content import Content
 

@@ -7,7 +7,8 @@ import numpy as np
 from stickslip_blender.cloth import ground_truth as module
 from stickslip_blender.cloth.geometry import FLOOR, Geometry, Holders
 from stickslip_blender.cloth.ground_truth import CLOTH, GROUND, PROP, ground_truth
-from stickslip_schemas.kinds.cloth.spec import SEGMENTS, GroundTruth
+from stickslip_schemas.kinds.cloth.arrays import SEGMENTS
+from stickslip_schemas.kinds.cloth.spec import GroundTruth
 from stickslip_schemas.spec.cameras import load_rig
 
 

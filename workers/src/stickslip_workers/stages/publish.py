@@ -27,8 +27,7 @@ from stickslip_schemas.format.manifest import (
     with_manifest_digest,
 )
 from stickslip_schemas.plan.points import dataset_id
-from stickslip_schemas.spec.arrays import ArrayLayout
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 
 from stickslip_workers.settings import CPU, RENDER_DEVICE

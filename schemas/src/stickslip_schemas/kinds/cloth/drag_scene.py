@@ -1,10 +1,15 @@
-"""The stage of drop-and-drag [thesis, 4.2.3]: its cameras, the rig `drag`, and the labels of a drop."""
+"""The scene of drop-and-drag [thesis, 4.2.3]: its cameras, the rig `drag`, its lamps, and the labels of a drop."""
 
 from enum import StrEnum
 from typing import Annotated
 
-from stickslip_schemas.spec.arrays import NAN, ArrayLayout
-from stickslip_schemas.spec.axes import quantity
+from pydantic import Field
+
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, Lighting, LightingAxis
+from stickslip_schemas.kinds.cloth.spec import ClothSpec
+from stickslip_schemas.spec.appearance import LampNumbers
+from stickslip_schemas.spec.arrays import array
+from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, name_schema
 
 
@@ -31,21 +36,41 @@ class Viewpoint(StrEnum):
     elevation_plus_15 = "elevation-plus-15"
 
 
-ViewpointName = Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]
-
 TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
 HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)
 """`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
 
+ViewpointAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]],
+    SHORTHAND,
+    Field(description="camera of the rig, or a custom one under `viewpoints`"),
+]
+LampAxis = Annotated[
+    LightingAxis | None, Field(description="range of lamps, or a custom one under `lamps`; by default `drawn`")
+]
+
+
+class DragSceneSpec(ClothSpec):
+    """What the kinds of dragged cloth have in common."""
+
+    instants = 300
+    instants_per_second = 2.4
+    rig = "drag"
+    custom = CUSTOM_LOOKS | {
+        "viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint)),
+        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
+    }
+
+    lamps: dict[CustomName, LampNumbers] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="custom lamps, by the names that the axis `lighting` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
+
+
 DROP_LABELS = (
-    ArrayLayout("bias_side", "int8", (), (), "side to which gravity leaned during the drop, +1 or -1 along x"),
-    ArrayLayout("landed_side", "int8", (), (), "side of the holders on which the cloth landed, +1 or -1 along x"),
-    ArrayLayout(
-        "bias",
-        "float64",
-        (),
-        (),
-        "what broke the symmetry: horizontal over vertical gravity during the drop",
-        fill=NAN,
-    ),
+    array("bias_side", "side to which gravity leaned during the drop, +1 or -1 along x", "int8", fill=0),
+    array("landed_side", "side of the holders on which the cloth landed, +1 or -1 along x", "int8", fill=0),
+    array("bias", "what broke the symmetry: horizontal over vertical gravity during the drop"),
 )

@@ -15,7 +15,7 @@ from stickslip_blender.cloth.geometry import FLOOR, Geometry
 from stickslip_blender.raster import Window, _raster, projected, see
 
 BACKGROUND, GROUND, CLOTH, PROP = range(4)
-"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.spec.SEGMENTS`."""
+"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.arrays.SEGMENTS`."""
 
 Floats = npt.NDArray[np.float32]
 Halves = npt.NDArray[np.float16]

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from PIL import Image
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
-from stickslip_schemas.spec.jobs import SPLITS
+from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page

@@ -1,0 +1,146 @@
+"""Arrays that the datasets of the kinds of cloth have in common."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from stickslip_schemas.kinds.cloth.names import Lighting, Substrate
+from stickslip_schemas.kinds.cloth.spec import ClothSpec, GroundTruth
+from stickslip_schemas.spec.appearance import CLIP_SIZE
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+
+KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
+"""Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""
+
+SEGMENTS = ("background", "floor", "cloth", "prop")
+"""Names of the codes of the array `segmentation`: add new ones at the end."""
+
+
+def codes(name: str, names: tuple[str, ...]) -> ArrayLayout:
+    """Return the label of an axis of names: a code each, in the order of `names`."""
+    return array(name, f"code of the {name}", "int16", categories=tuple(map(str, names)))
+
+
+def over_time(
+    spec: ClothSpec, name: str, text: str, dtype: str = "float32", of: Mapping[str, int] | None = None, **more: Any
+) -> ArrayLayout:
+    """Return an array of the record that has a number, or an array of dimensions `of`, at each instant."""
+    rate = {"instants_per_second": spec.instants_per_second}
+    return array(name, text, dtype, {"instant": spec.instants, **(of or {})}, is_recorded=True, attributes=rate, **more)
+
+
+def clip_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
+    """Return the clip and the labels of what it shows."""
+    pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
+    instants = {"instants": list(spec.shown_instants)}
+    return (
+        array("video", "sRGB clip", "uint8", pixels | {"rgb": 3}, per_sample=True, is_clip=True, attributes=instants),
+        *_ground_truth_arrays(spec, pixels),
+        codes("texture", spec.names("texture")),
+        codes("viewpoint", spec.names("viewpoint")),
+        codes("lighting", spec.names("lighting") if "lighting" in spec.custom else tuple(Lighting)),
+        codes("substrate", spec.names("substrate") if "substrate" in spec.custom else tuple(Substrate)),
+        array("light_seed", "seed of the lamp, the floor and the noise", "int32"),
+        array(
+            "light", "azimuth and elevation of the lamp [degree], its power over the nominal", "float32", {"light": 3}
+        ),
+        array(
+            "floor",
+            "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)",
+            "float32",
+            {"floor": 8},
+        ),
+        array("creases", "strength of the creases that the renderer added", "float32"),
+        array("frame_share", "share of the frame that is cloth, mean of the clip", "float32"),
+        array("visible_share", "share of the cloth in sight, mean of the clip", "float32"),
+        array("gate_db", "image gate: PSNR of means of 4 x 4 pixels [dB]", "float32"),
+        array("composed", "false where the gate failed and Cycles rendered directly", "bool"),
+    )
+
+
+def _ground_truth_arrays(spec: ClothSpec, pixels: dict[str, int]) -> tuple[ArrayLayout, ...]:
+    """Return the arrays per pixel that the spec asks for. Textures share them, and each of their samples has them."""
+    arrays = (
+        array("depth", "depth along the optical axis [m], infinite where nothing is", "float32", pixels),
+        array("segmentation", "code of what is seen", "uint8", pixels, attributes={"categories": list(SEGMENTS)}),
+        array(
+            "normals",
+            "normals towards the camera, in its axes (right, down, forward); 0 where nothing is",
+            "float16",
+            pixels | {"xyz": 3},
+        ),
+        array("uv", "place on the cloth, 0 to 1 along warp and weft, else NaN", "float16", pixels | {"uv": 2}),
+        array(
+            "flow",
+            "how far what is seen moves until the next frame of the clip [px], 0 in the last",
+            "float16",
+            pixels | {"xy": 2},
+        ),
+    )
+    return tuple(replace(each, per_sample=True) for each in arrays if GroundTruth(each.name) in spec.ground_truth)
+
+
+def physical_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
+    """Return the labels of what the cloth is made of, and its friction."""
+    factors = (
+        array("density", "factor of the fabric's mass per area"),
+        array("bending", "factor of the fabric's rigidity against bending"),
+        array("stretching", "factor of the fabric's stiffness in its plane"),
+    )
+    return (
+        codes("material", spec.names("material")),
+        array("mu", "friction coefficient"),
+        *(factor for factor in factors if factor.name in spec.named_axes),
+        array("areal_density", "mass per area [kg/m^2]"),
+        array(
+            "bending_rigidity",
+            "plate rigidities along the warp, along the weft, and of twist [N m]",
+            of={"direction": 3},
+        ),
+        array(
+            "stretching_stiffness",
+            "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]",
+            of={"coefficient": 4},
+        ),
+    )
+
+
+def solver_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
+    """Return the solver's diagnostics."""
+    return (
+        codes("kernel", KERNELS),
+        array("steps", "time steps of the solver", "int32"),
+        array("unconverged_steps", "steps that stopped short of the tolerance", "int32"),
+        array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
+        over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
+    )
+
+
+def forces(spec: ClothSpec, **texts: str) -> tuple[ArrayLayout, ...]:
+    """Return arrays of forces (xyz) [N] over time, by name."""
+    return tuple(over_time(spec, name, f"{text} [N]", of={"xyz": 3}) for name, text in texts.items())
+
+
+def mesh_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
+    """Return the mesh and its motion; nothing where the spec does not keep it.
+
+    Rest shape and triangles are the same for all samples of a dataset, and every sample has them all the same: a
+    repeated row costs some bytes, an array without the dimension `sample` would be an exception in every reader.
+    """
+    if not spec.store_positions:
+        return ()
+    vertices, triangles = spec.mesh**2, 2 * (spec.mesh - 1) ** 2
+    return (
+        over_time(
+            spec,
+            "positions",
+            "positions of the vertices [m]; the floor is z = 0",
+            of={"vertex": vertices, "xyz": 3},
+            per_sample=True,
+            is_trajectory=True,
+        ),
+        array("rest", "the flat cloth (warp, weft) [m]", "float32", {"vertex": vertices, "uv": 2}, is_recorded=True),
+        array(
+            "triangles", "vertices of the triangles", "int32", {"triangle": triangles, "corner": 3}, is_recorded=True
+        ),
+    )

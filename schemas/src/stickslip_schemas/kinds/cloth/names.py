@@ -1,0 +1,146 @@
+"""Names in a spec of cloth: materials, textures, lamps and floors, the built-in ones and those that users add."""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.keys import ArtifactRef, Sha256, referred
+from stickslip_schemas.spec.appearance import Calibration
+from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean, name_schema
+from stickslip_schemas.spec.jobs import JobSpec
+
+
+class Lighting(StrEnum):
+    """Named ranges that the lamp of a clip is drawn from.
+
+    Their order gives the codes of the label `lighting`: add new ones at the end.
+    """
+
+    drawn = "drawn"
+    held_out = "held-out"
+
+
+class Substrate(StrEnum):
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
+
+    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
+    the end.
+    """
+
+    matt = "matt"
+    aluminium = "aluminium"
+    aluminium_pet = "aluminium-pet"
+    ceramic = "ceramic"
+    rough_glass = "rough-glass"
+    smooth_glass = "smooth-glass"
+    polyester_mirror = "polyester-mirror"
+    stainless_steel = "stainless-steel"
+    cloth = "cloth"
+    any = "any"
+
+
+MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
+TextureAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
+    SHORTHAND,
+    Field(description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"),
+]
+LightingAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Lighting"), name_schema(Lighting)]], SHORTHAND]
+SubstrateAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Substrate"), name_schema(Substrate)]], SHORTHAND]
+
+
+class Custom(NamedTuple):
+    """Where the spec defines what an axis of names may name besides what is built in."""
+
+    key: str
+    """Of the spec: a mapping from the user's names to what they mean."""
+    field: str
+    """Of the document that takes it."""
+    built_in: tuple[str, ...]
+
+
+CUSTOM_LOOKS = {
+    "material": Custom("materials", "fabric", tuple(Material)),
+    "texture": Custom("textures", "image", tuple(Texture)),
+}
+"""What specs of all kinds of cloth may add: see `NamingSpec.custom`."""
+
+
+class NamingSpec(JobSpec):
+    """A spec whose axes of names take custom names, which the spec defines."""
+
+    custom: ClassVar[Mapping[str, Custom]]
+    """By axis of names, what the user may add to it."""
+
+    materials: dict[CustomName, FabricNumbers] = Field(
+        default_factory=dict,
+        description="custom fabrics, by the names that the axis `material` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
+    textures: dict[CustomName, ArtifactRef] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="custom textures, by the names that the axis `texture` uses: `sha256:` and the digest that "
+        "`stickslip upload` prints",
+        json_schema_extra={"additionalProperties": False},
+    )
+    viewpoints: dict[CustomName, Calibration] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="custom cameras, by the names that the axis `viewpoint` uses",
+        json_schema_extra={"additionalProperties": False},
+    )
+
+    def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
+        """Return the fields that a value of an axis sets: what the user has defined brings its numbers along."""
+        if axis not in self.custom:
+            return {axis: value}
+        _, field, _ = self.custom[axis]
+        given = self._defined(axis).get(value)
+        if isinstance(given, Calibration):
+            given = given.camera(value)
+        return {axis: value, field: given.model_dump(mode="json") if isinstance(given, Document) else given}
+
+    def _defined(self, axis: str) -> dict[str, Any]:
+        defined: dict[str, Any] = getattr(self, self.custom[axis].key)
+        return defined
+
+    def names(self, axis: str) -> tuple[str, ...]:
+        """Return the names that an axis may use, the built-in ones first: they are the codes of the label."""
+        return (*map(str, self.custom[axis].built_in), *self._defined(axis))
+
+    @property
+    def artifacts(self) -> dict[str, Sha256]:
+        """Pictures of the custom textures."""
+        return {f"/textures/{name}": digest for name, image in self.textures.items() if (digest := referred(image))}
+
+    @model_validator(mode="after")
+    def _known_names(self) -> Self:
+        unknown = []
+        for axis, (key, _, built_in) in self.custom.items():
+            for name in self._defined(axis):
+                if name in built_in:
+                    raise ValueError(f"{key} must not redefine what is built in, and {name!r} is")
+            known = self.names(axis)
+            given = getattr(self.axes, axis)
+            unknown += [
+                InitErrorDetails(
+                    type=PydanticCustomError(
+                        "unknown_name",
+                        "Input should be one of {known}{hint}",
+                        {"known": ", ".join(known), "hint": did_you_mean(name, known)},
+                    ),
+                    loc=("axes", axis, "list", "values", position),
+                    input=name,
+                )
+                for position, name in enumerate(() if given is None else given.values)
+                if name not in known
+            ]
+        if unknown:
+            raise ValidationError.from_exception_data(type(self).__name__, unknown)
+        return self
