@@ -82,7 +82,7 @@ def test_curves_are_the_same_with_the_smallest_cache(rods):
     reader = DatasetReader(rods.root, cache_bytes=0)
     slots = np.random.default_rng(0).permutation(reader.slots())
     assert np.array_equal(reader.read("centerline", slots), rods.arrays["centerline"][slots])
-    assert len(reader._chunks) == 1
+    assert len(reader.index._chunks) == 1
 
 
 def test_pickles(clips):

@@ -25,7 +25,8 @@ from stickslip_training.arrays import Array, Integers
 from stickslip_training.benchmark.cloth import ClothTask
 from stickslip_training.benchmark.rods import RodTask
 from stickslip_training.benchmark.task import Task
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 
 TASKS: dict[str, Task] = {"cloth_drag": ClothTask(), "rod_hang": RodTask()}
 """By kind of dataset."""

@@ -11,7 +11,8 @@ from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
 from stickslip_training.data.coco import export_coco
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 
 
 def info(

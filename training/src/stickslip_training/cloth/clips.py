@@ -21,7 +21,8 @@ from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, landed_side
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 from stickslip_training.engine.fit import seed_of_step
 
 RIG = "drag"

@@ -16,7 +16,8 @@ import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
 from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 
 STEP = 1e-5
 """Of the positions in a packed file [m]."""

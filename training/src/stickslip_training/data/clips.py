@@ -5,8 +5,9 @@ from typing import ClassVar
 
 import torch
 
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import SampleDataset
+from stickslip_training.data.version import Split
 
 
 class ClipSamples(SampleDataset):

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 
 THINGS = ("cloth", "prop")
 """Names of the codes of `segmentation` that are exported; the floor and what is behind are no things."""

@@ -21,7 +21,8 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 
 
 class Item(dict[str, torch.Tensor]):

@@ -6,8 +6,9 @@ from typing import Any
 
 from stickslip_schemas.kinds import kind_named
 
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import SampleDataset
+from stickslip_training.data.version import Split
 
 __all__ = ["dataset_class", "open_samples"]
 

@@ -2,8 +2,9 @@
 
 import os
 
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import SampleDataset
+from stickslip_training.data.version import Split
 
 
 class RodDataset(SampleDataset):

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from stickslip_training.arrays import Array, Integers, SingleFloats
-from stickslip_training.data.reader import DatasetReader, Split
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 from stickslip_training.rods.curvature_net import POINTS
 
 KIND = "rod_hang"
