@@ -110,9 +110,9 @@ def simulate(folder: Path, names: list[str]) -> None:
 def render(folder: Path, out: Path, names: list[str]) -> None:
     """Render what was simulated, by the worker's actor, and write moving pictures."""
     from stickslip_blender.actor import RenderActor
-    from stickslip_blender.preview import moving
     from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
     from stickslip_schemas.format.codecs import decode_clip
+    from stickslip_schemas.format.pictures import moving
     from stickslip_schemas.kinds import kind_named
     from stickslip_schemas.spec.appearance import shown_frames
     from stickslip_schemas.spec.cameras import load_rig, rig_digest

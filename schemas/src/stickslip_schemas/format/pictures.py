@@ -1,10 +1,18 @@
-"""Pictures that users bring along as textures: which are taken, and how they are read."""
+"""Picture files: custom textures that are read, and previews that are written (PNG, and WebP that moves).
+
+Pillow is an extra: each function that needs it imports it.
+"""
 
 import io
 import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 FORMATS = ("PNG", "JPEG")
 SIDES = (64, 4096)
@@ -13,6 +21,9 @@ MAX_BYTES = 8 * 2**20
 """Of a file."""
 
 _MODES = ("RGB", "RGBA", "L", "LA", "P")
+_LABEL_HEIGHT = 12  # [px]
+
+Pictures = npt.NDArray[np.uint8]
 
 
 class UnfitPictureError(ValueError):
@@ -24,7 +35,7 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
 
     Sizes are looked at before anything is decoded, so that a small file cannot ask for much memory.
     """
-    from PIL import Image, ImageOps  # an extra: only who looks at pictures needs it
+    from PIL import Image, ImageOps
 
     if len(data) > MAX_BYTES:
         raise UnfitPictureError(f"a texture must have at most {MAX_BYTES} bytes, and it has {len(data)}")
@@ -53,3 +64,54 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise UnfitPictureError(f"a texture must be a whole PNG or JPEG file: {error}"[:300]) from error
+
+
+def png(picture: Pictures) -> bytes:
+    """Return a picture (height, width, 3) as a PNG file."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(file, format="PNG", compress_level=6)
+    return file.getvalue()
+
+
+def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) -> bytes:
+    """Return pictures (n, height, width, 3) as an animated WebP that repeats for ever, 120 ms a picture.
+
+    With `side`, pictures are reduced to that width [px].
+    """
+    width = pictures.shape[2] if side is None else side
+    height = round(width * pictures.shape[1] / pictures.shape[2])
+    frames = [_reduced(picture, (width, height)) for picture in pictures]
+    file = io.BytesIO()
+    frames[0].save(
+        file, format="WEBP", save_all=True, append_images=frames[1:], duration=120, loop=0, quality=quality, method=2
+    )
+    return file.getvalue()
+
+
+def labelled(pictures: Pictures, text: str, side: int) -> Pictures:
+    """Return pictures (n, height, width, 3) reduced to squares of `side` pixels, with a text above them."""
+    from PIL import Image, ImageDraw
+
+    small = [np.asarray(_reduced(picture, (side, side))) for picture in pictures]
+    label = Image.new("RGB", (side, _LABEL_HEIGHT), (255, 255, 255))
+    ImageDraw.Draw(label).text((2, 0), text, fill=(0, 0, 0), font_size=9)
+    strip = np.broadcast_to(np.asarray(label), (len(small), _LABEL_HEIGHT, side, 3))
+    return np.concatenate([strip, np.stack(small)], axis=1)
+
+
+def _reduced(picture: Pictures, size: tuple[int, int]) -> "Image.Image":
+    """Return a picture (height, width, 3) at a size (width, height) [px]."""
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(picture))
+    return image if image.size == size else image.resize(size, Image.Resampling.BOX)
+
+
+def sheet(tiles: Sequence[Pictures], columns: int) -> Pictures:
+    """Arrange pictures (n, height, width, 3), all of one shape, in rows; the last row is filled with white."""
+    columns = min(columns, len(tiles))
+    filled = [*tiles, *[np.full_like(tiles[0], 255)] * (-len(tiles) % columns)]
+    rows = [np.concatenate(filled[first : first + columns], axis=2) for first in range(0, len(filled), columns)]
+    return np.concatenate(rows, axis=1)

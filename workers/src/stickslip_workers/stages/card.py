@@ -1,18 +1,31 @@
-"""The dataset card: `README.md` of a dataset version, for people who find the directory and nothing else."""
+"""The dataset card, `README.md` of a dataset version, and its preview: some of its samples in one picture.
+
+The card is for people who find only the directory.
+"""
 
 import json
 from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from stickslip_schemas.format.codecs import decode_sample
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest
+from stickslip_schemas.format.pictures import labelled, moving, sheet
+from stickslip_schemas.plan.points import grid
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis
-
-from stickslip_workers.stages.preview import PREVIEW_NAME
+from stickslip_schemas.spec.jobs import JobSpec
 
 CARD_NAME = "README.md"
-
+PREVIEW_NAME = "preview.webp"
 SHOWN_VALUES = 12
+SHOWN_SAMPLES, FRAMES = 12, 20
+"""Samples and instants in the preview, at most."""
+_COLUMNS = 4
+_SIDE = 120  # of a picture [px]
 
 
 def card(manifest: Manifest) -> bytes:
@@ -133,3 +146,33 @@ def _in_sections(manifest: Manifest) -> str:
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     lines = [header, tuple("---" for _ in header), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def pictured(spec: JobSpec) -> ArrayLayout | None:
+    """Return the array that a dataset of `spec` is best seen by; None where it has no pictures."""
+    seen = (array for array in layout(spec) if array.per_sample and array.dimensions[-3:] == ("y", "x", "rgb"))
+    return next(seen, None)
+
+
+def preview(spec: JobSpec, array: ArrayLayout, valid: Sequence[int], chunk: Callable[[int], bytes]) -> bytes | None:
+    """Return a WebP of valid slots, evenly spread, with the values of their axes; None where none is valid.
+
+    `chunk` returns the encoded chunk of a slot. A clip moves; of several views, the first is shown.
+    """
+    if not valid:
+        return None
+    shown = [valid[place] for place in shown_frames(min(SHOWN_SAMPLES, len(valid)), len(valid))]
+    points = {slot: point for slot, point in enumerate(grid(spec)) if slot in shown}
+    tiles = []
+    for slot in shown:
+        pictures = np.empty(array.shape, dtype=np.uint8)
+        decode_sample(array, chunk(slot), pictures)
+        count = min(FRAMES, len(pictures)) if array.is_clip else 1
+        varied = {name: value for name, value in points[slot].items() if spec.named_axes[name].num > 1}
+        tiles.append(labelled(pictures[list(shown_frames(count, len(pictures)))], text_of(varied), _SIDE))
+    return moving(sheet(tiles, _COLUMNS), quality=50)
+
+
+def text_of(values: Mapping[str, object]) -> str:
+    """Return parameters as people read them."""
+    return " ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in values.values())

@@ -31,9 +31,8 @@ from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 
 from stickslip_workers.settings import CPU, RENDER_DEVICE
-from stickslip_workers.stages.card import CARD_NAME, card
+from stickslip_workers.stages.card import CARD_NAME, PREVIEW_NAME, card, pictured, preview
 from stickslip_workers.stages.metadata import metadata_files
-from stickslip_workers.stages.preview import PREVIEW_NAME, pictured, preview
 
 
 def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:

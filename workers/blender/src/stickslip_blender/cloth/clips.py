@@ -16,6 +16,7 @@ import numpy.typing as npt
 from stickslip_schemas.base.keys import content_key, referred
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
 from stickslip_schemas.format.chunks import decode_chunk, encode_chunk
+from stickslip_schemas.format.pictures import moving
 from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.spec.fabrics import Texture
 
@@ -28,7 +29,6 @@ from stickslip_blender.cloth.shading import Sight, settled
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
-from stickslip_blender.preview import moving
 from stickslip_blender.raster import Textures
 from stickslip_blender.workshop import Workshop, why_unfit
 
@@ -42,6 +42,7 @@ GATE_TEXTURE = Texture.floral
 """Of the gate: with dark, light and saturated places."""
 _GATE_SAMPLES = 16
 _BLOCK = 4
+_PREVIEW_SIDE = 160  # [px]
 
 _KEPT_SHADINGS = 4
 """Shadings that a process keeps: 9 MB each at 30 frames."""
@@ -219,14 +220,17 @@ def render_clips(
     wanted = task.textures or (look.variant,)
     videos, labels = clip.clips(shading, [_picture(name, workshop) for name in wanted])
     if not task.textures:
-        preview = workshop.store.publish(moving(videos[0])) if task.preview else None
+        preview = workshop.store.publish(moving(videos[0], side=_PREVIEW_SIDE)) if task.preview else None
         chunks = {"video": workshop.clip(videos[0]), **known}
         return TaskResult(outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels))
     output = RenderOutput(
         chunks=known,
         labels=labels,
         clips={texture: workshop.clip(video) for texture, video in zip(wanted, videos, strict=True)},
-        previews={texture: workshop.store.publish(moving(video)) for texture, video in zip(wanted, videos, strict=True)}
+        previews={
+            texture: workshop.store.publish(moving(video, side=_PREVIEW_SIDE))
+            for texture, video in zip(wanted, videos, strict=True)
+        }
         if task.preview
         else {},
     )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.cameras import load_rig
 
-from stickslip_blender.preview import side_by_side
 from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_linear
 from stickslip_blender.workshop import Workshop, why_unfit
 
@@ -26,6 +27,5 @@ def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskRes
         ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality, scratch=workshop.scratch)
     )
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
-    return workshop.rendered(
-        "views", views, side_by_side(views) if task.preview else None, {"color": list(to_linear(color))}
-    )
+    preview = png(np.concatenate(list(views), axis=1)) if task.preview else None
+    return workshop.rendered("views", views, preview, {"color": list(to_linear(color))})

@@ -2,14 +2,13 @@
 
 import json
 from functools import lru_cache
-from io import BytesIO
 from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
-from PIL import Image
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
+from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
@@ -130,9 +129,8 @@ def get_picture(
     values = _value(data, array, slot)
     if values.ndim != 4 or index >= len(values):
         raise NotFoundError(f"{array} has no picture {index}")
-    content = BytesIO()
-    Image.fromarray(np.ascontiguousarray(values[index][::step, ::step])).save(content, "PNG")
-    return Response(content.getvalue(), media_type="image/png", headers={"Cache-Control": "private, max-age=86400"})
+    content = png(values[index][::step, ::step])
+    return Response(content, media_type="image/png", headers={"Cache-Control": "private, max-age=86400"})
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.json")
