@@ -89,17 +89,21 @@ class MissingArtifactError(StickslipError):
     """The store does not have what the database says it has, or not all of it."""
 
 
-class DatabaseRefusedError(Exception):
+class CommandError(Exception):
+    """Base of errors that a command prints in one sentence, without a traceback."""
+
+
+class DatabaseRefusedError(CommandError):
     """The database is damaged, lost, or of another version; the message says what to do."""
 
 
-class SettingsError(Exception):
+class SettingsError(CommandError):
     """A setting breaks a rule."""
 
 
-class SupervisorError(Exception):
+class SupervisorError(CommandError):
     """`stickslip up` cannot go on."""
 
 
-class ServerNotInstalledError(Exception):
+class ServerNotInstalledError(CommandError):
     """A server command was called where only the client is installed."""

@@ -25,6 +25,16 @@ class StageProgress(Document):
         default=None, description="of the simulations that run and tell: frames done, and frames"
     )
 
+    @property
+    def total(self) -> int:
+        """Number of tasks."""
+        return sum(self.counts.values())
+
+    @property
+    def done(self) -> int:
+        """Number of tasks that have ended without being cancelled."""
+        return sum(count for state, count in self.counts.items() if state.is_over and state is not TaskState.cancelled)
+
 
 class Eta(Document):
     """Time that is left, from measured durations; `low` to `high` covers about 80 % of jobs [s]."""

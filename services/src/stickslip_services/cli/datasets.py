@@ -16,7 +16,6 @@ from stickslip_schemas.format.manifest import MANIFEST_NAME, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.addresses import DEFAULT_URL, coordinator_url
-from stickslip_services.cli import wording
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.comparing import differences
@@ -25,6 +24,7 @@ from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import safe_path
 from stickslip_services.client.verifying import verify as find_faults
+from stickslip_services.units import size
 
 ArraysOption = Annotated[
     str | None, typer.Option(help="arrays to take, with commas between; labels always come; without, all")
@@ -56,7 +56,7 @@ def datasets(context: typer.Context, url: UrlOption = DEFAULT_URL, as_json: Json
                 dataset.kind,
                 str(version.sample_count),
                 str(version.valid_count),
-                wording.size(version.bytes),
+                size(version.bytes),
                 f"{version.created_at:%Y-%m-%d %H:%M} UTC",
             )
     return console().print(shown)
@@ -98,7 +98,7 @@ def pull_dataset(
     there = done.files - done.downloaded_files
     screen.print(
         f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files downloaded "
-        f"({wording.size(done.downloaded_bytes)}), {there} already there"
+        f"({size(done.downloaded_bytes)}), {there} already there"
     )
     say(f"{target / 'README.md'} says what it holds and how to read it. To check it again: stickslip verify {target}")
 

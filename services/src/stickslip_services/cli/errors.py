@@ -1,4 +1,4 @@
-"""Errors on the command line: the field, the rule and the value, and no traceback."""
+"""Errors on the command line: field, rule and value, without a traceback."""
 
 import functools
 from collections.abc import Callable
@@ -8,36 +8,16 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from stickslip_services.cli.specs import SpecFileError
+from stickslip_services.cli.specs import field_line
 from stickslip_services.client.errors import ClientError, ProblemError, UnreachableError
-from stickslip_services.errors import (
-    DatabaseRefusedError,
-    ServerNotInstalledError,
-    SettingsError,
-    StickslipError,
-    SupervisorError,
-)
-from stickslip_services.local.certifying import CertifyError
-from stickslip_services.local.simulating import SimulateError
-
-_SHOWN = (
-    CertifyError,
-    ClientError,
-    DatabaseRefusedError,
-    StickslipError,
-    ServerNotInstalledError,
-    SettingsError,
-    SimulateError,
-    SpecFileError,
-    SupervisorError,
-)
+from stickslip_services.errors import CommandError, StickslipError
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
-    """Print what a command may stumble over, and exit with status 1."""
+    """Print the errors that a command expects, and exit with status 1."""
 
     @functools.wraps(command)
     def run(*arguments: P.args, **options: P.kwargs) -> R:
@@ -46,9 +26,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         except ProblemError as error:
             _print(error.problem.detail if not error.problem.errors else "the document is not valid")
             for field in error.problem.errors:
-                place = field.pointer.lstrip("/").replace("/", ".") or "the document"
-                value = f", and it is {field.value}" if field.value else ""
-                _print_line(f"  [bold]{escape(place)}[/]: {escape(field.rule)}{escape(value)}")
+                _print_line(escape(field_line(field)))
             if error.problem.request_id and error.problem.status >= 500:
                 _print_line(f"  request {escape(error.problem.request_id)}; the coordinator's log says more")
         except UnreachableError as error:
@@ -56,7 +34,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
                 f"{error}. Is a coordinator running there? `stickslip up` starts one on this machine; "
                 "--url or STICKSLIP_URL names another."
             )
-        except _SHOWN as error:
+        except (ClientError, CommandError, StickslipError) as error:
             _print(str(error))
         except OSError as error:
             _print(f"{error.filename or 'the file system'}: {error.strerror or error}")

@@ -28,6 +28,7 @@ from stickslip_services.cli.specs import check_spec, read_spec
 from stickslip_services.cli.watch import GOOD, watch
 from stickslip_services.client.errors import UnreachableError
 from stickslip_services.client.http import Client
+from stickslip_services.units import duration, size
 
 SHOWN_REJECTS = 50
 
@@ -53,7 +54,7 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
     shown = _counts(answer.spec)
     shown.add_row("tasks cached", f"{cached} of {answer.task_count}")
     if answer.stored_bytes_estimate is not None:
-        shown.add_row("size of the files, about", wording.size(answer.stored_bytes_estimate))
+        shown.add_row("size of the files, about", size(answer.stored_bytes_estimate))
     shown.add_row("certificate", answer.certificate or "none")
     console().print(shown)
     if answer.refusal is not None:
@@ -76,7 +77,7 @@ def _counts(spec: JobSpec) -> Table:
     shown.add_row("samples", f"{counts.samples} ({splits}, about)")
     shown.add_row("simulations", f"{counts.simulations}")
     shown.add_row("renders", f"{counts.renders}")
-    shown.add_row("arrays before compression", wording.size(bytes_estimate(spec)))
+    shown.add_row("arrays before compression", size(bytes_estimate(spec)))
     shown.add_row("digest of the spec", spec.content_digest)
     return shown
 
@@ -124,7 +125,7 @@ def jobs(
             str(job.sample_count),
             str(job.rejected_count),
             wording.done_of(job.progress),
-            "" if job.progress.eta is None else wording.duration(job.progress.eta.seconds),
+            "" if job.progress.eta is None else duration(job.progress.eta.seconds),
             wording.dataset(job.dataset),
         )
     return console().print(shown)
@@ -170,7 +171,7 @@ def _job_table(job: JobDetail) -> Table:
     if job.state.is_open:
         shown.add_row("time left", wording.eta(job.progress.eta))
     cpu = sum(stage.cpu_seconds for stage in job.progress.stages.values())
-    shown.add_row("CPU time", wording.duration(cpu))
+    shown.add_row("CPU time", duration(cpu))
     if job.state in GOOD:
         rate = 1 - job.rejected_count / job.sample_count
         shown.add_row("accepted", f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})")

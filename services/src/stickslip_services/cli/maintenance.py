@@ -12,6 +12,7 @@ import typer
 from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, say
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
+from stickslip_services.errors import CommandError, DatabaseRefusedError
 from stickslip_services.installed import require_server
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ def _owned(
     from stickslip_services.access.audit_log import acting, this_user
     from stickslip_services.database.database import Role
     from stickslip_services.database.opening import check, opened
-    from stickslip_services.errors import DatabaseRefusedError
     from stickslip_services.local.process import locked
     from stickslip_services.settings import Settings
 
@@ -48,7 +48,10 @@ def _owned(
             f"{settings.database_option} of a coordinator"
         )
     with locked(data), acting(this_user()), opened(settings, Role.upkeep) as opened_database:
-        yield opened_database, open_store(settings.store_place)
+        try:
+            yield opened_database, open_store(settings.store_place)
+        except ValueError as error:  # a damaged manifest in the store
+            raise CommandError(str(error)) from error
 
 
 @shows_errors

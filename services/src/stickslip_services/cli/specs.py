@@ -1,4 +1,4 @@
-"""Files of specs and of scenes: YAML or JSON."""
+"""Spec and scene files, YAML or JSON."""
 
 import json
 import math
@@ -8,18 +8,20 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from stickslip_schemas.documents.problems import field_errors
+from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.spec.scene_file import SceneFile
 
+from stickslip_services.errors import CommandError
 
-class SpecFileError(Exception):
-    """A file that holds no spec."""
+
+class SpecFileError(CommandError):
+    """The file holds no valid spec or scene."""
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML as people expect it: `1e-3` is a number, and a key that is there twice is a mistake."""
+    """YAML in which `1e-3` is a number and a repeated key is an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
@@ -41,7 +43,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_spec(path: Path) -> dict[str, Any]:
-    """Read a spec file; whether it is a good spec is for the coordinator to say. Raise SpecFileError."""
+    """Return the document of a spec file, which may break rules of specs; raise SpecFileError if it is no document."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -59,7 +61,7 @@ def read_spec(path: Path) -> dict[str, Any]:
 
 
 def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
-    """Return the spec that a document describes; raise SpecFileError with everything that is wrong with it."""
+    """Return the spec of a document; raise SpecFileError with all fields that break a rule."""
     try:
         return job_spec_adapter.validate_python(document)
     except ValidationError as error:
@@ -67,7 +69,7 @@ def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
 
 
 def check_scene(document: dict[str, Any], path: Path) -> SceneFile:
-    """Return the scene that a document describes; raise SpecFileError with everything that is wrong with it."""
+    """Return the scene of a document; raise SpecFileError with all fields that break a rule."""
     try:
         return SceneFile.model_validate(document)
     except ValidationError as error:
@@ -75,16 +77,18 @@ def check_scene(document: dict[str, Any], path: Path) -> SceneFile:
 
 
 def _not_valid(error: ValidationError, document: dict[str, Any], model: Any, path: Path) -> SpecFileError:
-    lines = [
-        f"  {field.pointer.lstrip('/').replace('/', '.') or 'the document'}: {field.rule}"
-        + (f", and it is {field.value}" if field.value else "")
-        for field in field_errors(error, document, model)
-    ]
+    lines = [field_line(field) for field in field_errors(error, document, model)]
     return SpecFileError("\n".join([f"{path} is not valid", *lines]))
 
 
+def field_line(field: FieldError) -> str:
+    """Return a line that names a field of a document, the rule that it breaks, and its value."""
+    place = field.pointer.lstrip("/").replace("/", ".") or "the document"
+    return f"  {place}: {field.rule}" + (f", and it is {field.value}" if field.value else "")
+
+
 def _check(value: Any, place: str, path: Path) -> None:
-    """Refuse what JSON has no word for, before it is sent."""
+    """Raise SpecFileError for values that JSON cannot hold."""
     if isinstance(value, dict):
         for key, item in value.items():
             _check(item, f"{place}.{key}" if place else str(key), path)

@@ -1,4 +1,4 @@
-"""Watching a job: bars on a terminal, plain lines elsewhere."""
+"""Progress of a job: bars on a terminal, plain lines elsewhere."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,9 +18,6 @@ from stickslip_services.client.http import Client
 
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
 
-_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed)
-"""Done; a cancelled task is not."""
-
 
 class _Screen(Protocol):
     def line(self, markup: str) -> None: ...
@@ -28,7 +25,7 @@ class _Screen(Protocol):
 
 
 def watch(client: Client, job_id: str, console: Console) -> JobState:
-    """Show a job until it ends; return how it did."""
+    """Show the progress of a job until it ends; return its final state."""
     job = client.job(job_id)
     try:
         return _follow(client, job_id, console, job.state, job.sample_count)
@@ -53,7 +50,7 @@ def _follow(client: Client, job_id: str, console: Console, state: JobState, samp
                     screen.line(f"published [bold]{name}[/]")
                     screen.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
                     page = f"{client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}"
-                    screen.line(f"look at it: {page}")
+                    screen.line(f"its page: {page}")
     return state
 
 
@@ -62,7 +59,7 @@ def _because(message: str) -> str:
 
 
 class _Lines:
-    """One line for each piece of news."""
+    """Prints a line for each event."""
 
     def __init__(self, console: Console, sample_count: int) -> None:
         self._console = console
@@ -82,7 +79,7 @@ class _Lines:
 
 
 class _Bars:
-    """A bar for each stage."""
+    """Shows a progress bar for each stage."""
 
     def __init__(self, console: Console, bars: Progress, sample_count: int) -> None:
         self._console = console
@@ -100,22 +97,15 @@ class _Bars:
         if self._plan is not None:
             self._bars.update(self._plan, completed=progress.planned)
         for stage, counted in progress.stages.items():
-            total = sum(counted.counts.values())
-            if not total:
+            if not counted.total:
                 continue
             if stage not in self._ids:
-                self._ids[stage] = self._bars.add_task(stage, total=total, extra="")
-            over = sum(counted.counts.get(state, 0) for state in _OVER)
+                self._ids[stage] = self._bars.add_task(stage, total=counted.total, extra="")
             running = counted.counts.get(TaskState.running, 0)
-            notes = [f"{running} running"] if running else []
-            notes += [f"{counted.cached} cached"] if counted.cached else []
-            notes += [
-                f"{counted.counts[state]} {state}"
-                for state in (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
-                if counted.counts.get(state)
-            ]
-            self._bars.update(self._ids[stage], total=total, completed=over, extra=", ".join(notes))
-        if self._ids and progress.eta is not None:  # on the last bar, which has nothing else to say for long
+            notes = ([f"{running} running"] if running else []) + wording.notes(counted)
+            row = self._ids[stage]
+            self._bars.update(row, total=counted.total, completed=counted.done, extra=", ".join(notes))
+        if self._ids and progress.eta is not None:  # on the last bar, whose other notes come late
             self._bars.update(max(self._ids.values()), extra=f"{wording.eta(progress.eta)} left")
 
 

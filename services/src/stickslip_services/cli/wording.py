@@ -1,7 +1,9 @@
-"""How the command line says things: durations, sizes, states, progress."""
+"""States, progress and remaining times as text for the command line."""
 
 from stickslip_schemas.base.states import JobState, TaskState
-from stickslip_schemas.documents.responses import DatasetRef, Eta, Job, Progress
+from stickslip_schemas.documents.responses import DatasetRef, Eta, Progress, StageProgress
+
+from stickslip_services.units import duration
 
 _COLORS = {
     JobState.planning: "yellow",
@@ -14,77 +16,47 @@ _COLORS = {
     JobState.failed: "red",
 }
 
-_OVER = (TaskState.succeeded, TaskState.rejected, TaskState.failed)
-"""Done; a cancelled task is not."""
-
-
-def duration(seconds: float) -> str:
-    """Return a time span in words: 9 s, 4 min, 2 h 10 min."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    if minutes < 90:
-        return f"{minutes} min"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
-def size(count: int) -> str:
-    """Return a number of bytes in words."""
-    value = float(count)
-    for unit in ("B", "kB", "MB", "GB"):
-        if value < 1000:
-            return f"{value:.0f} {unit}" if unit == "B" or value >= 100 else f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.1f} TB"
+_NOTED = (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
 
 
 def eta(value: Eta | None) -> str:
-    """Return the time that is left in words."""
+    """Return the remaining time with its range."""
     if value is None:
         return "unknown"
     return f"about {duration(value.seconds)} ({duration(value.low)} to {duration(value.high)})"
 
 
 def state(value: JobState) -> str:
-    """Return a state in its colour (rich markup)."""
+    """Return a state in its colour, as rich markup."""
     return f"[{_COLORS.get(value, 'white')}]{value}[/]"
 
 
 def dataset(value: DatasetRef | None) -> str:
-    """Return a dataset version as `pull` reads it."""
+    """Return a dataset version as `stickslip pull` reads it."""
     return "" if value is None else f"{value.dataset}:v{value.version}"
 
 
 def done_of(progress: Progress) -> str:
-    """Return how many tasks are over."""
+    """Return the number of finished tasks, of all."""
     return f"{progress.done}/{progress.total}"
 
 
 def planned(progress: Progress, sample_count: int) -> str:
-    """Return how many samples are planned, where it is not all of them; else nothing."""
+    """Return the number of planned samples; empty when all are planned."""
     return "" if progress.planned == sample_count else f"{progress.planned:,} of {sample_count:,} samples are planned"
 
 
 def stages(progress: Progress) -> str:
     """Return a line of counts: `simulate 12/40 (3 cached, 1 rejected), render 0/40`."""
-    words = []
-    for stage, counted in progress.stages.items():
-        total = sum(counted.counts.values())
-        if not total:
-            continue
-        over = sum(counted.counts.get(state, 0) for state in _OVER)
-        extra = [f"{counted.cached} cached"] if counted.cached else []
-        extra += [
-            f"{count} {state}"
-            for state, count in counted.counts.items()
-            if count and state in (TaskState.rejected, TaskState.failed, TaskState.soft_failed, TaskState.cancelled)
-        ]
-        words.append(f"{stage} {over}/{total}" + (f" ({', '.join(extra)})" if extra else ""))
-    return ", ".join(words) or "not planned yet"
+    shown = [
+        f"{stage} {counted.done}/{counted.total}" + (f" ({', '.join(found)})" if (found := notes(counted)) else "")
+        for stage, counted in progress.stages.items()
+        if counted.total
+    ]
+    return ", ".join(shown) or "not planned yet"
 
 
-def acceptance(job: Job) -> str:
-    """Return how many of the samples so far are good."""
-    if not job.rejected_count:
-        return "no sample was rejected"
-    return f"{job.rejected_count} of {job.sample_count} samples rejected"
+def notes(counted: StageProgress) -> list[str]:
+    """Return counts of tasks of a stage that need a word: `3 cached`, `1 rejected`."""
+    cached = [f"{counted.cached} cached"] if counted.cached else []
+    return cached + [f"{counted.counts[state]} {state}" for state in _NOTED if counted.counts.get(state)]

@@ -3,10 +3,10 @@
 from datetime import UTC, datetime
 
 from stickslip_services.addresses import DEFAULT_URL
-from stickslip_services.cli import wording
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.http import Client
+from stickslip_services.units import duration
 
 
 @shows_errors
@@ -19,7 +19,7 @@ def workers(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
     shown = table("worker", "kinds", "slots", "tasks", "last seen", no_wrap=("worker",))
     now = datetime.now(UTC)
     for worker in found:
-        ago = wording.duration(max(0.0, (now - worker.last_seen_at).total_seconds()))
+        ago = duration(max(0.0, (now - worker.last_seen_at).total_seconds()))
         shown.add_row(
             worker.name,
             ", ".join(worker.builds),

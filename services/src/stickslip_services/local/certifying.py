@@ -11,11 +11,13 @@ from pathlib import Path
 from pydantic import ValidationError
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
 
+from stickslip_services.errors import CommandError
+
 DOCUMENT_NAME = "certificate.json"
 PAGE_NAME = "certificate.html"
 
 
-class CertifyError(Exception):
+class CertifyError(CommandError):
     """There is no certificate."""
 
 

@@ -9,8 +9,10 @@ from typing import Any
 
 from stickslip_schemas.spec.scene_file import SceneFile
 
+from stickslip_services.errors import CommandError
 
-class SimulateError(Exception):
+
+class SimulateError(CommandError):
     """A scene that was not simulated."""
 
 
