@@ -121,7 +121,7 @@ def test_an_old_certificate_is_not_taken_for_a_new_one(
     monkeypatch.setattr(sys, "executable", "/bin/false")  # ends with status 1, as a preset that fails does
     result = cli("certify", "--preset", "rods", "--out", quick)
     assert result.exit_code == 1
-    assert "there is no certificate: the workers' program ended with status 1" in result.stderr
+    assert "no certificate was made: the workers' program ended with status 1" in result.stderr
 
 
 def test_a_damaged_certificate_is_refused_in_words(cli: Callable[..., Result], quick: Path, tmp_path: Path) -> None:
@@ -131,5 +131,5 @@ def test_a_damaged_certificate_is_refused_in_words(cli: Callable[..., Result], q
     (tmp_path / "certificate.html").write_text("<p>")
     result = cli("register", tmp_path)
     assert result.exit_code == 1
-    assert "is no certificate" in result.stderr
+    assert "is not a valid certificate" in result.stderr
     assert "largest of the curves' errors" in result.stderr

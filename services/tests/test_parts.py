@@ -116,11 +116,11 @@ def test_versions_are_compared(origin: tuple[str, str, str], tmp_path: Path) -> 
         }
     assert found["samples"] == ("8", "4")
     assert found["spec name"] == ("4-rods", "2-rods")
-    assert found["samples that only it has"] == ("4", "0")
+    assert found["samples in this version only"] == ("4", "0")
     assert not [what for what in found if what.startswith(("build", "certificate", "array"))]
     done = run("datasets", "diff", f"{large}:v1", tmp_path / "small", "--url", url)
     assert done.exit_code == 1
-    assert "samples that only it has" in done.stdout
+    assert "samples in this version only" in done.stdout
     same = run("datasets", "diff", small, tmp_path / "small", "--url", url)
     assert (same.exit_code, "hold the same files" in same.stdout) == (0, True), same.output
     assert large in run("datasets", "--url", url).stdout

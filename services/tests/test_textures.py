@@ -106,7 +106,7 @@ def test_the_command_line_uploads_and_says_what_to_write(
 
     done = run("upload", tmp_path / "My Logo.png")
     assert done.stdout == f"textures:\n  my-logo: {client.upload_texture(_png(seed=2)).texture}\n"
-    for name, rule in (("text.png", "text.png was not taken: a texture must be"), ("none.png", "cannot be read")):
+    for name, rule in (("text.png", "text.png was refused: a texture must be"), ("none.png", "cannot be read")):
         failed = run("upload", tmp_path / name)
         assert (failed.exit_code, rule in failed.stderr) == (1, True), failed.output
 

@@ -192,8 +192,8 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
     ("arguments", "message"),
     [
         (("rm", "ds-0000000000000000:v1"), "there is no version 1 of a dataset 'ds-0000000000000000'"),
-        (("rm", "ds-0000000000000000"), "a version is written ds-0123456789abcdef:v1"),
-        (("rm", "../../etc:v1"), "a version is written ds-0123456789abcdef:v1"),
+        (("rm", "ds-0000000000000000"), "must be DATASET:vN, as in ds-0123456789abcdef:v1"),
+        (("rm", "../../etc:v1"), "must be DATASET:vN, as in ds-0123456789abcdef:v1"),
     ],
 )
 def test_what_does_not_exist_is_refused(

@@ -1,4 +1,4 @@
-"""Where a coordinator listens, and where its clients look for it."""
+"""Addresses of a coordinator, for the server and for its clients."""
 
 import os
 from ipaddress import ip_address
@@ -6,11 +6,11 @@ from ipaddress import ip_address
 DEFAULT_PORT = 8765
 DEFAULT_URL = f"http://127.0.0.1:{DEFAULT_PORT}"
 DATABASE_VARIABLE = "STICKSLIP_DATABASE"
-"""How processes hand each other the URL of the database: everybody can read their command lines."""
+"""Environment variable with the URL of the database, which is not passed in command lines, because those are public."""
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether only this machine can reach `host`."""
+    """Return whether only this machine can reach `host`."""
     if host == "localhost":
         return True
     try:
@@ -20,7 +20,7 @@ def is_loopback(host: str) -> bool:
 
 
 def reachable(host: str) -> str:
-    """Return an address at which this machine reaches a server that listens at `host`."""
+    """Return the address at which this machine reaches a server that listens at `host`."""
     return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
 
 
@@ -31,5 +31,5 @@ def http_url(host: str, port: int, *, tls: bool = False) -> str:
 
 
 def coordinator_url(url: str | None) -> str:
-    """Return where the coordinator is: at `url`, at STICKSLIP_URL, or on this machine."""
+    """Return the URL of the coordinator: `url`, STICKSLIP_URL, or the default on this machine."""
     return (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")

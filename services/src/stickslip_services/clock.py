@@ -8,5 +8,5 @@ Clock = Callable[[], float]
 
 
 def as_datetime(seconds: float) -> datetime:
-    """Return the point in time as the API shows it."""
+    """Return a time in seconds since 1970 as a UTC datetime."""
     return datetime.fromtimestamp(seconds, UTC)

@@ -1,7 +1,7 @@
 """Administration of a coordinator on its own machine: API keys, projects, webhooks and the audit log.
 
-These commands open the database of a data directory, also while the coordinator runs. They need no API key: whoever may
-write the data directory may make keys.
+These commands open the database of a data directory, also while the coordinator runs. They need no API key: users who
+may write the data directory may make keys.
 """
 
 import json

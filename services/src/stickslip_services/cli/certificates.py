@@ -1,4 +1,4 @@
-"""Certificates: measuring, registering and listing them."""
+"""Commands for certificates: measure, register and list."""
 
 from pathlib import Path
 from typing import Annotated
@@ -56,7 +56,7 @@ def register(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="what `stickslip certify` wrote")],
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Register a certificate with a coordinator that did not run when it was made."""
+    """Register a certificate that was measured without a running coordinator."""
     upload = certifying.read_certificate(directory)
     with Client(url) as client:
         _say_registered(client.register(upload), url)
@@ -68,7 +68,7 @@ def _say_registered(entry: CertificateEntry, url: str) -> None:
 
 @shows_errors
 def certificates(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """List certificates, newest first, and whether they are of the build of the connected workers."""
+    """List certificates, newest first, and compare their builds with those of the connected workers."""
     with Client(url) as client:
         found = list(client.certificates())
         if as_json:

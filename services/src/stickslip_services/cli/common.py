@@ -1,4 +1,4 @@
-"""What commands share: options, a console, JSON output."""
+"""Options, the console and JSON output, shared by the commands."""
 
 import json
 import sys
@@ -26,12 +26,12 @@ JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
 
 
 def console() -> Console:
-    """Return a console as wide as the terminal, or wide enough for any table where there is none to fit into."""
+    """Return a console as wide as the terminal, or 200 columns wide if the output is no terminal."""
     return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
 def say(text: str) -> None:
-    """Tell people something that programs need not read, on standard error."""
+    """Print a message for people on standard error; standard output is for programs."""
     typer.echo(text, err=True)
 
 
@@ -44,7 +44,7 @@ def print_json(value: BaseModel | list[Any]) -> None:
 
 
 def table(*columns: str, no_wrap: tuple[str, ...] = ()) -> Table:
-    """Return an empty table; columns in `no_wrap` are never folded."""
+    """Return an empty table; columns in `no_wrap` are never wrapped."""
     made = Table(box=None, header_style="bold")
     for column in columns:
         made.add_column(column, overflow="fold", no_wrap=column in no_wrap)

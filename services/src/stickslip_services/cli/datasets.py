@@ -1,4 +1,4 @@
-"""Datasets: listing, pulling and verifying them."""
+"""Commands for datasets: list, pull, compare, export and verify."""
 
 import os
 import re
@@ -71,10 +71,10 @@ def pull_dataset(
     where: WhereOption = None,
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Download a dataset, or a part of it. Every file is checked, and what is already there is not downloaded again.
+    """Download a dataset or a part of it. Every file is checked, and intact files are not downloaded again.
 
-    A part has all labels. Of the other arrays it has the shards in which a chosen sample lies. The reader of
-    stickslip-training shows the chosen samples only; other readers show fill values for what is not there.
+    A part has all labels and, of the other arrays, the shards that hold a chosen sample. The reader of
+    stickslip-training shows only the chosen samples; other readers show fill values for missing samples.
     """
     screen = console()
     try:
@@ -100,7 +100,7 @@ def pull_dataset(
         f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files downloaded "
         f"({size(done.downloaded_bytes)}), {there} already there"
     )
-    say(f"{target / 'README.md'} says what it holds and how to read it. To check it again: stickslip verify {target}")
+    say(f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}")
 
 
 @app.command("diff")
@@ -110,13 +110,13 @@ def diff(
     b: Annotated[str, typer.Argument(metavar="B", help="DATASET[:vN], or a directory")],
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Say what differs between two versions: spec, builds, labels, samples, files. Exit with 1 if anything does."""
+    """Compare two versions: spec, builds, labels, samples, files. Exit with 1 if they differ."""
     with Client(url) as client:
         found = differences(_contents(client, a), _contents(client, b))
     if not found:
-        console().print("the two were made from the same spec by the same code, and hold the same files")
+        console().print("no difference: same spec, same builds, same files")
         return
-    shown = table("what", a, b)
+    shown = table("difference", a, b)
     for difference in found:
         shown.add_row(*map(escape, (difference.what, difference.a, difference.b)))
     console().print(shown)
@@ -124,7 +124,7 @@ def diff(
 
 
 def _contents(client: Client, dataset: str) -> Contents:
-    """Return what the manifest lists of a version that is on disk, or at the coordinator."""
+    """Return the contents of a version, from a directory or from the coordinator."""
     if _ID.match(dataset):
         return client.contents(*_resolve(client, dataset))
     path = Path(dataset) / MANIFEST_NAME
@@ -132,7 +132,7 @@ def _contents(client: Client, dataset: str) -> Contents:
         manifest = Manifest.model_validate_json(path.read_bytes())
         return Contents(manifest, lambda file: safe_path(Path(dataset), file.path).read_bytes())
     except ValidationError as error:
-        raise ClientError(f"{path} is no manifest: {str(error).splitlines()[0]}") from error
+        raise ClientError(f"{path} is not a valid manifest: {str(error).splitlines()[0]}") from error
 
 
 @shows_errors
@@ -152,7 +152,7 @@ def export(
     licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Write a dataset in a format that other libraries read, with Croissant metadata. Nothing is overwritten.
+    """Export a dataset to a format of another library, with Croissant metadata. Existing files are not overwritten.
 
     Needs the training package: pip install 'stickslip-training[export]'.
     """
@@ -196,7 +196,7 @@ def _resolve(client: Client, dataset: str) -> tuple[str, int]:
             raise ClientError(f"dataset {name} has no version yet")
         return name, versions[-1].version
     if not version.isdecimal() or len(version) > 9:
-        raise ClientError(f"a version is written DATASET:v1, and this is {dataset!r}")
+        raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {dataset!r}")
     return name, int(version)
 
 
@@ -206,7 +206,7 @@ def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset
     screen = console()
     faults = find_faults(target)
     if not faults:
-        screen.print(f"{escape(str(target))}: every file is there, and no byte has changed")
+        screen.print(f"{escape(str(target))}: all files are present and unchanged")
         return
     shown = table("file", "fault", "detail")
     for fault in faults:
@@ -214,6 +214,6 @@ def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset
     screen.print(shown)
     files = "1 file is" if len(faults) == 1 else f"{len(faults)} files are"
     screen.print(
-        f"{files} missing, damaged or not part of the dataset. To mend it, run `stickslip pull` again.", style="red"
+        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` again.", style="red"
     )
     raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""Jobs: validating, submitting, listing, watching, pausing and cancelling them."""
+"""Commands for jobs: validate, submit, list, watch, pause, prioritise and cancel."""
 
 from typing import Annotated
 
@@ -38,7 +38,7 @@ PriorityOption = Annotated[int, typer.Option(min=-100, max=100, help=PRIORITY)]
 
 @shows_errors
 def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """Check a spec and count its samples, without submitting it. Works offline, too."""
+    """Check a spec and count its samples, without submitting it. Works offline."""
     document = read_spec(file)
     spec = check_spec(document, file)
     try:
@@ -65,7 +65,7 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
 def _validate_offline(spec: JobSpec, url: str) -> None:
     console().print(_counts(spec))
     say(
-        f"the spec is valid. No coordinator answers at {url}, so nothing is known of cached tasks and certificates. "
+        f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are unknown. "
         "To start one on this machine: stickslip up"
     )
 
@@ -133,7 +133,7 @@ def jobs(
 
 @shows_errors
 def show(job_id: JobArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """Show a job: its state, its progress, and which samples were rejected and why."""
+    """Show the state and progress of a job, and its rejected samples with reasons."""
     with Client(url) as client:
         job = client.job(job_id)
         if as_json:
@@ -223,7 +223,7 @@ def prioritise(
     priority: Annotated[int, typer.Argument(min=-100, max=100, help=PRIORITY)],
     url: UrlOption = DEFAULT_URL,
 ) -> None:
-    """Give a job another priority, from its next task on. What runs goes on."""
+    """Change the priority of a job, from its next task on. Running tasks continue."""
     with Client(url) as client:
         job = client.prioritise(job_id, priority)
     console().print(f"{job.id} has priority {job.priority}")

@@ -67,7 +67,7 @@ def rm(
     """
     parts = re.fullmatch(r"(ds-[0-9a-f]{16}):v([1-9]\d{0,8})", version)
     if parts is None:
-        raise ClientError(f"a version is written ds-0123456789abcdef:v1, and this is {version!r}")
+        raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {version!r}")
     with _owned(data, store, database) as (opened, files):
         from stickslip_services.queue.removing import remove
 

@@ -1,4 +1,4 @@
-"""Scenes of the user's own: simulating one."""
+"""The command that simulates a custom scene."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def simulate(
     obj: Annotated[bool, typer.Option("--obj", help="write an OBJ file for each sheet and frame, too")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate a scene of your own on this machine: sheets, bodies and motions from a file.
+    """Simulate a custom scene on this machine: sheets, bodies and motions from a file.
 
     Writes trajectory.npz and scene.json; exits with 1 if the solver did not converge. No coordinator is needed.
     """
@@ -35,7 +35,7 @@ def simulate(
     usual = Path("certificates") / scene.preset.value
     directory = certificate or (usual if usual.is_dir() else None)
     if directory is not None:
-        certifying.read_certificate(directory)  # what is no certificate is refused here, with the reason
+        certifying.read_certificate(directory)  # refuses an invalid certificate with the reason
     result = simulating.simulate(
         scene,
         file.parent,

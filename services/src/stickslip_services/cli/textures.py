@@ -1,4 +1,4 @@
-"""Textures of the user's own."""
+"""The command that uploads custom textures."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ def upload(
     url: UrlOption = DEFAULT_URL,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload pictures as textures, and print what a spec writes under `textures`."""
+    """Upload pictures as textures, and print their entries for `textures` in a spec."""
     found = []
     with Client(url) as client:
         for file in files:
@@ -29,10 +29,10 @@ def upload(
             try:
                 found.append(client.upload_texture(data))
             except ClientError as error:
-                raise ClientError(f"{file} was not taken: {error}") from error
+                raise ClientError(f"{file} was refused: {error}") from error
     if as_json:
         return print_json(found)
-    say("In a spec, with names of your own:")
+    say("In a spec, under any names:")
     console().print("textures:")
     for file, entry in zip(files, found, strict=True):
         console().print(f"  {_name(file)}: {entry.texture}")
@@ -40,6 +40,6 @@ def upload(
 
 
 def _name(file: Path) -> str:
-    """Return a name for a texture after its file."""
+    """Return the name of a texture, from the name of its file."""
     word = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in file.stem.lower())
-    return word.strip("-")[:60] or "own"
+    return word.strip("-")[:60] or "custom"

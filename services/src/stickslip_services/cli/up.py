@@ -1,4 +1,4 @@
-"""Running a coordinator and a dispatcher on this machine."""
+"""The command that runs a coordinator and a dispatcher on this machine."""
 
 import re
 from pathlib import Path
@@ -22,7 +22,7 @@ def _url_option(url: str) -> str:
 
 
 def _name(settings: "Settings") -> str:
-    """Return a name that no other dispatcher has: one of the same name would take its tasks away."""
+    """Return a unique name for the dispatcher: a second one of the same name would take over its tasks."""
     return "local" if settings.database is None else re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname()).lstrip("_.-")[:63]
 
 

@@ -1,4 +1,4 @@
-"""Workers: who is connected, and with which builds."""
+"""The command that lists workers."""
 
 from datetime import UTC, datetime
 
@@ -11,7 +11,7 @@ from stickslip_services.units import duration
 
 @shows_errors
 def workers(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """List the workers that have registered, newest first."""
+    """List the registered workers, newest first."""
     with Client(url) as client:
         found = client.workers()
     if as_json:

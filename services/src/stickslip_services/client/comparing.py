@@ -1,4 +1,4 @@
-"""What differs between two versions of datasets, by their manifests."""
+"""Differences between two dataset versions, by their manifests."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -12,7 +12,7 @@ from stickslip_schemas.spec.arrays import ArrayLayout
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One thing that is not the same in both."""
+    """A property with its values in both versions."""
 
     what: str
     a: str
@@ -20,7 +20,7 @@ class Difference:
 
 
 def differences(left: Contents, right: Contents) -> list[Difference]:
-    """Return what differs: spec, builds, certificate, arrays and labels, samples, rejections and files."""
+    """Return the differences in spec, builds, certificate, arrays and labels, samples, rejections and files."""
     a, b = left.manifest, right.manifest
     return [
         *_of_mappings("spec", _flat(a.spec.model_dump(mode="json")), _flat(b.spec.model_dump(mode="json"))),
@@ -69,13 +69,13 @@ def _counts(contents: Contents) -> dict[str, Any]:
 
 
 def _of_samples(a: Contents, b: Contents) -> Iterator[Difference]:
-    """Samples with one key were made from the same things by the same code."""
+    """Compare sample keys: equal keys mean equal inputs and builds."""
     keys_a, keys_b = ([bytes.fromhex(key) for key in contents.sample_keys()] for contents in (a, b))
     left, right = set(keys_a), set(keys_b)
     if left != right:
-        yield Difference("samples that only it has", str(len(left - right)), str(len(right - left)))
+        yield Difference("samples in this version only", str(len(left - right)), str(len(right - left)))
     elif keys_a != keys_b:
-        yield Difference("order of the samples", "another", "another")
+        yield Difference("order of the samples", "differs", "differs")
 
 
 def _of_files(a: Contents, b: Contents) -> Iterator[Difference]:
@@ -83,4 +83,4 @@ def _of_files(a: Contents, b: Contents) -> Iterator[Difference]:
     if left.keys() != right.keys():
         only_a = sum(size for digest, size in left.items() if digest not in right)
         only_b = sum(size for digest, size in right.items() if digest not in left)
-        yield Difference("bytes in files that only it has", str(only_a), str(only_b))
+        yield Difference("bytes of files in this version only", str(only_a), str(only_b))

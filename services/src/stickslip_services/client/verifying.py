@@ -1,4 +1,4 @@
-"""Verification of a dataset directory: its seal, its files, and nothing else beside them."""
+"""Verification of a dataset directory: its seal, its files, and the absence of other files."""
 
 import hashlib
 import os

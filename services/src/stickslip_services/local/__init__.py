@@ -1,1 +1,1 @@
-"""What runs on this machine: processes, sockets, logs, the certifying program."""
+"""Processes on this machine: `stickslip up`, the workers' program for certificates, locks, sockets and logs."""

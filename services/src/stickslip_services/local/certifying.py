@@ -1,6 +1,6 @@
-"""Certifying from the command line: the workers' own program measures, for it is their build that is certified.
+"""Measurement of certificates by the workers' program, whose build is certified.
 
-Nothing of the core is imported here; what comes back are two files.
+The core is not imported here: the program returns two files.
 """
 
 import os
@@ -18,14 +18,18 @@ PAGE_NAME = "certificate.html"
 
 
 class CertifyError(CommandError):
-    """There is no certificate."""
+    """The certificate is missing, damaged, or could not be measured."""
 
 
 def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
-    """Run the protocols of a preset, which tell of their progress on stderr; write the certificate into `out`."""
+    """Run the protocols of a preset and write the certificate into `out`; progress goes to standard error.
+
+    Raises:
+        CertifyError: The program failed, or `out` holds another certificate.
+    """
     program = [sys.executable, "-m", "stickslip_workers", "certify"]
     arguments = ["--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
-    # Threads of NumPy's linear algebra only disturb: the matrices of master curves are small.
+    # The matrices of master curves are too small for the threads of NumPy's linear algebra.
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
     try:
         ended = subprocess.run([*program, *arguments], env=environment, stdout=subprocess.PIPE, text=True, check=False)
@@ -33,7 +37,7 @@ def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
         raise CertifyError(f"the workers' program does not start: {error}") from error
     digest = ended.stdout.strip()
     if ended.returncode not in (0, 1) or not digest:
-        raise CertifyError(f"there is no certificate: the workers' program ended with status {ended.returncode}")
+        raise CertifyError(f"no certificate was made: the workers' program ended with status {ended.returncode}")
     certificate = read_certificate(out).certificate
     if certificate.digest != digest:
         raise CertifyError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
@@ -50,4 +54,6 @@ def read_certificate(directory: Path) -> CertificateUpload:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the document"
-        raise CertifyError(f"{directory / DOCUMENT_NAME} is no certificate: {place}: {first['msg']}") from error
+        raise CertifyError(
+            f"{directory / DOCUMENT_NAME} is not a valid certificate: {place}: {first['msg']}"
+        ) from error

@@ -1,4 +1,4 @@
-"""Simulating a scene of the user's own from the command line: the workers' own program does it."""
+"""Simulation of custom scenes by the workers' program."""
 
 import json
 import subprocess
@@ -13,13 +13,13 @@ from stickslip_services.errors import CommandError
 
 
 class SimulateError(CommandError):
-    """A scene that was not simulated."""
+    """The scene was not simulated."""
 
 
 def simulate(
     scene: SceneFile, folder: Path, out: Path, *, certificate: Path | None, allow_uncertified: bool, obj: bool
 ) -> dict[str, Any]:
-    """Run a scene whose files are in `folder`, which tells of its progress on stderr; return what `scene.json` says.
+    """Simulate a scene whose files are in `folder`, with progress on standard error; return what `scene.json` holds.
 
     Raises:
         SimulateError: It was not run.

@@ -1,8 +1,8 @@
-"""`stickslip up`: a coordinator and a dispatcher on this machine, kept alive until they are told to stop.
+"""`stickslip up`: a coordinator and a dispatcher on this machine, restarted until the supervisor stops.
 
-Everything lies below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (where it listens) and `lock` (two
-of them on one directory refuse). Children that die are started again, ever more slowly; one that keeps dying as soon as
-it starts ends the whole with its last words.
+All files are below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (the address) and `lock` (against a
+second supervisor). Children that die are restarted with growing delays. A child that dies repeatedly at its start ends
+the supervisor, which prints the end of its log.
 """
 
 import ctypes
@@ -29,19 +29,19 @@ from stickslip_services.local.process import listen, locked
 from stickslip_services.settings import Settings
 
 START_SECONDS = 180.0
-"""How long the coordinator may take until it answers [s]: migrations may be slow, and simulations have all cores."""
+"""Time limit for the coordinator's first answer [s]; migrations may be slow while simulations use all cores."""
 SOON_SECONDS = 5.0
 """A child that dies within this time of its start has failed to start [s]."""
 MAX_FAILED_STARTS = 5
 STOP_SECONDS = {"dispatcher": 6.0, "coordinator": 4.0}
-"""How long each child may take to stop before it is killed [s]."""
+"""Time limit for each child to stop before it is killed [s]."""
 _TICK = 0.1
 _PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
 class LocalService:
-    """What `stickslip up` runs."""
+    """Settings of `stickslip up`."""
 
     settings: Settings
     """Of the coordinator. `data` is an absolute path."""
@@ -59,14 +59,14 @@ class _Child:
     log: Path
     inherited: tuple[int, ...] = ()
     database: str | None = None
-    """URL of the database, with its password: only the environment of the process has it."""
+    """URL of the database with its password, passed in the environment of the process."""
     process: subprocess.Popen[bytes] | None = None
     started_at: float = 0.0
     failed_starts: int = 0
     start_again_at: float = field(default=0.0)
 
     def start(self) -> None:
-        """Start in a session of its own: Ctrl-C is for the supervisor, which then stops children in order."""
+        """Start in a new session, so that Ctrl-C reaches only the supervisor, which stops children in order."""
         environment = {name: value for name, value in os.environ.items() if name != DATABASE_VARIABLE}
         if self.database is not None:
             environment[DATABASE_VARIABLE] = self.database
@@ -84,14 +84,14 @@ class _Child:
         self.started_at = time.monotonic()
 
     def restart_if_dead(self, say: Callable[[str], None]) -> None:
-        """Start again if it has died; raise SupervisorError where that is of no use."""
+        """Restart the process if it has died; raise SupervisorError after too many failed starts."""
         if self.process is None:
             if time.monotonic() >= self.start_again_at:
                 self.start()
             return
         if not self._has_ended():
             return
-        self._kill_group()  # what it has left behind would be in the way of its successor
+        self._kill_group()  # its remaining processes would block the next one
         status = self.process.wait()
         self.process = None
         lived = time.monotonic() - self.started_at
@@ -107,7 +107,7 @@ class _Child:
         self.start_again_at = time.monotonic() + wait
 
     def stop(self, is_urgent: Callable[[], bool]) -> None:
-        """Ask it to stop, and kill it where it does not."""
+        """Stop the process; kill it if it takes too long."""
         if self.process is None:
             return
         if not self._has_ended():
@@ -127,7 +127,7 @@ class _Child:
         return "\n".join(f"  {line}" for line in lines[-15:]) or "  (empty)"
 
     def _has_ended(self) -> bool:
-        """Tell whether it has ended, but leave it a zombie: its number is its group's, and must not be given away."""
+        """Return whether it has ended. It stays a zombie, because its pid names its group and must not be reused."""
         assert self.process is not None
         return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
@@ -146,7 +146,7 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
     with ExitStack() as stack:
         lock = stack.enter_context(locked(data))
         signals = stack.enter_context(_stop_signals())
-        # The socket is the supervisor's: while the coordinator is started again, requests wait instead of failing.
+        # The supervisor owns the socket, so requests wait while the coordinator restarts.
         listener = _listen(settings.host, settings.port)
         stack.callback(listener.close)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
@@ -172,13 +172,13 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
                 time.sleep(_TICK)
             return 0
         finally:
-            for child in (dispatcher, coordinator):  # so that the dispatcher can still give its leases back
+            for child in (dispatcher, coordinator):  # the dispatcher first, which returns its leases
                 child.stop(lambda: len(signals) > 1)
             (data / "url").unlink(missing_ok=True)
 
 
 def print_line(stream: IO[str], message: str) -> None:
-    """Write a line at once."""
+    """Write a line with the time, and flush it."""
     stream.write(f"{time.strftime('%H:%M:%S')} {message}\n")
     stream.flush()
 
@@ -218,9 +218,9 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
 
 
 def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int]) -> bool:
-    """Return True when the coordinator answers, False if it is to stop before; raise SupervisorError."""
+    """Return True when the coordinator answers, False after a signal to stop; raise SupervisorError."""
     deadline = time.monotonic() + START_SECONDS
-    # Whose certificate it is does not matter here: the listening socket is ours.
+    # The certificate needs no check, because the supervisor owns the listening socket.
     with httpx.Client(base_url=settings.url, timeout=2.0, trust_env=False, verify=False) as client:
         while not signals:
             assert coordinator.process is not None
@@ -241,7 +241,7 @@ def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int
 
 @contextmanager
 def _stop_signals() -> Iterator[list[int]]:
-    """Collect signals to stop instead of dying of them."""
+    """Collect the numbers of the signals to stop."""
     caught: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -270,5 +270,5 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _die_with_parent() -> None:
-    """Let the kernel end this process when the supervisor dies, however it dies [prctl(2)]."""
+    """Make the kernel end this process when the supervisor dies [prctl(2)]."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

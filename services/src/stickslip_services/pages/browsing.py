@@ -16,7 +16,7 @@ SHOWN_THUMBS = 48
 
 
 def sliders(spec: JobSpec) -> list[dict[str, Any]]:
-    """Return the axes with more than one value: their names and, by place, their values."""
+    """Return the names and sorted values of the axes with more than one value."""
     columns: dict[str, set[Any]] = {name: set() for name in spec.named_axes}
     for point in islice(grid(spec), MOST_SAMPLES):
         for name, value in point.items():
@@ -25,7 +25,10 @@ def sliders(spec: JobSpec) -> list[dict[str, Any]]:
 
 
 def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, Any]:
-    """Return the samples whose axes lie between the sliders (`NAME.from`, `NAME.to`: places among the values)."""
+    """Return the context of `thumbs.html`: the samples within the sliders, from number `start` on.
+
+    The query has the ends of each slider, `NAME.from` and `NAME.to`, as indices into the values of the axis.
+    """
     wanted: dict[str, set[Any]] = {}
     for axis in sliders(data.manifest.spec):
         values = axis["values"]
@@ -52,19 +55,19 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
 
 
 def _pictured(data: SampleData) -> str | None:
-    """Return the array that holds pictures."""
+    """Return the name of the array of pictures, None for a dataset without pictures."""
     return next((name for name, array in data.arrays.items() if array.dimensions[-3:] == ("y", "x", "rgb")), None)
 
 
 def _telling_picture(data: SampleData) -> int:
-    """Return which picture stands for a sample: the middle of a clip, the first of several views."""
+    """Return the index of the picture that represents a sample: the middle of a clip, or the first view."""
     name = _pictured(data)
     array = None if name is None else data.arrays[name]
     return array.shape[0] // 2 if array is not None and array.dimensions[0] == "frame" else 0
 
 
 def histograms(data: SampleData) -> list[dict[str, Any]]:
-    """Return the distributions of the labels that are not axes, over the valid samples."""
+    """Return the distributions of the numeric labels that are not axes, over the valid samples."""
     valid = data.label("valid").astype(bool)
     shown = []
     for name, array in data.arrays.items():

@@ -82,17 +82,17 @@ class _Scale:
 
     @classmethod
     def of(cls, values: npt.NDArray[np.float64], *, is_log: bool, pad: float) -> "_Scale":
-        """Return a scale that holds all values, and a share `pad` more on both sides."""
+        """Return a scale that holds all values, extended by a share `pad` on both sides."""
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
         if is_log and low > 0.0:
             room = max((high / low) ** pad, 1.005) if high > low else 1.5
             return cls(low / room, high * room, True)
-        # A scale is never so fine that its numbers look the same.
+        # The range is at least 1 % of the values, so that the texts of ticks differ.
         room = max(pad * (high - low), 0.005 * max(abs(low), abs(high))) or 0.1
         return cls(low - room, high + room, False)
 
     def share(self, value: float) -> float:
-        """Return where a value lies, from 0 at the lower end to 1 at the upper one."""
+        """Return the position of a value, from 0 at the lower end to 1 at the upper one."""
         if self.is_log:
             return float(np.log(value / self.low) / np.log(self.high / self.low))
         return (value - self.low) / (self.high - self.low)

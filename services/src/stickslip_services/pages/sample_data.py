@@ -1,4 +1,4 @@
-"""What a page shows of one sample: its arrays, read from the shards in the store."""
+"""Arrays of single samples, read from the shards in the store."""
 
 from functools import lru_cache
 
@@ -21,7 +21,7 @@ Array = npt.NDArray[np.generic]
 
 
 class SampleData:
-    """The arrays of a version, by name; the files are found through its manifest."""
+    """The arrays of a version by name, whose files the manifest lists."""
 
     def __init__(self, store: Store, contents: Contents) -> None:
         self.contents = contents
@@ -56,7 +56,7 @@ class SampleData:
         return found
 
     def rejection(self, slot: int) -> Rejection | None:
-        """Return why a sample was rejected; None where it was not."""
+        """Return the rejection of a sample, None for a valid one."""
         rejections = self.contents.section(self.contents.number_of(slot)).rejections
         return next((rejection for rejection in rejections if rejection.slot == slot), None)
 
@@ -68,7 +68,7 @@ class SampleData:
         return file
 
     def named(self, array: ArrayLayout, value: Array) -> object:
-        """Return a label as people read it: the name of a code, a number, several numbers."""
+        """Return a label for display: the name of a code, a number, or several numbers."""
         if array.categories:
             code = int(value)
             return array.categories[code] if 0 <= code < len(array.categories) else "none"
@@ -76,7 +76,7 @@ class SampleData:
 
 
 def _chunk(store: Store, file: FileEntry, array: ArrayLayout, position: int, slots: int) -> Array:
-    """Return the value of the sample at `position` of a shard; raise KeyError where it was rejected."""
+    """Return the value of the sample at `position` of a shard; raise KeyError if it was rejected."""
     tail = shard_index_size(slots)
     index = decode_shard_index(store.read(file.sha256, offset=file.size - tail, length=tail), slots)
     offset, length = (int(value) for value in index[position])
@@ -90,7 +90,7 @@ def _chunk(store: Store, file: FileEntry, array: ArrayLayout, position: int, slo
 
 @lru_cache(maxsize=256)
 def _column(store: Store, digest: Sha256, array: ArrayLayout, slots: int) -> Array:
-    """Return the values of all samples of a file; artifacts never change, so it is read once."""
+    """Return the values of all samples of a file. Artifacts never change, so they are cached."""
     out = np.empty((slots, *array.shape), dtype=array.dtype)
     decode_chunk(store.read(digest), out)
     return out
