@@ -1,6 +1,6 @@
 """Internal: the C++ core. Use stickslip_sim_core."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated
 
 import numpy
@@ -99,6 +99,11 @@ def self_intersections(positions: Annotated[NDArray[numpy.float64], dict(shape=(
 def cloth_kernels() -> list[str]:
     """Internal: cloth kernels this processor can run, narrowest first."""
 
+def cloth_constants() -> dict[str, float]:
+    """
+    Internal: constants of the cloth solver by name; see cloth/constants.hpp.
+    """
+
 class StepReport:
     """How a step of cloth went."""
 
@@ -142,7 +147,7 @@ class StepReport:
 
     @property
     def pairs(self) -> int:
-        """Pairs of cloth with cloth that bear."""
+        """Pairs of cloth with cloth that bear a force."""
 
     @property
     def least_distance(self) -> float:
@@ -153,7 +158,7 @@ class StepReport:
 class ClothSolver:
     """Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp."""
 
-    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')] | None, edge_share: float, second_share: float, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int], surface_positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: Sequence[float]) -> None: ...
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')] | None, edge_share: float, second_share: float, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int], surface_positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: Sequence[float], constants: Mapping[str, float] = {}) -> None: ...
 
     def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], surfaces: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> None: ...
 
@@ -215,7 +220,7 @@ def cap_motion(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), 
 
 def feet(triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], x: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: float, points: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> tuple[Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], list[int]]:
     """
-    Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see contact/patches.hpp.
+    Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see contact/pn_triangles.hpp.
     """
 
 def pair_law(gap: float, normal: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], slip: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], force: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], mu: float, stiffness: float, along: float, across: float, smoothing: float = 0.0) -> tuple[int, Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float]:

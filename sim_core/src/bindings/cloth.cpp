@@ -3,6 +3,7 @@
 #include <nanobind/eigen/dense.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/function.h>
+#include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
@@ -11,6 +12,7 @@
 
 #include <algorithm>
 #include <functional>
+#include <map>
 #include <tuple>
 
 #include "cloth/intersections.hpp"
@@ -60,6 +62,9 @@ void bind_cloth(nb::module_& m) {
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def("cloth_kernels", &cloth_kernels, "Internal: cloth kernels this processor can run, narrowest first.");
+  m.def(
+      "cloth_constants", [] { return Constants().by_name(); },
+      "Internal: constants of the cloth solver by name; see cloth/constants.hpp.");
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")
       .def_ro("converged", &StepReport::converged)
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
@@ -73,7 +78,7 @@ void bind_cloth(nb::module_& m) {
       .def_ro("halvings", &StepReport::halvings)
       .def_ro("contacts", &StepReport::contacts)
       .def_ro("sliding", &StepReport::sliding)
-      .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear.")
+      .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear a force.")
       .def_ro("least_distance", &StepReport::least_distance,
               "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
@@ -86,7 +91,8 @@ void bind_cloth(nb::module_& m) {
              const std::vector<double>& thickness, const std::optional<Eigen::MatrixXd>& mu, double edge_share,
              double second_share, const Triangles& surface_triangles,
              const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
-             const std::vector<double>& crease) {
+             const std::vector<double>& crease, const std::map<std::string, double>& changed) {
+            const Constants constants(changed);
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, {stretching}, rigidity, damping});
@@ -95,15 +101,17 @@ void bind_cloth(nb::module_& m) {
                 rest, triangles, list, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
                 {step_error, coarsest, finest}, kernel,
-                mu ? std::optional<PairSettings>(
-                         {thickness, *mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share})
+                mu ? std::optional<ContactMaterials>({thickness, *mu,
+                                                      static_cast<int>(thickness.size() - crease.size()), edge_share,
+                                                      second_share, constants.contact.surface_share})
                    : std::nullopt,
-                {surface_triangles, surface_of_vertex, surface_positions, crease});
+                {surface_triangles, surface_of_vertex, surface_positions, crease}, constants);
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
           "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
           "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "edge_share"_a, "second_share"_a,
-          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
+          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a,
+          "constants"_a = std::map<std::string, double>())
       .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a)
       .def(
           "step",

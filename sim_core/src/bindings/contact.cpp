@@ -12,8 +12,8 @@
 #include "cloth/mesh.hpp"
 #include "contact/nearest.hpp"
 #include "contact/pair_law.hpp"
-#include "contact/patches.hpp"
 #include "contact/path.hpp"
+#include "contact/pn_triangles.hpp"
 
 namespace sim_core {
 
@@ -37,7 +37,7 @@ std::vector<std::array<int, 3>> triples_of(const Triangles& triangles) {
 }
 
 Surface surface_of(const Triangles& triangles, const Points3& x) {
-  return {triples_of(triangles), std::vector<int>(x.rows(), 0), Felt::Constant(1, 1, true)};
+  return {triples_of(triangles), std::vector<int>(x.rows(), 0), CollisionMask::Constant(1, 1, true)};
 }
 
 Buffer<double> buffer_of(const Points3& x) {
@@ -83,7 +83,7 @@ void bind_contact(nb::module_& m) {
       "feet",
       [](const Triangles& triangles, const Points3& x, double crease, const Points3& points) {
         const Buffer<double> at = buffer_of(x);
-        const Patches patches(triples_of(triangles), at, std::vector<double>(triangles.rows(), crease));
+        const PNTriangles patches(triples_of(triangles), at, std::vector<double>(triangles.rows(), crease));
         const TriangleTree tree(patches.triangles(), at);
         const PatchShape shape = patches.shape(at);
         Eigen::VectorXd height = Eigen::VectorXd::Constant(points.rows(), std::numeric_limits<double>::quiet_NaN());
@@ -104,14 +104,14 @@ void bind_contact(nb::module_& m) {
       },
       "triangles"_a, "x"_a, "crease"_a, "points"_a,
       "Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see "
-      "contact/patches.hpp.");
+      "contact/pn_triangles.hpp.");
   m.def(
       "pair_law",
       [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force,
          double mu, double stiffness, double along, double across, double smoothing) {
-        const PairSight sight{gap, normal, slip, force, mu, stiffness, along, across, smoothing};
-        const PairRow row = pair_row(sight);
-        return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(sight));
+        const PairKinematics at{gap, normal, slip, force, mu, stiffness, along, across, smoothing};
+        const PairLinearization row = linearize(at);
+        return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(at));
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a, "smoothing"_a = 0.0,
       "Internal: mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.");

@@ -4,17 +4,10 @@
 #include <cmath>
 
 namespace sim_core {
-namespace {
-
-// A matrix of bending is assembled again when its stiffening has changed by more.
-constexpr float stiffening_change = 0.03f;
-// s from which a triangle is a fold whose part of the matrix is worth its cost.
-constexpr double fold_smallest = 0.01;
-
-}  // namespace
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
-                   const std::vector<std::int32_t>& held, const Edges& clamped, int others)
+                   const std::vector<std::int32_t>& held, const Edges& clamped, int others,
+                   const FactorSettings& settings)
     : kernel(kernel_in),
       stencils(bending_stencils(mesh, fabrics, clamped)),
       compact_stencils(bending_stencils(mesh, fabrics, clamped, true)),
@@ -31,7 +24,8 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fa
       diagonal_(numbering.free_nodes, 0.0f),
       stiffening_(2 * mesh.triangles.rows(), 0.0f),
       assembled_stiffening_(2 * mesh.triangles.rows(), -1.0f),
-      unused_(4L * numbering.nodes, 0.0) {
+      unused_(4L * numbering.nodes, 0.0),
+      settings_(settings) {
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     const ClothProperties& fabric = fabrics.at(t);
     rigidity_scale_.push_back(static_cast<float>(1.0 / fabric.rigidity.cwiseAbs().maxCoeff()));
@@ -64,8 +58,8 @@ void Assembly::reserve_folds() {
   fold_nodes_.assign(data.begin[data.triangles], 0);
   fold_vectors_.assign(8L * data.begin[data.triangles], 0.0f);
   fold_coefficients_.assign(2L * data.triangles, 0.0f);
-  folds_ = {numbering.free_nodes,     fold_smallest, 0, fold_begin_.data(), fold_nodes_.data(), fold_vectors_.data(),
-            fold_coefficients_.data()};
+  folds_ = {numbering.free_nodes, settings_.fold_smallest,  0, fold_begin_.data(), fold_nodes_.data(),
+            fold_vectors_.data(), fold_coefficients_.data()};
 }
 
 void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
@@ -73,7 +67,7 @@ void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   if (with_matrix) std::fill(blocks_.begin(), blocks_.end(), 0.0f);
   membrane_energy =
       kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, definite);
-  folds_.smallest = exact ? 0.0 : fold_smallest;
+  folds_.smallest = exact ? 0.0 : settings_.fold_smallest;
   bending_energy =
       kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(), with_matrix ? &folds_ : nullptr);
   if (with_matrix) assemble_bending();
@@ -85,7 +79,7 @@ void Assembly::assemble_bending() {
     change_max = std::max({change_max, std::abs(stiffening_[2 * t] - assembled_stiffening_[2 * t]),
                            rigidity_scale_[t] * std::abs(stiffening_[2 * t + 1] - assembled_stiffening_[2 * t + 1])});
   }
-  if (!exact && !(change_max > stiffening_change)) return;
+  if (!exact && !(change_max > static_cast<float>(settings_.stiffening_change))) return;
   std::fill(scalars_.begin(), scalars_.end(), 0.0f);
   kernel.bending_matrix(bending_.data(), stiffening_.data(), scalars_.data());
   assembled_stiffening_ = stiffening_;

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "cloth/bending.hpp"
+#include "cloth/factor_settings.hpp"
 #include "cloth/membrane.hpp"
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
@@ -23,7 +24,8 @@ class Assembly {
  public:
   // `others`: vertices of surfaces.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, const Edges& clamped, int others);
+           const std::vector<std::int32_t>& held, const Edges& clamped, int others,
+           const FactorSettings& settings = {});
   Assembly(const Assembly&) = delete;
 
   const ClothKernel kernel;
@@ -68,6 +70,7 @@ class Assembly {
   Buffer<float> scalars_, blocks_, diagonal_;
   Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)
   Buffer<double> unused_;
+  FactorSettings settings_;
   std::vector<int> fold_begin_, fold_nodes_;
   Buffer<float> fold_vectors_, fold_coefficients_;
   FoldData folds_{}, no_folds_{};

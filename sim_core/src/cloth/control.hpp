@@ -23,7 +23,7 @@ using Motion = std::function<Drive(double time)>;
 
 class StepController {
  public:
-  StepController(Stepper& stepper, const StepControl& control);
+  StepController(Stepper& stepper, const StepControl& control, const ControlSettings& constants);
 
   // From `begin` to `end` [s], an interval that is as long as all others.
   StepReport advance(double begin, double end, const Motion& motion);
@@ -31,11 +31,13 @@ class StepController {
 
  private:
   int ticks(int level) const;
+  double work_of(const StepReport& report) const;
   void learn(int level, double work, double progress);
   bool worth_growing(int level) const;
 
   Stepper& stepper_;
   StepControl control_;
+  ControlSettings constants_;
   int coarsest_, finest_, last_, level_;  // log2 of steps in an interval; `last_`: of the shortest
   std::vector<double> cost_;              // by level: work per interval of late, 0 where unknown
 };

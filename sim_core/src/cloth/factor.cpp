@@ -4,12 +4,6 @@
 #include <cmath>
 
 namespace sim_core {
-namespace {
-
-// Factors that are kept.
-constexpr std::size_t pool_size = 3;
-
-}  // namespace
 
 StaleFactor::StaleFactor(const Numbering& numbering)
     : storage_(numbering.compact_bending, numbering.membrane, numbering.dissection),
@@ -54,7 +48,7 @@ void FactorCost::spent(int iterations) {
 
 bool StaleFactor::fits(double dt) const { return made_ && std::abs(dt - dt_) <= 1e-9 * dt_; }
 
-FactorPool::FactorPool(const Numbering& numbering) : numbering_(numbering) {
+FactorPool::FactorPool(const Numbering& numbering, int size) : numbering_(numbering), size_(size) {
   factors_.push_back(std::make_unique<StaleFactor>(numbering));
 }
 
@@ -62,7 +56,7 @@ StaleFactor& FactorPool::of(double dt) {
   std::size_t place = 0;
   while (place < factors_.size() && !factors_[place]->fits(dt)) ++place;
   if (place == factors_.size()) {
-    if (place < pool_size) {
+    if (place < size_) {
       factors_.push_back(std::make_unique<StaleFactor>(numbering_));
     } else {
       --place;

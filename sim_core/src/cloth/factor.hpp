@@ -62,7 +62,8 @@ class StaleFactor {
 // Factors for the lengths of step of late: one that is known again is not made again.
 class FactorPool {
  public:
-  explicit FactorPool(const Numbering& numbering);
+  // `size`: factors that are kept.
+  FactorPool(const Numbering& numbering, int size);
 
   // That for steps of dt, or one to be made in place of the one that was needed least recently.
   StaleFactor& of(double dt);
@@ -71,6 +72,7 @@ class FactorPool {
  private:
   std::vector<std::unique_ptr<StaleFactor>> factors_;  // the latest first
   const Numbering& numbering_;
+  std::size_t size_;
 };
 
 }  // namespace sim_core

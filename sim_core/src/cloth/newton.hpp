@@ -4,12 +4,7 @@
 #include <memory>
 #include <vector>
 
-#include "cloth/assembly.hpp"
-#include "cloth/factor.hpp"
-#include "cloth/pair_factor.hpp"
-#include "cloth/settings.hpp"
-#include "contact/pairs.hpp"
-#include "contact/state.hpp"
+#include "cloth/correction.hpp"
 
 namespace sim_core {
 
@@ -29,14 +24,14 @@ struct StepOutcome {
 
 class Newton {
  public:
-  Newton(Assembly& assembly, const ClothSettings& settings);
+  Newton(Assembly& assembly, const ClothSettings& settings, const Constants& constants);
   Newton(const Newton&) = delete;
 
   ContactState contact;
-  FactorPool factors;
-  std::unique_ptr<Pairs> pairs;  // of cloth with cloth; null where it does not feel itself
-  Buffer<double> residual;       // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
   ClothPhases phases;
+  Correction correction;
+  std::unique_ptr<ContactSet> pairs;  // null without self-contact and surfaces
+  Buffer<double> residual;            // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
   // Iterations in a row that are stopped short, or take all rounds, after which an attempt is given up.
   int strained_max = 0;
 
@@ -56,22 +51,20 @@ class Newton {
  private:
   // `share`: of the last changes of the pairs' forces.
   Norms look(const StepProblem& problem, const Buffer<double>& x, double share = 0.0);
-  void correct(const StepProblem& problem, const Buffer<double>& x, double krylov_tolerance, StepReport& report);
-  void correct_with_pairs(const StepProblem& problem, const Buffer<double>& x, StepReport& report);
-  KrylovResult solve_linear(const Factor& factor, double krylov_tolerance);
-  void subtract_corrections();
+  void begin(const StepProblem& problem, Buffer<double>& x, bool from_rest, bool smoothly);
+  Norms move(const StepProblem& problem, const Buffer<double>& x, double share, bool smoothly);
+  void choose_matrix(const Buffer<double>& x, double before, double now, bool whole);
   bool arrived(const Buffer<double>& x) const;
   double reach() const;
   bool sharpen(const StepProblem& problem, const Buffer<double>& x, double share, Norms& norms);
 
   Assembly& assembly_;
   ClothSettings settings_;
-  PairFactor pair_factor_;
-  PairData pair_rows_{};
-  bool strained_ = false;  // whether the last correction was stopped short or took all rounds
+  NewtonSettings constants_;
+  double law_stiffness_, length_tolerance_;  // see ContactSettings
+  bool strained_ = false;                    // whether the last correction was stopped short or took all rounds
   Buffer<double> trial_, wanted_, best_, ends_;
   std::vector<double> own_stiffness_;  // of contacts, without that of pairs, N/m
-  Buffer<float> change_, work_, image_, force_;
 };
 
 }  // namespace sim_core

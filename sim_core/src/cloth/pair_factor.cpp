@@ -6,25 +6,20 @@
 namespace sim_core {
 namespace {
 
-// Nodes that may be held otherwise than in the factor, over the pairs; and what may have no place in its pattern.
-constexpr double changed_share = 0.01, missing_share = 0.05;
-// A node is held otherwise if that has changed by more than this share, and by more than this share of its own
-// stiffness.
-constexpr float hold_change = 0.5f, hold_least = 0.1f;
 // Pinned nodes in a front.
 constexpr std::size_t pins_together = tile_columns / 3;
 
 }  // namespace
 
-double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const Pairs& pairs,
-                         double dt, const ClothSettings& settings) {
+double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
+                         const ContactSet& pairs, double dt, const ClothSettings& settings) {
   collect(pairs, assembly.numbering.free_nodes);
   const int changed = compare(assembly, contact);
   const double count = static_cast<double>(wanted_.size());
   // Under a smoothed law all pairs change all the time.
   bool whole = !made_ || pairs.smoothing > 0.0 || std::abs(dt - dt_) > 1e-9 * dt_ || cost_.too_much(settings);
-  if (!whole && !(changed > changed_share * count)) return 0.0;
-  if (!made_ || missing(contact) > missing_share * count) {
+  if (!whole && !(changed > constants_.changed_share * count)) return 0.0;
+  if (!made_ || missing(contact) > constants_.missing_share * count) {
     order(assembly, x, contact, pairs);
     compare(assembly, contact);
     whole = true;
@@ -45,10 +40,10 @@ double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Cont
   return share;
 }
 
-void PairFactor::collect(const Pairs& pairs, int free_nodes) {
+void PairFactor::collect(const ContactSet& pairs, int free_nodes) {
   wanted_.clear();
   for (const Pair& pair : pairs.list()) {
-    if (!pair.bears()) continue;
+    if (!pair.active()) continue;
     Entry entry;
     for (int c = 0; c < 4; ++c) {
       const int node = pair.who.node[c];
@@ -74,6 +69,8 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
   }
   holds_ = bodies_;
   for (const Entry& entry : wanted_) add_holds(entry, holds_);
+  const float hold_change = static_cast<float>(constants_.hold_change);
+  const float hold_least = static_cast<float>(constants_.hold_least);
   int changed = 0;
   for (std::size_t i = 0; i < free_nodes; ++i) {
     const float difference = (holds_[i] - held_[i]).squaredNorm();
@@ -120,7 +117,7 @@ bool PairFactor::has_place(const Entry& entry) const {
 }
 
 void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
-                       const Pairs& pairs) {
+                       const ContactSet& pairs) {
   const Numbering& numbering = assembly.numbering;
   const int free_nodes = numbering.free_nodes;
   pinned_.resize(free_nodes);

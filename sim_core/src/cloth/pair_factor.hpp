@@ -10,24 +10,25 @@
 
 #include "cloth/assembly.hpp"
 #include "cloth/factor.hpp"
+#include "cloth/factor_settings.hpp"
 #include "cloth/fronts.hpp"
 #include "cloth/settings.hpp"
-#include "contact/pairs.hpp"
+#include "contact/contact_set.hpp"
 #include "contact/state.hpp"
 
 namespace sim_core {
 
 class PairFactor {
  public:
-  PairFactor() = default;
+  explicit PairFactor(const FactorSettings& constants) : constants_(constants) {}
   PairFactor(const PairFactor&) = delete;
 
   const Factor& view() const { return view_; }
 
   // Makes it anew if it is of another length of step or has cost more GMRES iterations than a new one would; where too
   // many nodes are held otherwise by pairs and bodies, those parts that hold them. Returns the share that was made.
-  double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const Pairs& pairs, double dt,
-               const ClothSettings& settings);
+  double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const ContactSet& pairs,
+               double dt, const ClothSettings& settings);
   void spent(int iterations) { cost_.spent(iterations); }
 
  private:
@@ -39,10 +40,10 @@ class PairFactor {
   };
   using Hold = Eigen::Matrix<float, 6, 1>;  // xx xy xz yy yz zz, N/m
 
-  void collect(const Pairs& pairs, int free_nodes);
+  void collect(const ContactSet& pairs, int free_nodes);
   int compare(const Assembly& assembly, const ContactState& contact);
   int missing(const ContactState& contact) const;
-  void order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const Pairs& pairs);
+  void order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const ContactSet& pairs);
   void enter(bool whole);
   void read_matrix(Assembly& assembly, const Buffer<double>& x);
   void make(const Assembly& assembly);
@@ -52,6 +53,7 @@ class PairFactor {
   template <class Call>
   void visit(const Entry& entry, const Call& call) const;
 
+  FactorSettings constants_;
   std::vector<int> order_, place_;  // nodes by place, and back
   std::vector<char> pinned_;        // nodes that stuck when the order was made
   Pattern bending_, membrane_;      // in places; both have those of pairs

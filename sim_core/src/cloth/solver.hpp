@@ -10,32 +10,26 @@
 #include <utility>
 #include <vector>
 
+#include "cloth/constants.hpp"
+#include "cloth/contact_setup.hpp"
 #include "cloth/control.hpp"
 #include "cloth/properties.hpp"
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
-#include "contact/pair_settings.hpp"
+#include "contact/materials.hpp"
 
 namespace sim_core {
-
-// Triangles that are no cloth, which surface each of their vertices belongs to, where these are at first, and the angle
-// from which edges of each surface stay sharp, rad.
-struct SurfaceMeshes {
-  Triangles triangles;
-  std::vector<std::int32_t> surface_of_vertex;
-  Points3 positions;
-  std::vector<double> crease;
-};
 
 class ClothSolver {
  public:
   // `kernel`: level of the kernels, "" for the widest that this processor runs. `fabrics`: one, or one of each sheet.
   // `held`: vertices whose positions are prescribed; `clamped`: boundary edges whose outward slope is prescribed;
-  // `touch`: how the sheets, and then the surfaces, feel each other, if any do.
+  // `touch`: contact among the sheets and then the surfaces, if any touch.
   ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
               const StepControl& control, const std::string& kernel = "",
-              const std::optional<PairSettings>& touch = std::nullopt, const SurfaceMeshes& surfaces = {});
+              const std::optional<ContactMaterials>& touch = std::nullopt, const SurfaceMeshes& surfaces = {},
+              const Constants& constants = {});
   ~ClothSolver();
 
   // `surfaces`: positions of their vertices.

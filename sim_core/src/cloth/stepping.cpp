@@ -7,32 +7,17 @@
 
 namespace sim_core {
 
-namespace {
-
-// Tolerance of GMRES where a step does not converge with that of the preset.
-constexpr double loose = 0.1;
-// Iterations up to which steps may grow again, of those that a step may take.
-constexpr double easy = 0.6;
-// Times the patience where pairs matter: then halves of a step are hardly easier than the whole.
-constexpr double near_pairs = 2.5;
-// Iterations in a row that strain the cloth, after which an attempt is given up: of a step that may be halved at once,
-// and of one for which halving comes last.
-constexpr int strained_soon = 2, strained_long = 4;
-// Iterations by way of a smoothed law.
-constexpr int smooth_iterations = 100;
-
-}  // namespace
-
-Stepper::Stepper(Assembly& assembly, const ClothSettings& settings)
+Stepper::Stepper(Assembly& assembly, const ClothSettings& settings, const Constants& constants)
     : x(4L * assembly.numbering.nodes, 0.0),
       v(x),
-      newton(assembly, settings),
+      newton(assembly, settings, constants),
       assembly_(assembly),
       settings_(settings),
+      constants_(constants.stepping),
       start_(x),
       inertial_(x),
       predicted_(x) {
-  newton.strained_max = strained_long;
+  newton.strained_max = constants_.strained_long;
 }
 
 void Stepper::restart() {
@@ -65,20 +50,25 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
   }
 }
 
-int Stepper::patience() const { return static_cast<int>((near() ? near_pairs : 1.0) * settings_.patience); }
+int Stepper::patience(bool near) const {
+  return static_cast<int>((near ? constants_.near_patience : 1.0) * settings_.patience);
+}
 
-bool Stepper::near() const { return newton.pairs && newton.pairs->matter(); }
+bool Stepper::easy(int iterations, bool near) const { return iterations <= constants_.easy * patience(near); }
+
+bool Stepper::near() const { return newton.pairs && newton.pairs->relevant(); }
 
 // Where Newton's method fails near other cloth: with stiff pairs, else by way of a smoothed law.
 StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report) {
   x = driven;
   newton.pairs->stiff = true;
-  const StepOutcome outcome = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
+  const StepOutcome outcome =
+      newton.solve(problem, x, false, patience(near()), report, settings_.krylov_tolerance, false);
   newton.pairs->stiff = false;
   if (outcome.converged) return outcome;
   x = driven;
   assembly_.definite = true;
-  return newton.solve(problem, x, false, smooth_iterations, report, settings_.krylov_tolerance, true);
+  return newton.solve(problem, x, false, constants_.smooth_iterations, report, settings_.krylov_tolerance, true);
 }
 
 // Solves for the state at the end of a part of a step. Where that fails it does nothing, unless no part is shorter:
@@ -96,14 +86,14 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
   const bool deepest = halvings_ == settings_.halvings_max;
   assembly_.definite = halvings_ > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
-  StepOutcome outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(), report,
+  StepOutcome outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(near()), report,
                                      settings_.krylov_tolerance, false);
   // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
   if (!outcome.converged && near()) outcome = solve_hard(problem, driven, report);
   if (!outcome.converged && (deepest || !near())) {
     x = driven;
     outcome = newton.solve(problem, x, deepest, settings_.newton_max, report,
-                           std::max(loose, settings_.krylov_tolerance), false);
+                           std::max(constants_.loose, settings_.krylov_tolerance), false);
   }
   if (!outcome.converged && !deepest) {
     x = start_;
@@ -139,9 +129,9 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, x, predicted_, false);
-  newton.strained_max = strained_soon;
-  tried_ = newton.solve(problem, x, false, patience(), report, settings_.krylov_tolerance, false);
-  newton.strained_max = strained_long;
+  newton.strained_max = constants_.strained_soon;
+  tried_ = newton.solve(problem, x, false, patience(near()), report, settings_.krylov_tolerance, false);
+  newton.strained_max = constants_.strained_long;
   tried_dt_ = dt;
   return tried_.converged;
 }
@@ -168,7 +158,7 @@ void Stepper::count_contacts(StepReport& report) const {
     report.contacts += mode != contact_open;
     report.sliding += mode == contact_slip;
   }
-  if (newton.pairs) report.pairs = newton.pairs->bearing();
+  if (newton.pairs) report.pairs = newton.pairs->active_count();
 }
 
 void Stepper::check(double dt, const Drive& drive) {
@@ -198,7 +188,7 @@ StepReport Stepper::step(double dt, const Drive& drive) {
   const auto size = [&] { return all >> halvings_; };
   int hardest = 0;
   const auto ease = [&](int iterations) {
-    if (halvings_ > 0 && iterations <= easy * patience()) --halvings_;
+    if (halvings_ > 0 && easy(iterations, near())) --halvings_;
   };
   for (int tick = 0; tick < all;) {
     while (tick % size() != 0) ++halvings_;

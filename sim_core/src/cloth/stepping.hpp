@@ -19,7 +19,7 @@ struct Drive {
 
 class Stepper {
  public:
-  Stepper(Assembly& assembly, const ClothSettings& settings);
+  Stepper(Assembly& assembly, const ClothSettings& settings, const Constants& constants);
   Stepper(const Stepper&) = delete;
 
   Buffer<double> x, v;  // (nodes, 4), m, m/s
@@ -34,8 +34,10 @@ class Stepper {
   bool attempt(double dt, const Drive& drive, StepReport& report);
   void accept(const Drive& drive, StepReport& report);
   void reject();
-  // Whether pairs mattered in the last attempt.
+  // Whether pairs mattered in the last attempt, and whether a step of so many iterations is easy there: longer ones may
+  // follow.
   bool near() const;
+  bool easy(int iterations, bool near) const;
   // Largest distance of a free node from where it was predicted in the last attempt, m.
   double missed() const;
 
@@ -46,7 +48,7 @@ class Stepper {
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
 
  private:
-  int patience() const;
+  int patience(bool near) const;
   StepOutcome solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report);
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);
@@ -56,6 +58,7 @@ class Stepper {
 
   Assembly& assembly_;
   ClothSettings settings_;
+  SteppingSettings constants_;
   Buffer<double> start_, inertial_, predicted_;
   StepOutcome tried_{false, 0.0};
   double tried_dt_ = 0.0, last_dt_ = 0.0;

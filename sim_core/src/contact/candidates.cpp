@@ -140,7 +140,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     if (cell < 0) continue;
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
       const auto& corner = surface.triangles[*t];
-      if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any() || !surface.feel(vertex, corner[0])) continue;
+      if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any() || !surface.may_touch(vertex, corner[0])) continue;
       if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
       add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
                   reach);
@@ -156,12 +156,12 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     around.take(boxes, begin, end);
     for (const int* i = begin; i < end; ++i) {
       const auto& a = surface.edges[*i];
-      if (a[0] > surface.last_felt[surface.sheet_of_node[a[0]]]) continue;  // none of those to come is felt
+      if (a[0] > surface.last_collider[surface.sheet_of_node[a[0]]]) continue;  // nothing beyond touches it
       const std::vector<char>& meet = around.meeting(static_cast<int>(i - begin));
       for (const int* j = i + 1; j < end; ++j) {
         if (!meet[j - begin]) continue;
         const auto& b = surface.edges[*j];
-        if (!surface.feel(a[0], b[0])) continue;
+        if (!surface.may_touch(a[0], b[0])) continue;
         if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1]) continue;
         // Boxes that meet in many cells count in the one with the lowest corner of what they share.
         if (edges.cell_at(boxes[*i].low.max(boxes[*j].low)) != cell) continue;

@@ -22,8 +22,8 @@ struct Candidate {
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x);
 
-// All pairs of sheets that feel each other, without a common node, that are within `reach` at x: vertices and triangles
-// first, sorted by (first, second). By a grid of cells about as large as a triangle.
+// All pairs of sheets that touch each other, without a common node, that are within `reach` at x: vertices and
+// triangles first, sorted by (first, second). By a grid of cells about as large as a triangle.
 std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach);
 
 }  // namespace sim_core

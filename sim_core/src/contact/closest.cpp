@@ -14,8 +14,7 @@ namespace {
 
 // Segments whose squared sine is below this are taken for parallel: their closest points are not unique to rounding.
 constexpr double parallel = 1e-14;
-// Of what is left of the distance, so much is advanced at a time, at most; and how often at most.
-constexpr double advance_share = 0.9;
+// Advances that end a search which converges no further.
 constexpr int advances_max = 1000;
 
 Eigen::Vector2d closest_on_segments(const FourPoints& x) {
@@ -102,7 +101,7 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, cons
     // The distance is at least `least` up to here, and above 0 up to `next`.
     const double safe = share + (distance - least) / fastest;
     if (safe >= 1.0) return 1.0;
-    const double next = std::min(1.0, share + std::max(advance_share * distance, distance - least) / fastest);
+    const double next = std::min(1.0, share + std::max(leaves.advance * distance, distance - least) / fastest);
     for (int i = 0; i < 4; ++i) at[i] = x[i] + next * motion[i];
     const double before = std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());
     if (distance < least) return share + (before - least) / fastest;

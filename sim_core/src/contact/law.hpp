@@ -22,7 +22,7 @@
 namespace sim_core {
 
 // What a contact sees at the iterate at hand.
-struct ContactSight {
+struct ContactKinematics {
   double gap;              // m
   Eigen::Vector3d normal;  // of the body, outward
   Eigen::Vector3d slip;    // m: of the cloth over the body since the start of the step, in the tangent plane
@@ -33,7 +33,7 @@ struct ContactSight {
 
 // The branch that holds there, and its row of Newton's system. `force` is the right-hand side in the directions that
 // are free, `correction` the displacement in those that are not.
-struct ContactRow {
+struct ContactLinearization {
   int mode;                    // ContactMode
   Eigen::Vector3d direction;   // t
   Eigen::Vector3d force;       // N
@@ -43,11 +43,12 @@ struct ContactRow {
   double error_squared;        // N^2: by how far the law is missed
 };
 
-ContactRow open_row(const Eigen::Vector3d& force);
-ContactRow closed_row(const ContactSight& sight);
+ContactLinearization open_row(const Eigen::Vector3d& force);
+// `turning_max`: bound of `turning` over the stiffness k, from which a contact is as good as stuck.
+ContactLinearization closed_row(const ContactKinematics& at, double turning_max);
 
 // The rows of a branch that is chosen, whatever the law says at the iterate.
-ContactRow sticking_row(const ContactSight& sight);
-ContactRow slipping_row(const ContactSight& sight, const Eigen::Vector3d& direction, double turning);
+ContactLinearization sticking_row(const ContactKinematics& at);
+ContactLinearization slipping_row(const ContactKinematics& at, const Eigen::Vector3d& direction, double turning);
 
 }  // namespace sim_core

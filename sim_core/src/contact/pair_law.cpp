@@ -13,20 +13,22 @@ using Eigen::Vector3d;
 
 namespace {
 
-PairRow open_row(const PairSight& sight) { return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -sight.force}; }
-
-PairRow stick_row(const PairSight& sight) {
-  const Vector3d& n = sight.normal;
-  const Matrix3d stiffness = sight.across * Matrix3d::Identity() + (sight.along - sight.across) * n * n.transpose();
-  return {contact_stick, stiffness, stiffness, -sight.along * sight.gap * n - sight.across * sight.slip};
+PairLinearization open_row(const PairKinematics& at) {
+  return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -at.force};
 }
 
-PairRow slip_row(const PairSight& sight) {
-  const Vector3d& n = sight.normal;
-  const double kappa = sight.along, lambda = sight.across, k = sight.stiffness;
-  const double pressing = std::max(sight.force.dot(n), 0.0);
-  const Vector3d tangential = sight.force - sight.force.dot(n) * n, tau = tangential - k * sight.slip;
-  const double size = tau.norm(), bound = sight.mu * pressing;
+PairLinearization stick_row(const PairKinematics& at) {
+  const Vector3d& n = at.normal;
+  const Matrix3d stiffness = at.across * Matrix3d::Identity() + (at.along - at.across) * n * n.transpose();
+  return {contact_stick, stiffness, stiffness, -at.along * at.gap * n - at.across * at.slip};
+}
+
+PairLinearization slip_row(const PairKinematics& at) {
+  const Vector3d& n = at.normal;
+  const double kappa = at.along, lambda = at.across, k = at.stiffness;
+  const double pressing = std::max(at.force.dot(n), 0.0);
+  const Vector3d tangential = at.force - at.force.dot(n) * n, tau = tangential - k * at.slip;
+  const double size = tau.norm(), bound = at.mu * pressing;
   const Vector3d t = size > 0.0 ? Vector3d(tau / size) : Vector3d(n.unitOrthogonal());
   const double beta = size > 0.0 ? std::min(bound / size, 1.0) : 0.0;
   // s = beta k/(1 - beta) and s/(beta k) = 1/(1 - beta), or lambda in place of s.
@@ -36,10 +38,9 @@ PairRow slip_row(const PairSight& sight) {
   const Matrix3d across = Matrix3d::Identity() - n * n.transpose() - t * t.transpose();
   const Matrix3d symmetric = kappa * n * n.transpose() + side * across;
   const double turns = soft ? 1.0 : (1.0 - beta) * pull;
-  return {contact_slip, symmetric + sight.mu * kappa * t * n.transpose(), symmetric,
-          -kappa * sight.gap * n + (bound - t.dot(tangential) - sight.mu * kappa * sight.gap) * t -
-              pull * (across * tangential),
-          pressing * (t * t.transpose() + turns * across) + sight.mu * t * tangential.transpose()};
+  return {contact_slip, symmetric + at.mu * kappa * t * n.transpose(), symmetric,
+          -kappa * at.gap * n + (bound - t.dot(tangential) - at.mu * kappa * at.gap) * t - pull * (across * tangential),
+          pressing * (t * t.transpose() + turns * across) + at.mu * t * tangential.transpose()};
 }
 
 // The smoothed law at a pair: what it asks of the force, and its derivatives.
@@ -71,15 +72,15 @@ double multiplier(double f, double a, double q) {
   return high;
 }
 
-Smoothed smoothed(const PairSight& sight) {
-  const Vector3d& n = sight.normal;
-  const double k = sight.stiffness, q = k * sight.smoothing, pressing = sight.force.dot(n);
-  const double z = pressing - k * sight.gap, root = std::sqrt(z * z + 4.0 * q);
+Smoothed smoothed(const PairKinematics& at) {
+  const Vector3d& n = at.normal;
+  const double k = at.stiffness, q = k * at.smoothing, pressing = at.force.dot(n);
+  const double z = pressing - k * at.gap, root = std::sqrt(z * z + 4.0 * q);
   Smoothed out{};
   out.pressing = z > 0.0 ? 0.5 * (z + root) : 2.0 * q / (root - z);
   out.share = out.pressing / root;
-  const Vector3d tau = sight.force - pressing * n - k * sight.slip;
-  const double size = tau.norm(), bound = sight.mu * out.pressing;
+  const Vector3d tau = at.force - pressing * n - k * at.slip;
+  const double size = tau.norm(), bound = at.mu * out.pressing;
   out.direction = size > 0.0 ? Vector3d(tau / size) : Vector3d(n.unitOrthogonal());
   if (!(bound > 0.0)) return out;
   const double y = multiplier(bound, size, q);
@@ -90,18 +91,18 @@ Smoothed smoothed(const PairSight& sight) {
   return out;
 }
 
-PairRow smoothed_row(const PairSight& sight) {
-  const Smoothed law = smoothed(sight);
-  const Vector3d &n = sight.normal, &t = law.direction;
-  const double k = sight.stiffness, pressing = sight.force.dot(n);
-  const Vector3d tangential = sight.force - pressing * n;
+PairLinearization smoothed_row(const PairKinematics& at) {
+  const Smoothed law = smoothed(at);
+  const Vector3d &n = at.normal, &t = law.direction;
+  const double k = at.stiffness, pressing = at.force.dot(n);
+  const Vector3d tangential = at.force - pressing * n;
   const auto compliance = [&](double share, double proximal) { return (1.0 - share) / k + share / proximal; };
   // dr_N = pull - press dg; then friction, of the bound mu (r_N + dr_N).
-  const double soft = compliance(law.share, sight.along), press = law.share / soft,
+  const double soft = compliance(law.share, at.along), press = law.share / soft,
                pull = -(pressing - law.pressing) / (k * soft);
-  const double soft_along = compliance(law.along, sight.across), soft_across = compliance(law.across, sight.across);
+  const double soft_along = compliance(law.along, at.across), soft_across = compliance(law.across, at.across);
   const double along = law.along / soft_along, across = law.across / soft_across;
-  const double coupling = law.by_bound * sight.mu / (k * soft_along);
+  const double coupling = law.by_bound * at.mu / (k * soft_along);
   const Matrix3d side = Matrix3d::Identity() - n * n.transpose() - t * t.transpose();
   const Matrix3d symmetric = press * n * n.transpose() + along * t * t.transpose() + across * side;
   const Vector3d force =
@@ -116,38 +117,38 @@ PairRow smoothed_row(const PairSight& sight) {
               coupling * t * tangential.transpose()};
 }
 
-double smoothed_error_squared(const PairSight& sight) {
-  const Smoothed law = smoothed(sight);
-  return (sight.force - law.pressing * sight.normal - law.friction * law.direction).squaredNorm();
+double smoothed_error_squared(const PairKinematics& at) {
+  const Smoothed law = smoothed(at);
+  return (at.force - law.pressing * at.normal - law.friction * law.direction).squaredNorm();
 }
 
 }  // namespace
 
-PairRow pair_row(const PairSight& sight) {
-  if (sight.smoothing > 0.0) return smoothed_row(sight);
-  const double pressing = sight.force.dot(sight.normal), bearing = pressing - sight.stiffness * sight.gap;
-  if (!(bearing > 0.0)) return open_row(sight);
-  const Vector3d tau = sight.force - pressing * sight.normal - sight.stiffness * sight.slip;
-  const bool sticks = sight.mu > 0.0 && tau.norm() <= sight.mu * std::max(pressing, bearing);
-  return sticks ? stick_row(sight) : slip_row(sight);
+PairLinearization linearize(const PairKinematics& at) {
+  if (at.smoothing > 0.0) return smoothed_row(at);
+  const double pressing = at.force.dot(at.normal), bearing = pressing - at.stiffness * at.gap;
+  if (!(bearing > 0.0)) return open_row(at);
+  const Vector3d tau = at.force - pressing * at.normal - at.stiffness * at.slip;
+  const bool sticks = at.mu > 0.0 && tau.norm() <= at.mu * std::max(pressing, bearing);
+  return sticks ? stick_row(at) : slip_row(at);
 }
 
-PairRow closing_row(const PairSight& sight, const Vector3d& motion) {
-  const double sinking = sight.normal.dot(motion) + sight.gap;
-  PairSight then = sight;
-  then.slip += motion - sight.normal.dot(motion) * sight.normal;
-  const bool sticks = sight.mu > 0.0 && then.slip.norm() <= sight.mu * std::max(-sinking, 0.0);
-  return sticks ? stick_row(sight) : slip_row(then);
+PairLinearization linearize_closing(const PairKinematics& at, const Vector3d& motion) {
+  const double sinking = at.normal.dot(motion) + at.gap;
+  PairKinematics then = at;
+  then.slip += motion - at.normal.dot(motion) * at.normal;
+  const bool sticks = at.mu > 0.0 && then.slip.norm() <= at.mu * std::max(-sinking, 0.0);
+  return sticks ? stick_row(at) : slip_row(then);
 }
 
-double pair_error_squared(const PairSight& sight) {
-  if (sight.smoothing > 0.0) return smoothed_error_squared(sight);
-  const double pressing = sight.force.dot(sight.normal);
-  const double bearing = std::max(0.0, pressing - sight.stiffness * sight.gap);
-  const Vector3d tangential = sight.force - pressing * sight.normal;
-  if (!(bearing > 0.0)) return sight.force.squaredNorm();
-  const Vector3d tau = tangential - sight.stiffness * sight.slip;
-  const double size = tau.norm(), bound = sight.mu * std::max(pressing, 0.0);
+double pair_error_squared(const PairKinematics& at) {
+  if (at.smoothing > 0.0) return smoothed_error_squared(at);
+  const double pressing = at.force.dot(at.normal);
+  const double bearing = std::max(0.0, pressing - at.stiffness * at.gap);
+  const Vector3d tangential = at.force - pressing * at.normal;
+  if (!(bearing > 0.0)) return at.force.squaredNorm();
+  const Vector3d tau = tangential - at.stiffness * at.slip;
+  const double size = tau.norm(), bound = at.mu * std::max(pressing, 0.0);
   const Vector3d allowed = size > bound ? Vector3d(bound / size * tau) : tau;
   return (pressing - bearing) * (pressing - bearing) + (tangential - allowed).squaredNorm();
 }

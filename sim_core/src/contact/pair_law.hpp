@@ -34,7 +34,7 @@
 
 namespace sim_core {
 
-struct PairSight {
+struct PairKinematics {
   double gap;              // m
   Eigen::Vector3d normal;  // from the second to the first
   Eigen::Vector3d slip;    // m: of the first over the second since the start of the step, across the normal
@@ -44,7 +44,7 @@ struct PairSight {
   double smoothing = 0.0;  // epsilon, J
 };
 
-struct PairRow {
+struct PairLinearization {
   int mode = 0;                                         // ContactMode
   Eigen::Matrix3d stiffness = Eigen::Matrix3d::Zero();  // N/m
   Eigen::Matrix3d symmetric = Eigen::Matrix3d::Zero();  // its part for the factor: without mu kappa t n^T
@@ -53,11 +53,11 @@ struct PairRow {
 };
 
 // The branch that holds there. A pair that sinks in is about to bear more than r_N: it sticks up to mu (r_N - k g).
-PairRow pair_row(const PairSight& sight);
+PairLinearization linearize(const PairKinematics& at);
 // The branch of a pair that `motion` closes, whatever its gap and force are now: it sticks if it slips by no more than
 // mu times what it would sink in, and it slips else.
-PairRow closing_row(const PairSight& sight, const Eigen::Vector3d& motion);
+PairLinearization linearize_closing(const PairKinematics& at, const Eigen::Vector3d& motion);
 // Square of the force by which the law is missed, N^2.
-double pair_error_squared(const PairSight& sight);
+double pair_error_squared(const PairKinematics& at);
 
 }  // namespace sim_core

@@ -9,14 +9,6 @@ namespace {
 
 using Eigen::Array3d;
 
-// Of the distance of a pair, or of the thickness where that is less, what a motion leaves: what slides past each other
-// comes from far to about the thickness.
-constexpr double keep = 0.5;
-// Thicknesses below which nothing comes nearer.
-constexpr double floor_share = 0.01;
-// Rounds in which nodes are capped one by one; after them all are by the same share.
-constexpr int rounds_max = 8;
-
 std::pair<Array3d, Array3d> box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
   Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
   for (int i : surface.vertices) {
@@ -38,11 +30,12 @@ double fastest(const Candidate& pair, const std::vector<double>& ways) {
 
 }  // namespace
 
-Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin)
+Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin, const PathSettings& settings)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
-      leaves{keep, thickness_in, floor_share * thickness_in},
+      leaves{settings.keep, thickness_in, settings.floor * thickness_in, settings.advance},
       margin_(margin),
+      rounds_max_(settings.rounds_max),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
       way_(share_) {}
@@ -149,7 +142,7 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
     way_[i] = (place(i) - at_node(from, i) - common).norm();
   };
   bool whole = true;
-  for (int round = 0; round <= rounds_max; ++round) {
+  for (int round = 0; round <= rounds_max_; ++round) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
       const double distance = pair.distance - fastest(pair, drift_);
@@ -158,12 +151,12 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
       const double safe = safe_share(pair.kind, points_of(pair, from), ends, leaves);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
-      if (round == rounds_max) continue;
+      if (round == rounds_max_) continue;
       for (int i : pair.node) shorten(i, safe);
     }
     if (least == 1.0) break;
     whole = false;
-    if (round == rounds_max) {
+    if (round == rounds_max_) {
       for (int i : surface.vertices) share_[i] *= least;
     }
   }

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "contact/candidates.hpp"
+#include "contact/path_settings.hpp"
 
 namespace sim_core {
 
@@ -11,7 +12,7 @@ namespace sim_core {
 // `margin` from where it was, whatever common way all of them have come.
 class Neighbourhood {
  public:
-  Neighbourhood(Surface surface, double thickness, double margin);
+  Neighbourhood(Surface surface, double thickness, double margin, const PathSettings& settings = {});
 
   const Surface surface;
   const double thickness;
@@ -43,6 +44,7 @@ class Neighbourhood {
   Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to, std::vector<double>& ways) const;
 
   double margin_;
+  int rounds_max_;
   std::vector<Candidate> pairs_;
   Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
   std::vector<double> share_, drift_, way_;

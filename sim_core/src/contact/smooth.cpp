@@ -13,11 +13,6 @@ using Eigen::Array3d;
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-// Nodes look for surfaces as far as they may come in a step, times this.
-constexpr double reach_share = 1.5;
-// Curvatures that count, times the radius of a triangle's circle: what is sharper pokes through between nodes.
-constexpr double curvature_max = 0.5;
-
 std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, const std::vector<int>& sheet_of_node,
                             int sheets, const std::vector<double>& crease) {
   std::vector<double> out;
@@ -28,13 +23,14 @@ std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, co
 }  // namespace
 
 SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
-                             const PairSettings& settings, const std::vector<double>& crease, const Buffer<double>& x,
-                             const std::vector<double>& radius)
+                             const ContactMaterials& materials, const std::vector<double>& crease,
+                             const Buffer<double>& x, const std::vector<double>& radius, const SmoothSettings& settings)
     : sheet_of_node_(std::move(sheet_of_node)),
       radius_(radius),
       free_nodes_(static_cast<int>(radius.size())),
+      materials_(materials),
       settings_(settings),
-      patches_(triangles, x, creases(triangles, sheet_of_node_, settings.sheets, crease)),
+      patches_(triangles, x, creases(triangles, sheet_of_node_, materials.sheets, crease), settings),
       tree_(patches_.triangles(), x),
       track_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
       kept_(track_),
@@ -80,14 +76,14 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   }
   const Vector3d common = 0.5 * (low + high).matrix();
   const double spread = 0.5 * (high - low).matrix().norm();
-  const double thickness = *std::max_element(settings_.thickness.begin(), settings_.thickness.end());
+  const double thickness = *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
   track_ = kept_;
   for (int i = 0; i < free_nodes_; ++i) {
     if (track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const Vector3d p = at_node(start, i);
-    const double reach = thickness + reach_share * ((at_node(guess, i) - p - common).norm() + spread + thickness);
+    const double reach = thickness + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
     const Nearest found =
-        tree_.nearest(p, reach, [&](int t) { return settings_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
+        tree_.nearest(p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
     track_.triangle[i] = found.triangle;
     if (found.triangle >= 0) track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
   }
@@ -100,7 +96,7 @@ std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
   if (found->on_patch) track_.triangle[node] = found->triangle;
   feet_[node] = *found;
   return SmoothTouch{found->height - apart(node, *found), found->normal,
-                     surface_of(found->triangle) - settings_.sheets};
+                     surface_of(found->triangle) - materials_.sheets};
 }
 
 // What a node keeps, m: pairs stay idle as long as the triangles around it lie on the surface.
@@ -108,8 +104,8 @@ double SmoothContact::apart(int node, const Foot& foot) const {
   const int sheet = sheet_of_node_[node], surface = surface_of(foot.triangle);
   const double r = radius_[node];
   const double curvature = patches_.curvature(end_, foot.triangle, foot.weights, track_.side[node]);
-  const double sinking = 0.5 * r * r * std::min(curvature, curvature_max / r);
-  return std::max(settings_.mean(sheet, surface), settings_.apart(sheet, surface) + sinking);
+  const double sinking = 0.5 * r * r * std::min(curvature, settings_.curvature_max / r);
+  return std::max(materials_.mean(sheet, surface), materials_.apart(sheet, surface) + sinking);
 }
 
 // The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was somewhere, while
@@ -122,7 +118,7 @@ Vector3d SmoothContact::slip(int node, const Vector3d& before, const Vector3d& p
 }
 
 double SmoothContact::mu(int node) const {
-  return settings_.mu(sheet_of_node_[node], surface_of(feet_[node].triangle));
+  return materials_.mu(sheet_of_node_[node], surface_of(feet_[node].triangle));
 }
 
 }  // namespace sim_core

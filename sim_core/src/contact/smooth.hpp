@@ -1,10 +1,10 @@
 // Contacts of the cloth's nodes with the smooth surfaces through the vertices of prescribed triangles.
 //
-// A node keeps half of both thicknesses away from the surface and feels it as it feels a body, by one normal and one
-// gap. Where the surface is so curved that the triangles between nodes would cut into it, nodes keep further away: a
-// triangle in a circle of radius r sinks by r^2 kappa/2 below its corners on a surface of curvature kappa. A node stays
-// on the side of the triangles on which it is when a step begins. What nodes do not catch, triangles
-// that poke through between them, is left to pairs of closest points.
+// A node keeps half of both thicknesses away from the surface and touches it as it touches a body, by one normal and
+// one gap. Where the surface is so curved that the triangles between nodes would cut into it, nodes keep further away:
+// a triangle in a circle of radius r sinks by r^2 kappa/2 below its corners on a surface of curvature kappa. A node
+// stays on the side of the triangles on which it is when a step begins. What nodes do not catch, triangles that poke
+// through between them, is left to pairs of closest points.
 #pragma once
 
 #include <Eigen/Core>
@@ -12,9 +12,9 @@
 #include <optional>
 #include <vector>
 
+#include "contact/materials.hpp"
 #include "contact/nearest.hpp"
-#include "contact/pair_settings.hpp"
-#include "contact/patches.hpp"
+#include "contact/pn_triangles.hpp"
 
 namespace sim_core {
 
@@ -27,9 +27,11 @@ struct SmoothTouch {
 class SmoothContact {
  public:
   // `triangles`: nodes; `sheet_of_node`: of cloth, and after them surfaces. `crease`: of each surface, see
-  // Patches. x: where the surfaces are. `radius`: of the circle around the largest triangle at each free node, m.
-  SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, const PairSettings& settings,
-                const std::vector<double>& crease, const Buffer<double>& x, const std::vector<double>& radius);
+  // CreasedTriangles. x: where the surfaces are. `radius`: of the circle around the largest triangle at each free node,
+  // m.
+  SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
+                const ContactMaterials& materials, const std::vector<double>& crease, const Buffer<double>& x,
+                const std::vector<double>& radius, const SmoothSettings& settings);
 
   // Forgets which triangles are touched.
   void restart();
@@ -57,8 +59,9 @@ class SmoothContact {
   std::vector<double> radius_;
   int free_nodes_;
   int first_ = std::numeric_limits<int>::max();  // of the surfaces' nodes, which are the last
-  PairSettings settings_;
-  Patches patches_;
+  ContactMaterials materials_;
+  SmoothSettings settings_;
+  PNTriangles patches_;
   TriangleTree tree_;
   PatchShape start_, end_;
   struct Track {

@@ -10,14 +10,9 @@ using Eigen::Vector3d;
 
 namespace {
 
-// Contact stiffness in a factor over a node's own.
-constexpr float factor_share = 100.0f;
-// What begins a step nearer to a body than this feels surfaces by pairs only, m.
-constexpr double body_first = 1e-3;
-
-bool began_near(const std::vector<Body>& bodies, const Vector3d& p) {
+bool began_near(const std::vector<Body>& bodies, const Vector3d& p, double distance_max) {
   return std::any_of(bodies.begin(), bodies.end(),
-                     [&](const Body& body) { return gap_of(body, p).distance < body_first; });
+                     [&](const Body& body) { return gap_of(body, p).distance < distance_max; });
 }
 
 }  // namespace
@@ -27,7 +22,7 @@ void Norms::count(double force_squared) {
   if (!std::isnan(largest) && !(force_squared <= largest * largest)) largest = std::sqrt(force_squared);
 }
 
-ContactState::ContactState(int free_nodes)
+ContactState::ContactState(int free_nodes, const NodeSettings& settings, double law_stiffness)
     : mode(free_nodes, contact_open),
       touched(free_nodes, -1),
       stiffness(free_nodes, 0.0),
@@ -36,7 +31,9 @@ ContactState::ContactState(int free_nodes)
       mu(free_nodes, 0.0f),
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
-      correction(4 * free_nodes + 64, 0.0f) {}
+      correction(4 * free_nodes + 64, 0.0f),
+      settings_(settings),
+      turning_max_(settings.penalty / law_stiffness) {}
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), mu.data(), turning.data()};
@@ -45,7 +42,7 @@ ContactRows ContactState::rows() const {
 void ContactState::penalty(int node, double own, float* out) const {
   std::fill(out, out + 6, 0.0f);
   if (mode[node] == contact_open) return;
-  const float k = factor_share * static_cast<float>(own);
+  const float k = static_cast<float>(settings_.penalty) * static_cast<float>(own);
   const float* n = &normal[4L * node];
   const float* t = &direction[4L * node];
   const float side = mode[node] == contact_stick ? k : std::min(turning[node], k);
@@ -74,7 +71,7 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     const Vector3d r = at_node(residual, i);
     const auto bears = [&] { return which >= 0 && r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0; };
     // The nearest counts, but what began a step near a body does not change to a surface: pairs keep it from that.
-    if (surfaces && !began_near(at_start, at_node(start, i))) {
+    if (surfaces && !began_near(at_start, at_node(start, i), settings_.body_first)) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
       if (one && one->gap < gap.distance) {
         gap = {one->gap, one->normal};
@@ -83,7 +80,7 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     }
     if (!bears()) {
       touched[i] = -1;
-      const ContactRow row = open_row(r);
+      const ContactLinearization row = open_row(r);
       mode[i] = contact_open;
       at_node(force, i) = row.force.cast<float>();
       at_node(correction, i).setZero();
@@ -92,8 +89,8 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     }
     const bool slipped = mode[i] == contact_slip && touched[i] == which;
     touched[i] = which;
-    const ContactSight seen = sight(i, which, gap, x, start, residual, at_start, at_end);
-    const ContactRow row = closed_row(seen);
+    const ContactKinematics seen = kinematics(i, which, gap, x, start, residual, at_start, at_end);
+    const ContactLinearization row = closed_row(seen, turning_max_);
     const bool reversed =
         slipped && row.mode == contact_slip && at_node(direction, i).cast<double>().dot(row.direction) < 0.0;
     at_node(normal, i) = gap.normal.cast<float>();
@@ -127,7 +124,7 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, 
       if (!one) continue;
       gap = {one->gap, one->normal};
     }
-    const ContactSight seen = sight(node, body, gap, x, start, residual, at_start, at_end);
+    const ContactKinematics seen = kinematics(node, body, gap, x, start, residual, at_start, at_end);
     touched[i] = body;
     at_node(normal, node) = gap.normal.cast<float>();
     // Friction turns the more easily the further a node slips, and it slips in proportion to dt.
@@ -138,9 +135,9 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, 
   return true;
 }
 
-ContactSight ContactState::sight(int node, int body, const Gap& gap, const Buffer<double>& x,
-                                 const Buffer<double>& start, const Buffer<double>& residual,
-                                 const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {
+ContactKinematics ContactState::kinematics(int node, int body, const Gap& gap, const Buffer<double>& x,
+                                           const Buffer<double>& start, const Buffer<double>& residual,
+                                           const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {
   const Vector3d before = at_node(start, node), p = at_node(x, node);
   const bool is_body = body < static_cast<int>(at_end.size());
   Vector3d u = is_body ? Vector3d(p - carried(at_start[body], at_end[body], before)) : surfaces->slip(node, before, p);
@@ -149,7 +146,7 @@ ContactSight ContactState::sight(int node, int body, const Gap& gap, const Buffe
   return {gap.distance, gap.normal, u, at_node(residual, node), mu_here, stiffness[node]};
 }
 
-void ContactState::write(int node, const ContactRow& row) {
+void ContactState::write(int node, const ContactLinearization& row) {
   mode[node] = row.mode;
   at_node(direction, node) = row.direction.cast<float>();
   at_node(force, node) = row.force.cast<float>();

@@ -9,6 +9,7 @@
 #include "cloth/problem.hpp"
 #include "contact/bodies.hpp"
 #include "contact/law.hpp"
+#include "contact/node_settings.hpp"
 #include "contact/smooth.hpp"
 #include "math/buffer.hpp"
 
@@ -22,7 +23,8 @@ struct Norms {
 
 class ContactState {
  public:
-  explicit ContactState(int free_nodes);
+  // `law_stiffness`: k of the law over a node's own stiffness.
+  explicit ContactState(int free_nodes, const NodeSettings& settings = {}, double law_stiffness = 0.1);
 
   std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
   std::vector<double> stiffness;   // (free nodes): k of the law, N/m
@@ -54,10 +56,10 @@ class ContactState {
   void penalty(int node, double own, float* out) const;
 
  private:
-  ContactSight sight(int node, int body, const Gap& gap, const Buffer<double>& x, const Buffer<double>& start,
-                     const Buffer<double>& residual, const std::vector<Body>& at_start,
-                     const std::vector<Body>& at_end) const;
-  void write(int node, const ContactRow& row);
+  ContactKinematics kinematics(int node, int body, const Gap& gap, const Buffer<double>& x, const Buffer<double>& start,
+                               const Buffer<double>& residual, const std::vector<Body>& at_start,
+                               const std::vector<Body>& at_end) const;
+  void write(int node, const ContactLinearization& row);
 
   struct Kept {
     std::vector<int> mode, touched;
@@ -65,6 +67,8 @@ class ContactState {
     double dt = 0.0;  // 0: nothing is kept
   };
   Kept kept_;
+  NodeSettings settings_;
+  double turning_max_;
 };
 
 }  // namespace sim_core

@@ -5,16 +5,17 @@
 
 namespace sim_core {
 
-Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in, Felt felt_in)
+Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in,
+                 CollisionMask collides_in)
     : triangles(std::move(triangles_in)),
       around_begin(sheet_of_node_in.size() + 1, 0),
       sheet_of_node(std::move(sheet_of_node_in)),
-      felt(std::move(felt_in)),
-      last_felt(felt.rows(), -1) {
+      collides(std::move(collides_in)),
+      last_collider(collides.rows(), -1) {
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
     if (sheet_of_node[i] < 0) continue;
-    for (Eigen::Index sheet = 0; sheet < felt.rows(); ++sheet) {
-      if (felt(sheet, sheet_of_node[i])) last_felt[sheet] = static_cast<int>(i);
+    for (Eigen::Index sheet = 0; sheet < collides.rows(); ++sheet) {
+      if (collides(sheet, sheet_of_node[i])) last_collider[sheet] = static_cast<int>(i);
     }
   }
   for (const auto& corners : triangles) {

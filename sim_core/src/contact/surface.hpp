@@ -7,7 +7,7 @@
 
 namespace sim_core {
 
-using Felt = Eigen::Matrix<bool, Eigen::Dynamic, Eigen::Dynamic>;
+using CollisionMask = Eigen::Matrix<bool, Eigen::Dynamic, Eigen::Dynamic>;
 
 struct Surface {
   std::vector<std::array<int, 3>> triangles;       // nodes
@@ -17,11 +17,11 @@ struct Surface {
   std::vector<int> triangles_of_edge;              // counts
   std::vector<int> around_begin, around;           // triangles around each node, ascending
   std::vector<int> sheet_of_node;
-  Felt felt;                   // whether each two sheets feel each other
-  std::vector<int> last_felt;  // by sheet: the last node of those that it feels
+  CollisionMask collides;          // whether two sheets touch each other
+  std::vector<int> last_collider;  // by sheet: the last node that it touches
 
-  Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, Felt felt);
-  bool feel(int node, int other) const { return felt(sheet_of_node[node], sheet_of_node[other]); }
+  Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, CollisionMask collides);
+  bool may_touch(int node, int other) const { return collides(sheet_of_node[node], sheet_of_node[other]); }
 };
 
 }  // namespace sim_core

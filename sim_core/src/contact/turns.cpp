@@ -11,10 +11,6 @@ using Eigen::Vector3d;
 
 namespace {
 
-// Angle up to which a node's turn counts, and from twice which it does not: cloth that turns by more in a step is
-// stopped on its way, and velocities are no guide.
-constexpr double turn_most = 0.05;
-
 Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
   const Vector3d a = at_node(x, corner[1]) - at_node(x, corner[0]), b = at_node(x, corner[2]) - at_node(x, corner[0]);
   Matrix3d out;
@@ -45,7 +41,7 @@ const Matrix3d& Turns::of(const Surface& surface, int node) {
   if (node < free_nodes_) {
     const double angle = std::sqrt(std::max(3.0 - here.turn.trace(), 0.0));
     here.turn =
-        Matrix3d::Identity() + std::clamp(2.0 - angle / turn_most, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
+        Matrix3d::Identity() + std::clamp(2.0 - angle / turn_max_, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
   }
   return here.turn;
 }

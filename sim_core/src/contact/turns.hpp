@@ -20,6 +20,9 @@ namespace sim_core {
 
 class Turns {
  public:
+  // `turn_max`: angle up to which the turn of a free node counts, rad; from twice that it does not.
+  explicit Turns(double turn_max) : turn_max_(turn_max) {}
+
   // A step begins at `start` and is expected to end at `expected`. The nodes behind the free ones go there surely.
   void begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes);
   const Eigen::Matrix3d& of(const Surface& surface, int node);
@@ -31,6 +34,7 @@ class Turns {
     int step = 0;  // to which it belongs
     Eigen::Matrix3d turn;
   };
+  double turn_max_;
   std::vector<Turn> triangles_, nodes_;
   Buffer<double> start_, expected_;
   int step_ = 0, free_nodes_ = 0;

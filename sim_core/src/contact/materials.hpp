@@ -1,4 +1,4 @@
-// What contacts of cloth with cloth and surfaces are told.
+// Thickness and friction of sheets and surfaces in contact.
 #pragma once
 
 #include <Eigen/Core>
@@ -9,23 +9,21 @@
 
 namespace sim_core {
 
-// Of sheets and surfaces.
-struct PairSettings {
+// Of sheets and, after them, surfaces.
+struct ContactMaterials {
   std::vector<double> thickness;  // m: two keep the mean of theirs apart
-  Eigen::MatrixXd mu;             // of each two; negative where they do not feel each other
+  Eigen::MatrixXd mu;             // of each two; negative: they do not touch each other
   int sheets;                     // that come before the surfaces
-  // What edges of two sheets, and vertices of the later over triangles of the earlier, keep of the thickness. Where
-  // sheets lie flat on each other, both and the vertices of the earlier sheet say the same: which of them bear is
-  // arbitrary then, and changes all the time. Those that keep less only bear where cloth is curved.
+  // Shares of the thickness that edges of two sheets, and vertices of the later over triangles of the earlier, keep.
+  // Where sheets lie flat on each other, these pairs are redundant to those of the earlier sheet's vertices: the active
+  // set is not unique and changes all the time. With less than 1 they are active where cloth is curved only.
   double edge_share = 1.0, second_share = 1.0;
+  double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
 
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // What pairs of closest points keep apart, m. Nodes feel surfaces by themselves: pairs only catch what comes nearer
   // between the nodes than the facets of a curved surface do.
-  double apart(int a, int b) const {
-    constexpr double surface_share = 0.25;
-    return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
-  }
+  double apart(int a, int b) const { return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b); }
   // The same of a pair whose first piece is of one sheet and whose second is of another.
   double apart(PairKind kind, int first, int second) const {
     const bool other = first != second && std::max(first, second) < sheets;

@@ -27,6 +27,9 @@
 #include <optional>
 #include <vector>
 
+#include "contact/creased_triangles.hpp"
+#include "contact/pn_patch.hpp"
+#include "contact/smooth_settings.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
@@ -48,12 +51,13 @@ struct Foot {
   bool on_patch;            // or on a sharp edge, or at an end of one
 };
 
-class Patches {
+class PNTriangles {
  public:
-  // `crease`: angle of the normals of two triangles from which their edge stays sharp, rad, of each triangle.
-  Patches(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x, const std::vector<double>& crease);
+  // `crease`: see CreasedTriangles.
+  PNTriangles(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x, const std::vector<double>& crease,
+              const SmoothSettings& settings = {});
 
-  const std::vector<std::array<int, 3>>& triangles() const { return triangles_; }
+  const std::vector<std::array<int, 3>>& triangles() const { return mesh_.triangles; }
   PatchShape shape(const Buffer<double>& x) const;
 
   // The foot of p on a side (1: where the triangles' normals point to, after orientation; or -1), looked for from a
@@ -72,19 +76,12 @@ class Patches {
   Eigen::Matrix3d axes(const PatchShape& shape, int triangle, const Eigen::Vector3d& weights) const;
 
  private:
-  struct Patch;
-  struct Root;
-  Patch patch(const PatchShape& shape, int triangle) const;
+  PNPatch patch(const PatchShape& shape, int triangle) const;
   Eigen::Vector3d edge_handle(const PatchShape& shape, int triangle, int from, int to) const;
-  Eigen::Vector3d facet_normal(const Buffer<double>& x, int triangle) const;
   std::optional<Foot> foot_around(const PatchShape& shape, const Eigen::Vector3d& p, int triangle, double side) const;
 
-  std::vector<std::array<int, 3>> triangles_;  // nodes, oriented alike where they can be
-  std::vector<std::array<int, 3>> across_;     // over the edge opposite each corner: a triangle, -1 at a border
-  std::vector<std::array<int, 3>> sharp_;      // 1 where that edge is
-  std::vector<std::array<int, 3>> group_;      // of the corners
-  std::vector<int> around_begin_, around_;     // triangles around each node
-  int groups_ = 0;
+  CreasedTriangles mesh_;
+  SmoothSettings settings_;
 };
 
 }  // namespace sim_core

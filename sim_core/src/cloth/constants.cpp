@@ -1,0 +1,57 @@
+#include "cloth/constants.hpp"
+
+#include <cmath>
+
+#include "cloth/refusal.hpp"
+
+namespace sim_core {
+namespace {
+
+template <class Any, class Call>
+void each(Any& constants, const Call& call) {
+  const auto group = [&](const std::string& name, auto& settings) {
+    settings.each(settings, [&](const char* field, auto& value) { call(name + "." + field, value); });
+  };
+  group("contact", constants.contact);
+  group("node", constants.node);
+  group("path", constants.path);
+  group("smooth", constants.smooth);
+  group("newton", constants.newton);
+  group("stepping", constants.stepping);
+  group("control", constants.control);
+  group("factor", constants.factor);
+}
+
+void assign(double& to, const std::string&, double value) { to = value; }
+void assign(int& to, const std::string& name, double value) {
+  if (value != std::floor(value) || value > 1e9) refuse(text(name, ": must be an integer >= 1, got ", value));
+  to = static_cast<int>(value);
+}
+
+}  // namespace
+
+Constants::Constants(const std::map<std::string, double>& changed) {
+  std::size_t known = 0;
+  each(*this, [&](const std::string& name, auto& to) {
+    const auto found = changed.find(name);
+    if (found == changed.end()) return;
+    if (!(found->second > 0.0) || !std::isfinite(found->second)) {
+      refuse(text(name, ": must be finite and > 0, got ", found->second));
+    }
+    assign(to, name, found->second);
+    ++known;
+  });
+  if (known == changed.size()) return;
+  const std::map<std::string, double> names = by_name();
+  for (const auto& [name, value] : changed) {
+    if (!names.count(name)) refuse(text("constants: there is no ", name));
+  }
+}
+
+std::map<std::string, double> Constants::by_name() const {
+  std::map<std::string, double> out;
+  each(*this, [&](const std::string& name, const auto& value) { out[name] = value; });
+  return out;
+}
+
+}  // namespace sim_core

@@ -1,0 +1,102 @@
+#include "cloth/contact_setup.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numeric>
+#include <utility>
+
+#include "cloth/refusal.hpp"
+
+namespace sim_core {
+namespace {
+
+using Triples = std::vector<std::array<int, 3>>;
+
+void append(const Triangles& triangles, const int* node, Triples& out) {
+  for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
+    out.push_back({node[triangles(t, 0)], node[triangles(t, 1)], node[triangles(t, 2)]});
+  }
+}
+
+void check_thickness(const ClothMesh& mesh, const std::vector<int>& sheets, const ContactMaterials& materials) {
+  Buffer<double> rest(4L * mesh.rest.rows(), 0.0);
+  for (Eigen::Index i = 0; i < mesh.rest.rows(); ++i) at_node(rest, i).head<2>() = mesh.rest.row(i).transpose();
+  std::vector<int> vertices(mesh.rest.rows());
+  std::iota(vertices.begin(), vertices.end(), 0);
+  Triples triangles;
+  append(mesh.triangles, vertices.data(), triangles);
+  const Eigen::Index count = materials.mu.rows();
+  CollisionMask collides =
+      CollisionMask::Constant(count, count, false);  // sheets lie somewhere at rest, not on each other
+  for (Eigen::Index s = 0; s < count; ++s) collides(s, s) = materials.mu(s, s) >= 0.0;
+  const double reach = *std::max_element(materials.thickness.begin(), materials.thickness.end());
+  for (const Candidate& pair : candidates(Surface(triangles, sheets, collides), rest, reach)) {
+    const FourPoints at = points_of(pair, rest);
+    const double thickness = materials.thickness[sheets[pair.node[0]]];
+    if (between_closest(closest_weights(pair.kind, at), at).norm() > thickness) continue;
+    refuse(text("thickness: must be less than the distance at rest of vertices and edges that do not meet, and vertex ",
+                pair.node[0], " is nearer to one than ", thickness, " m"));
+  }
+}
+
+// Radius of the smallest circle around a triangle at rest, m: its circumcircle, or that of its longest side.
+double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
+  std::array<double, 3> side;
+  for (int c = 0; c < 3; ++c) {
+    side[c] =
+        (mesh.rest.row(mesh.triangles(triangle, c)) - mesh.rest.row(mesh.triangles(triangle, (c + 1) % 3))).norm();
+  }
+  std::sort(side.begin(), side.end());
+  const auto [a, b, c] = side;
+  return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
+}
+
+// Sheets, and after them surfaces; -1 of slopes.
+std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces) {
+  const std::vector<int> sheets = mesh.sheets();
+  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
+  std::vector<int> out(numbering.nodes, -1);
+  for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = sheets[i];
+  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  for (int i = 0; i < numbering.others; ++i) out[others[i]] = count + surfaces.surface_of_vertex[i];
+  return out;
+}
+
+}  // namespace
+
+std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
+                                           const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                           const Constants& constants) {
+  check_thickness(mesh, mesh.sheets(), materials);
+  Triples triangles;
+  append(mesh.triangles, numbering.node.data(), triangles);
+  append(surfaces.triangles, numbering.node.data() + numbering.vertices + numbering.slopes, triangles);
+  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces),
+                  (materials.mu.array() >= 0.0).matrix());
+  const double cell = std::sqrt(2.0 * mesh.area.mean());
+  return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact, constants.path,
+                                      constants.path.margin * cell, numbering.free_nodes);
+}
+
+std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
+                                                 const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                                 const SmoothSettings& settings) {
+  Buffer<double> x(4L * numbering.nodes, 0.0);
+  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  for (int i = 0; i < numbering.others; ++i) at_node(x, others[i]) = surfaces.positions.row(i).transpose();
+  Triples triangles;
+  append(surfaces.triangles, others, triangles);
+  std::vector<double> radius(numbering.free_nodes, 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    const double own = circle_around(mesh, t);
+    for (int c = 0; c < 3; ++c) {
+      const int node = numbering.node[mesh.triangles(t, c)];
+      if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
+    }
+  }
+  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces), materials,
+                                         surfaces.crease, x, radius, settings);
+}
+
+}  // namespace sim_core

@@ -1,0 +1,34 @@
+// Contact of a cloth with itself, its sheets and surfaces, set up from meshes.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "cloth/constants.hpp"
+#include "cloth/mesh.hpp"
+#include "cloth/numbering.hpp"
+#include "contact/contact_set.hpp"
+#include "contact/materials.hpp"
+#include "contact/smooth.hpp"
+
+namespace sim_core {
+
+// Triangles that are no cloth, the surface that each of their vertices belongs to, the initial positions of these, and
+// the angle from which edges of each surface are sharp, rad.
+struct SurfaceMeshes {
+  Triangles triangles;
+  std::vector<std::int32_t> surface_of_vertex;
+  Points3 positions;
+  std::vector<double> crease;
+};
+
+// Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
+std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
+                                           const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                           const Constants& constants);
+std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
+                                                 const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                                 const SmoothSettings& settings);
+
+}  // namespace sim_core

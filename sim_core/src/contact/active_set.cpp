@@ -1,0 +1,49 @@
+#include "contact/active_set.hpp"
+
+namespace sim_core {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+bool resume(std::vector<Pair>& pairs, const ContactSettings& settings) {
+  bool any = false;
+  for (Pair& pair : pairs) {
+    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings.closing_gap * pair.thickness) continue;
+    PairKinematics touching = pair.at;
+    touching.gap = 0.0;
+    const PairLinearization row = linearize(touching);
+    if (row.mode == contact_open) continue;
+    pair.row = row;
+    pair.row.force -= row.stiffness * pair.at.gap * pair.at.normal;
+    any = true;
+  }
+  return any;
+}
+
+bool activate(std::vector<Pair>& pairs, const Buffer<float>& change, int free_nodes, const ContactSettings& settings) {
+  bool changed = false;
+  for (Pair& pair : pairs) {
+    if (!pair.added) continue;
+    const Vector3d force = pair.at.force + pair.force_change(change, free_nodes);
+    if (force.dot(pair.at.normal) >= 0.0) continue;
+    pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.at.force};
+    pair.turning.setZero();
+    pair.sliding.setZero();
+    pair.added = false;
+    pair.released = changed = true;
+  }
+  for (PairKind kind : {PairKind::vertex_triangle, PairKind::edge_edge}) {
+    bool any = false;
+    for (Pair& pair : pairs) {
+      if (pair.who.kind != kind || pair.active() || pair.released) continue;
+      const Vector3d motion = pair.motion(change, free_nodes);
+      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings.closing_gap * pair.thickness)) continue;
+      pair.row = linearize_closing(pair.at, motion);
+      pair.added = any = true;
+    }
+    if (any) return true;
+  }
+  return changed;
+}
+
+}  // namespace sim_core

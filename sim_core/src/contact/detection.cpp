@@ -1,0 +1,210 @@
+#include "contact/detection.hpp"
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <utility>
+
+namespace sim_core {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+using Eigen::Vector4d;
+
+// A triangle whose closest point to a vertex lies on this feature.
+struct Found {
+  int feature, candidate;
+  Vector4d weights;
+};
+
+// Derivatives of the weights by the places of the closest points: along both edges, or along the sides of the feature
+// of a triangle.
+std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights) {
+  Vector4d first = Vector4d::Zero(), second = Vector4d::Zero();
+  if (kind == PairKind::edge_edge) {
+    first << -1.0, 1.0, 0.0, 0.0;
+    second << 0.0, 0.0, 1.0, -1.0;
+    return {first, second};
+  }
+  int base = -1;
+  for (int c = 1; c < 4; ++c) {
+    if (weights[c] == 0.0) continue;
+    if (base < 0) {
+      base = c;
+      continue;
+    }
+    Vector4d& along = first.isZero(0.0) ? first : second;
+    along[base] = 1.0;
+    along[c] = -1.0;
+  }
+  return {first, second};
+}
+
+}  // namespace
+
+PairDetection::PairDetection(Surface surface, const ContactMaterials& materials_in, const ContactSettings& settings,
+                             const PathSettings& path, double margin, int free_nodes)
+    : near(std::move(surface), materials_in.farthest(), margin, path),
+      materials(materials_in),
+      settings_(settings),
+      free_nodes_(free_nodes),
+      least_distance_(std::numeric_limits<double>::infinity()),
+      turns_(settings.turn_max) {}
+
+void PairDetection::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
+                          std::vector<Matrix3d> own) {
+  start_ = &start;
+  ends_ = &ends;
+  turns_.begin(start, expected, free_nodes_);
+  own_ = std::move(own);
+}
+
+void PairDetection::find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs) {
+  smoothing_ = smoothing;
+  stiff_ = stiff;
+  std::vector<Candidate>& candidates = near.pairs(x);
+  const double reach = settings_.detection_range * near.thickness + 2.0 * near.moved(*start_, x);
+  pairs.clear();
+  least_distance_ = std::numeric_limits<double>::infinity();
+  find_vertices(candidates, reach, x, pairs);
+  find_edges(candidates, reach, x, pairs);
+}
+
+// A vertex may be closest to an edge or a corner of a triangle. Such a pair counts once, and only where all triangles
+// around the feature agree: otherwise a point inside one of them is closer.
+void PairDetection::find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
+                                  std::vector<Pair>& pairs) {
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
+  const auto around_node = [&](int node) { return surface.around_begin[node + 1] - surface.around_begin[node]; };
+  std::vector<Found> found;
+  std::size_t c = 0;
+  while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
+    const int vertex = candidates[c].first;
+    found.clear();
+    for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
+         ++c) {
+      Candidate& who = candidates[c];
+      if (who.distance > reach) continue;
+      const FourPoints at = points_of(who, x);
+      const Vector4d weights = closest_weights(who.kind, at);
+      who.distance = between_closest(weights, at).norm();
+      int corners = 0, corner = 0, opposite = 0;
+      for (int i = 0; i < 3; ++i) {
+        if (weights[1 + i] != 0.0) {
+          ++corners;
+          corner = i;
+        } else {
+          opposite = i;
+        }
+      }
+      const int feature = corners == 3   ? who.second
+                          : corners == 2 ? triangles + surface.triangle_edges[who.second][opposite]
+                                         : triangles + edges + who.node[1 + corner];
+      found.push_back({feature, static_cast<int>(c), weights});
+    }
+    std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
+      return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
+    });
+    for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
+      const int feature = found[i].feature;
+      while (next < found.size() && found[next].feature == feature) ++next;
+      const int around = feature < triangles           ? 1
+                         : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
+                                                       : around_node(feature - triangles - edges);
+      if (static_cast<int>(next - i) != around || candidates[found[i].candidate].distance > reach) continue;
+      if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
+        const int other = feature - triangles - edges;
+        const auto first = std::lower_bound(pairs.begin(), pairs.end(), other,
+                                            [](const Pair& pair, int who) { return pair.who.first < who; });
+        if (std::any_of(first, pairs.end(), [&](const Pair& pair) {
+              return pair.who.first == other && pair.feature == triangles + edges + vertex;
+            })) {
+          continue;
+        }
+      }
+      add(candidates[found[i].candidate], feature, found[i].weights, x, pairs);
+    }
+  }
+}
+
+void PairDetection::find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
+                               std::vector<Pair>& pairs) {
+  for (Candidate& who : candidates) {
+    if (who.kind != PairKind::edge_edge || who.distance > reach) continue;
+    const FourPoints at = points_of(who, x);
+    const Vector4d weights = closest_weights(who.kind, at);
+    who.distance = between_closest(weights, at).norm();
+    if (who.distance > reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
+        crossing_squared(at) < settings_.crossing_least)
+      continue;
+    add(who, who.second, weights, x, pairs);
+  }
+}
+
+// With the compliances 1/k_i of the pair's nodes, in the mean or along n, the pair's own is sum w_i^2/k_i: its
+// stiffness scales with the inverse of that.
+void PairDetection::add(const Candidate& who, int feature, const Vector4d& weights, const Buffer<double>& x,
+                        std::vector<Pair>& pairs) {
+  const FourPoints at = points_of(who, x);
+  const Vector3d rho = between_closest(weights, at);
+  const double distance = rho.norm();
+  least_distance_ = std::min(least_distance_, distance);
+  if (!(distance > 0.0)) return;
+  const auto [along_first, along_second] = directions(who.kind, weights);
+  PairMotions given = PairMotions::Zero();
+  for (int c = 0; c < 4; ++c) {
+    const int node = who.node[c];
+    if (node < free_nodes_) continue;
+    const Vector3d way = at_node(*ends_, node) - at_node(x, node);
+    given.segment<3>(0) += weights[c] * way;
+    given.segment<3>(3) += along_first[c] * way;
+    given.segment<3>(6) += along_second[c] * way;
+  }
+  const Vector3d n = rho / distance;
+  const double share = stiff_ ? settings_.stiff_mean_share : settings_.mean_share;
+  double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] >= free_nodes_) continue;
+    const Matrix3d& own = own_[who.node[c]];
+    const double mean = own.trace() / 3.0;
+    softness += weights[c] * weights[c] / mean;
+    softness_along += weights[c] * weights[c] / (share * mean + std::max(n.dot(own * n), 0.0));
+  }
+  if (!(softness > 0.0)) return;
+  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
+  Vector3d slip = this->slip(who, weights, rho);
+  slip -= slip.dot(n) * n;
+  const double thickness = materials.apart(who.kind, a, b), k = settings_.law_stiffness / softness;
+  const double along = smoothing_ > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
+  const double across = (smoothing_ > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
+  const Vector3d first =
+      who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
+  pairs.push_back({who,
+                   feature,
+                   weights,
+                   {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
+                    k * smoothing_ * smoothing_},
+                   first - 0.5 * rho,
+                   thickness,
+                   along_first,
+                   along_second,
+                   given});
+}
+
+// Motion of the first point over the second, less that by which rho turns: with a surface, or half with each sheet.
+Vector3d PairDetection::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
+  const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
+  const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];
+  Matrix3d turn = Matrix3d::Zero();
+  for (int c = 0; c < 4; ++c) {
+    const int own = sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
+    const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
+    if (share * weights[c] != 0.0) turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+  }
+  return rho - turn * between_closest(weights, points_of(who, *start_));
+}
+
+}  // namespace sim_core

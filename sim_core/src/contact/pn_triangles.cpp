@@ -1,0 +1,183 @@
+#include "contact/pn_triangles.hpp"
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+namespace sim_core {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+// Barycentric coordinates that count as inside.
+constexpr double inside = -1e-9;
+// Triangles that a foot may move over in a search.
+constexpr int hops_max = 100;
+
+}  // namespace
+
+PNTriangles::PNTriangles(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x,
+                         const std::vector<double>& crease, const SmoothSettings& settings)
+    : mesh_(std::move(triangles), x, crease), settings_(settings) {}
+
+// Normals of corners, by the edges e and f that leave them: sum of e x f/(|e|^2 |f|^2), which is exact for a closed fan
+// on a sphere [Max 1999, Eq. 2].
+PatchShape PNTriangles::shape(const Buffer<double>& x) const {
+  PatchShape out{x, std::vector<Vector3d>(mesh_.groups, Vector3d::Zero())};
+  for (std::size_t t = 0; t < mesh_.triangles.size(); ++t) {
+    for (int k = 0; k < 3; ++k) {
+      const Vector3d p = at_node(x, mesh_.triangles[t][k]);
+      const Vector3d e = at_node(x, mesh_.triangles[t][next(k)]) - p,
+                     f = at_node(x, mesh_.triangles[t][after_next(k)]) - p;
+      out.normals[mesh_.group[t][k]] += e.cross(f) / (e.squaredNorm() * f.squaredNorm());
+    }
+  }
+  for (Vector3d& normal : out.normals) normal.normalize();
+  // Of the circle that touches at a corner and goes through the next: 2 N . (P_i - P_j)/|P_i - P_j|^2.
+  out.curvature.assign(mesh_.groups, {0.0, 0.0});
+  for (std::size_t t = 0; t < mesh_.triangles.size(); ++t) {
+    for (int k = 0; k < 3; ++k) {
+      for (int to : {next(k), after_next(k)}) {
+        const Vector3d edge = at_node(x, mesh_.triangles[t][k]) - at_node(x, mesh_.triangles[t][to]);
+        const double bulge = 2.0 * out.normals[mesh_.group[t][k]].dot(edge) / edge.squaredNorm();
+        auto& most = out.curvature[mesh_.group[t][k]];
+        most = {std::max(most[0], bulge), std::max(most[1], -bulge)};
+      }
+    }
+  }
+  return out;
+}
+
+// E_ij of corners `from` and `to` of a triangle.
+Vector3d PNTriangles::edge_handle(const PatchShape& shape, int t, int from, int to) const {
+  const Vector3d p = at_node(shape.x, mesh_.triangles[t][from]), chord = at_node(shape.x, mesh_.triangles[t][to]) - p;
+  const Vector3d& own = shape.normals[mesh_.group[t][from]];
+  const int k = 3 - from - to, other = mesh_.across[t][k];
+  if (mesh_.sharp[t][k] && other >= 0) {
+    const Vector3d& beyond = shape.normals[mesh_.group[other][mesh_.corner_of(other, mesh_.triangles[t][from])]];
+    const Vector3d both = own.cross(beyond);
+    if (both.norm() > settings_.same_normal) return p + chord.dot(both) / both.squaredNorm() * both / 3.0;
+  }
+  return p + (chord - chord.dot(own) * own) / 3.0;
+}
+
+PNPatch PNTriangles::patch(const PatchShape& shape, int t) const {
+  PNPatch out;
+  Vector3d corners = Vector3d::Zero(), handles = Vector3d::Zero();
+  for (int k = 0; k < 3; ++k) {
+    out.corner[k] = at_node(shape.x, mesh_.triangles[t][k]);
+    out.normal[k] = shape.normals[mesh_.group[t][k]];
+    corners += out.corner[k] / 3.0;
+  }
+  for (int k = 0; k < 3; ++k) {
+    const int i = next(k), j = after_next(k);
+    out.near[k] = edge_handle(shape, t, i, j);
+    out.far[k] = edge_handle(shape, t, j, i);
+    handles += (out.near[k] + out.far[k]) / 6.0;
+    const Vector3d sum = out.normal[i] + out.normal[j],
+                   tangent = out.corner[j] + out.far[k] - out.near[k] - out.corner[i];
+    const Vector3d m = (sum - sum.dot(tangent) / tangent.squaredNorm() * tangent).normalized();
+    out.bend[k] = 2.0 * m - 0.5 * sum;
+  }
+  out.middle = 1.5 * handles - 0.5 * corners;
+  return out;
+}
+
+std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p, int t, double side) const {
+  int before = -1;
+  for (int hop = 0; hop < hops_max; ++hop) {
+    const PNRoot root(patch(shape, t), p, settings_);
+    int out = 0;
+    const double least = root.b.minCoeff(&out);
+    if (root.found && least >= inside) return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
+    if (!root.found && least >= inside) return std::nullopt;
+    if (mesh_.sharp[t][out] && root.b[next(out)] < inside && !mesh_.sharp[t][next(out)]) out = next(out);
+    if (mesh_.sharp[t][out] && root.b[after_next(out)] < inside && !mesh_.sharp[t][after_next(out)])
+      out = after_next(out);
+    if (mesh_.sharp[t][out]) return foot_around(shape, p, t, side);
+    const int beyond = mesh_.across[t][out];
+    if (beyond == before && root.found && least >= -settings_.between) {
+      return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
+    }
+    before = std::exchange(t, beyond);
+  }
+  return std::nullopt;
+}
+
+// The closest of all feet in the triangles around one, on their sharp edges and at the ends of these.
+std::optional<Foot> PNTriangles::foot_around(const PatchShape& shape, const Vector3d& p, int t, double side) const {
+  std::vector<int> some;
+  for (int node : mesh_.triangles[t]) {
+    some.insert(some.end(), mesh_.around.begin() + mesh_.around_begin[node],
+                mesh_.around.begin() + mesh_.around_begin[node + 1]);
+  }
+  std::sort(some.begin(), some.end());
+  some.erase(std::unique(some.begin(), some.end()), some.end());
+  std::optional<Foot> best;
+  const auto take = [&](const Foot& foot) {
+    if (!best || foot.height < best->height) best = foot;
+  };
+  for (int q : some) {
+    const PNPatch one = patch(shape, q);
+    const PNRoot root(one, p, settings_);
+    if (root.found && root.b.minCoeff() >= inside && side * root.height > 0.0) {
+      take({q, root.b, root.point, side * root.normal, side * root.height, true});
+    }
+    for (int k = 0; k < 3; ++k) {
+      if (!mesh_.sharp[q][k]) continue;
+      const int i = next(k), j = after_next(k);
+      const double s = one.closest_on_edge(k, p);
+      Vector3d b = Vector3d::Zero();
+      b[i] = 1.0 - s;
+      b[j] = s;
+      const Vector3d c = one.y(b), away = p - c;
+      const double far = away.norm();
+      if (far > 0.0) take({q, b, c, away / far, far, false});
+    }
+  }
+  return best;
+}
+
+double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t, const Vector3d& weights) const {
+  const auto& corners = mesh_.triangles[t];
+  Vector3d c = Vector3d::Zero(), normal = mesh_.facet_normal(shape.x, t);
+  for (int k = 0; k < 3; ++k) c += weights[k] * at_node(shape.x, corners[k]);
+  for (int k = 0; k < 3; ++k) {
+    if (weights[k] == 1.0) {
+      normal.setZero();
+      for (int a = mesh_.around_begin[corners[k]]; a < mesh_.around_begin[corners[k] + 1]; ++a) {
+        const auto& others = mesh_.triangles[mesh_.around[a]];
+        const int own = mesh_.corner_of(mesh_.around[a], corners[k]);
+        const Vector3d e = at_node(shape.x, others[next(own)]) - c, f = at_node(shape.x, others[after_next(own)]) - c;
+        normal += std::atan2(e.cross(f).norm(), e.dot(f)) * mesh_.facet_normal(shape.x, mesh_.around[a]);
+      }
+    } else if (weights[k] == 0.0 && weights.maxCoeff() < 1.0 && mesh_.across[t][k] >= 0) {
+      normal += mesh_.facet_normal(shape.x, mesh_.across[t][k]);
+    }
+  }
+  return normal.dot(p - c) < 0.0 ? -1.0 : 1.0;
+}
+
+double PNTriangles::curvature(const PatchShape& shape, int t, const Vector3d& weights, double side) const {
+  double out = 0.0;
+  for (int k = 0; k < 3; ++k) out += weights[k] * shape.curvature[mesh_.group[t][k]][side < 0.0];
+  return out;
+}
+
+Vector3d PNTriangles::point(const PatchShape& shape, int t, const Vector3d& weights) const {
+  return patch(shape, t).y(weights);
+}
+
+Matrix3d PNTriangles::axes(const PatchShape& shape, int t, const Vector3d& weights) const {
+  const PNPatch one = patch(shape, t);
+  const Matrix3d slope = one.dy(weights);
+  Matrix3d out;
+  out.col(2) = one.n(weights).normalized();
+  out.col(1) = out.col(2).cross(slope.col(1) - slope.col(0)).normalized();
+  out.col(0) = out.col(1).cross(out.col(2));
+  return out;
+}
+
+}  // namespace sim_core
