@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stickslip_training.kinds.cloth_drag import ClipDataset
+from stickslip_training.data.samples import Samples
 
 Bytes = NDArray[np.uint8]
 Draw = Callable[[list[int]], Any]
@@ -36,7 +36,7 @@ Draw = Callable[[list[int]], Any]
 
 def ours(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
     """Yield our reader with new buffers and with a ring of two, which training uses."""
-    fresh, ring = ClipDataset(root), ClipDataset(root, ring=2)
+    fresh, ring = Samples(root), Samples(root, ring=2)
     yield "ours, new buffers", lambda indices: fresh.__getitems__(indices)["video"]
     yield "ours, ring of 2 buffers", lambda indices: ring.__getitems__(indices)["video"]
 
@@ -177,7 +177,7 @@ def main() -> None:
     print(f"python {platform.python_version()}, {packages()}")
     print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
 
-    everything = ClipDataset(options.dataset)
+    everything = Samples(options.dataset)
     count = min(options.clips, len(everything))
     clips = np.stack([np.asarray(everything[index]["video"]) for index in range(count)])
     stored = sum(path.stat().st_size for path in (options.dataset / "video").rglob("*") if path.is_file())

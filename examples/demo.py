@@ -15,8 +15,7 @@ import numpy as np
 from PIL import Image
 from rich.console import Console
 from stickslip_services.client.http import Client
-from stickslip_training.kinds.cloth_drag import ClipDataset
-from stickslip_training.kinds.rod_hang import RodDataset
+from stickslip_training.data.samples import Samples
 
 BIN = Path(sys.executable).parent
 RODS = Path(__file__).with_name("demo-rods.yaml")
@@ -97,7 +96,7 @@ def run(command: str, *arguments: str | Path) -> None:
 def look_at(directory: Path) -> None:
     """Draw batches as a training loop does, and lay the pictures out on a sheet: four views a rod."""
     console.rule("batches")
-    rods = RodDataset(directory, views=True)
+    rods = Samples(directory, arrays=["centerline", "curvature", "views"])
     rows = []
     for batch in rods.loader(16):
         rows += [np.concatenate(list(views), axis=1) for views in batch["views"].numpy()]
@@ -110,7 +109,7 @@ def look_at(directory: Path) -> None:
 def look_at_cloth(directory: Path) -> None:
     """Draw a batch of clips with their meshes, and lay frames of them out on a sheet: one clip a row."""
     console.rule("clips")
-    clips = ClipDataset(directory, positions=True)
+    clips = Samples(directory, arrays=["video", "positions"])
     (batch,) = clips.loader(len(clips))
     console.print(
         f"{len(clips)} clips in one batch of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }"

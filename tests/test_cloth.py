@@ -14,7 +14,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_sim_core import drop_and_drag
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.kinds.cloth_drag import ClipDataset
+from stickslip_training.data.samples import Samples
 
 SPEC: dict[str, Any] = {
     "kind": "cloth_drag",
@@ -97,13 +97,14 @@ def test_clips_show_the_cloth_of_their_sample(directory: Path) -> None:
     """What changes between two frames is where the cloth was or is, and the light it throws on the floor about."""
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
     cameras = {camera.name: camera for camera in manifest.cameras}
-    clips = ClipDataset(directory, positions=True)
-    assert clips.instants == (0, 100, 200)
+    clips = Samples(directory, arrays=["video", "positions"])
+    instants = clips.reader.arrays["video"].attributes["instants"]
+    assert list(instants) == [0, 100, 200]
     for index in range(len(clips)):
         item = clips[index]
         camera = cameras[item.name("viewpoint")]
         centers = []
-        for frame, instant in zip(item["video"].numpy(), clips.instants, strict=True):
+        for frame, instant in zip(item["video"].numpy(), instants, strict=True):
             bright = np.argwhere(frame.max(axis=2) > 110)
             pixels, _ = camera.project(item["positions"][instant].numpy())
             low, high = pixels.min(axis=0) - 3, pixels.max(axis=0) + 3

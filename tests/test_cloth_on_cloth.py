@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from harness import Service, read_arrays
-from stickslip_training.kinds import open_samples
+from stickslip_training.data.samples import Samples
 
 SPEC: dict[str, Any] = {
     "kind": "cloth_on_cloth",
@@ -37,6 +37,6 @@ def test_from_spec_to_training_batch(service: Service) -> None:
     steady = slice(60, 85)
     assert np.allclose(holders[steady, 2] + below[steady, 2], holders[0, 2], rtol=1e-3)
     assert np.allclose(np.abs(below[steady, 0]), 0.5 * below[steady, 2], rtol=2e-3)
-    (batch,) = open_samples(directory, "train").loader(2)
+    (batch,) = Samples(directory, "train").loader(2)
     assert batch["video"].shape == (2, 3, 224, 224, 3)
     assert batch.names("substrate_material") == ["my-felt", "my-felt"]

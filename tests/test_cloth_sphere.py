@@ -8,7 +8,7 @@ import torch
 from harness import Service, read_arrays
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.points import dataset_id
-from stickslip_training.kinds import open_samples
+from stickslip_training.data.samples import Samples
 
 SPEC: dict[str, Any] = {
     "kind": "cloth_sphere",
@@ -39,7 +39,7 @@ def test_from_spec_to_training_batch(service: Service) -> None:
     assert arrays["bending"].tolist() == [2.0, 2.0]
     rested, turned = (np.unwrap(np.arctan2(*arrays["positions"][0, i, :, 1::-1].T)) for i in (30, -1))
     assert np.median(turned - rested) > 0.5  # friction has dragged the cloth along
-    (batch,) = open_samples(directory, "train").loader(2)
+    (batch,) = Samples(directory, "train").loader(2)
     assert batch["video"].shape == (2, 3, 224, 224, 3)
     assert torch.equal(batch["angular_speed"], torch.tensor([2.0, 2.0]))
     assert batch.names("texture") == ["checker", "dots"]

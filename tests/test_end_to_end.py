@@ -16,7 +16,7 @@ from stickslip_schemas.format.chunks import CorruptChunkError
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.kinds.rod_hang import RodDataset
+from stickslip_training.data.samples import Samples
 
 TRAIN = STICKSLIP.with_name("stickslip-train")
 
@@ -153,7 +153,7 @@ def test_a_grown_grid_runs_what_is_new(service: Service, job: dict[str, Any]) ->
 
 
 def test_training_learns_from_the_pulled_dataset(directory: Path) -> None:
-    rods = RodDataset(directory, views=True)
+    rods = Samples(directory, arrays=["centerline", "curvature", "views"])
     (batch,) = rods.loader(8)
     assert batch["views"].shape == (len(rods), 4, 224, 224, 3)
     done = subprocess.run(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from harness import Service, read_arrays
 from stickslip_sim_core.character import bones, figure
-from stickslip_training.kinds import open_samples
+from stickslip_training.data.samples import Samples
 
 SPEC: dict[str, Any] = {
     "kind": "shawl",
@@ -55,7 +55,7 @@ def test_from_spec_to_training_batch(service: Service) -> None:
     assert set(np.unique(arrays["segmentation"][0])) >= {1, 2, 3}
     clip = arrays["video"][0].astype(float)
     assert np.abs(clip[2] - clip[1]).mean() > 0.3
-    (batch,) = open_samples(directory, "train").loader(2)
+    (batch,) = Samples(directory, "train").loader(2)
     assert batch["video"].shape == (2, 3, 224, 224, 3)
     assert np.allclose(batch["self_friction"], 0.4)
     assert batch.names("viewpoint") == ["front", "front"]

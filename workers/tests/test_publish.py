@@ -206,4 +206,4 @@ def test_a_version_has_a_card_that_is_true(make_dataset: Make, monkeypatch: pyte
     names: dict[str, Any] = {}
     exec(first, names)
     assert names["sample"].any()
-    assert "open_samples" in second  # whose package workers may not import: tests/ run it
+    assert "Samples" in second  # whose package workers may not import: tests/ run it

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.samples import Samples
 from stickslip_training.data.sources import BucketSource, open_source
-from stickslip_training.kinds import open_samples
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-training[s3]'")
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
@@ -63,7 +63,7 @@ def test_a_sample_is_one_request(clips_url, server, monkeypatch):
 
 
 def test_workers_that_are_spawned_read_it(clips_url, clips):
-    dataset = open_samples(clips_url, "train")
+    dataset = Samples(clips_url, "train")
     loader = dataset.loader(2, num_workers=1, multiprocessing_context="spawn")
     found = {int(slot): video for batch in loader for slot, video in zip(batch["slot"], batch["video"], strict=True)}
     assert sorted(found) == dataset.slots.tolist()

@@ -14,7 +14,7 @@ from stickslip_training.data.errors import (
     RejectedSampleError,
 )
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.kinds import open_samples
+from stickslip_training.data.samples import Samples
 
 
 def write_sections(made, **changes):
@@ -73,8 +73,8 @@ def test_it_is_read_like_any_other(clips, sectioned):
                 reader.read("video", [rejection.slot])
         again = pickle.loads(pickle.dumps(reader))
         assert np.array_equal(again.read("mu", [0]), whole.read("mu", [0]))
-    keys = open_samples(sectioned.root, "train")[0]["sample_key"]
-    first = int(open_samples(clips.root, "train").slots[0])
+    keys = Samples(sectioned.root, "train")[0]["sample_key"]
+    first = int(Samples(clips.root, "train").slots[0])
     assert bytes(keys.tolist()) == bytes.fromhex(clips.manifest.sample_keys[first])
 
 

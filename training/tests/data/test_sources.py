@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.samples import Samples
 from stickslip_training.data.sources import HttpSource
-from stickslip_training.kinds.rod_hang import RodDataset
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -122,7 +122,7 @@ def test_verify_reads_every_file(server, seen_rods):
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_make_connections_of_their_own(server, seen_rods, method):
-    dataset = RodDataset(_url(server), views=True)
+    dataset = Samples(_url(server), arrays=["centerline", "views"])
     dataset[0]  # the parent is connected already
     loader = dataset.loader(2, num_workers=2, multiprocessing_context=multiprocessing.get_context(method))
     for batch in loader:

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 import torch
+from stickslip_training.data.samples import Samples
 from stickslip_training.data.stream import Stream
-from stickslip_training.kinds import open_samples
 
 
 def slots(stream: Stream, count: int | None = None) -> list[list[int]]:
@@ -25,8 +25,8 @@ def flat(batches) -> list[int]:
 
 @pytest.fixture
 def samples(rods):
-    with open_samples(rods.root, "train").reader as reader:
-        yield open_samples(reader, "train")
+    with Samples(rods.root, "train").reader as reader:
+        yield Samples(reader, "train")
 
 
 def test_an_epoch_has_every_sample_once_in_an_order_of_its_own(samples):
@@ -71,7 +71,7 @@ def test_processes_share_the_rounds(samples):
 
 
 def test_batches_are_those_of_the_dataset(clips):
-    dataset = open_samples(clips.root, "train")
+    dataset = Samples(clips.root, "train")
     batch = next(iter(Stream(dataset, 2, seed=0)))
     for place, slot in enumerate(batch["slot"].tolist()):
         assert torch.equal(batch["video"][place], torch.from_numpy(clips.arrays["video"][slot]))
@@ -94,7 +94,7 @@ def test_a_state_of_another_order_is_refused(samples, change, message):
 
 
 def test_a_state_of_another_dataset_is_refused(samples, clips):
-    other = Stream(open_samples(clips.root, "train"), 3, seed=1)
+    other = Stream(Samples(clips.root, "train"), 3, seed=1)
     with pytest.raises(ValueError, match="manifest of the stream"):
         other.load_state_dict(Stream(samples, 3, seed=1).state_dict())
 

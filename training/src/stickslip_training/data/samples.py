@@ -1,12 +1,12 @@
-"""What the torch datasets of all kinds have in common; `stickslip_training.kinds` says what the samples of a kind hold.
+"""Samples of a dataset of any kind as batches for PyTorch.
 
-They are map-style, and read a whole batch at a time (`__getitems__`) into one buffer, so that `collate` has nothing to
+`Samples` is map-style, and reads a whole batch at a time (`__getitems__`) into one buffer, so `collate` has nothing to
 do: give it to a DataLoader as `collate_fn`, or let `loader()` do that.
 
 A buffer that is used again costs less than a new one, which the kernel has to map and clear: clips read into reused
-buffers cost about a third (benchmarks/reader.py). With `ring=n`, n buffers are used in turn, and **a batch is valid
-until n further batches have been drawn**: use it or copy it before. In the workers of a DataLoader every batch has a
-buffer of its own whatever `ring` says, for a worker reads ahead and hands its batches over by reference.
+buffers cost a sixth less (benchmarks/results/reader.json). With `ring=n`, n buffers are used in turn, and **a batch is
+valid until n further batches have been drawn**: use it or copy it before. In the workers of a DataLoader every batch
+has a buffer of its own, for a worker reads ahead and hands its batches over by reference.
 
 The clips of a batch are tensors with strides: rows of all frames are together in memory, as they are on disk. Use
 `reshape`, not `view`, or `contiguous()`.
@@ -14,10 +14,11 @@ The clips of a batch are tensors with strides: rows of all frames are together i
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from stickslip_training.arrays import Array
@@ -64,31 +65,48 @@ def collate(batch: Any) -> Batch:
     return batch
 
 
-class SampleDataset(Dataset[Item]):
-    """Samples of one split: `arrays` are read sample by sample, `labels` are in memory."""
+class Samples(Dataset[Item]):
+    """Samples of one split: arrays are read sample by sample, labels are in memory.
 
-    kind: ClassVar[str]
-    """The kind of dataset that the class reads."""
+    An item holds the arrays and labels that were asked for, by name, and `slot` int64 and `sample_key` uint8 (32,).
+    Labels are float32 where they are quantities, and int64 where they are codes or counts: `item.name("material")` and
+    `batch.names("material")` name a category.
+    """
 
     def __init__(
         self,
         source: str | os.PathLike[str] | DatasetReader,
-        split: Split | None,
+        split: Split | None = None,
         *,
-        arrays: Sequence[str],
-        labels: Sequence[str],
-        ring: int,
+        arrays: Sequence[str] | None = None,
+        labels: Sequence[str] | None = None,
+        ring: int = 0,
     ) -> None:
+        """Open `split` of a dataset, or all of it.
+
+        Args:
+            source: A directory, a URL or an open reader.
+            split: The split; None takes all samples.
+            arrays: Arrays of an item; by default the video, or all curves of a dataset without videos.
+            labels: Labels of an item; by default all that are one number.
+            ring: Buffers that are used in turn; 0 makes a new one for each batch.
+
+        Raises:
+            ValueError: The dataset has no such array, or `ring` is negative.
+        """
         if ring < 0:
             raise ValueError(f"ring must be a number of buffers, 0 for a new one each time, and is {ring}")
         self.reader = source if isinstance(source, DatasetReader) else DatasetReader(source)
-        if self.reader.kind != self.kind:
-            raise ValueError(
-                f"kind of the dataset must be {self.kind} for a {type(self).__name__}: it is {self.reader.kind}"
-            )
+        known = self.reader.arrays
+        if arrays is None:
+            curves = [array.name for array in known.values() if not array.is_label and not array.per_sample]
+            arrays = ["video"] if "video" in known else curves
+        if labels is None:
+            common = {array.name for array in COMMON_ARRAYS}
+            labels = [name for name in self.reader.label_names if not known[name].shape and name not in common]
         for name in arrays:
-            if name not in self.reader.arrays:
-                raise ValueError(f"the dataset has no array {name}; it has {', '.join(self.reader.arrays)}")
+            if name not in known:
+                raise ValueError(f"the dataset has no array {name}; it has {', '.join(known)}")
         self.split = split
         self.slots = self.reader.slots(split)
         """Slot in the dataset of each item, int64 (items,)."""
@@ -133,7 +151,7 @@ class SampleDataset(Dataset[Item]):
         return DataLoader(self, batch_size=batch_size, shuffle=shuffle, collate_fn=collate, **options)
 
     def close(self) -> None:
-        """Let go of connections."""
+        """Close connections."""
         self.reader.close()
 
     def _sample_keys(self, slots: Array) -> torch.Tensor:

@@ -7,7 +7,7 @@ import numpy as np
 import torch.distributed
 from torch.utils.data import DataLoader
 
-from stickslip_training.data.samples import Batch, SampleDataset, collate
+from stickslip_training.data.samples import Batch, Samples, collate
 
 
 class Stream:
@@ -24,7 +24,7 @@ class Stream:
 
     def __init__(
         self,
-        dataset: SampleDataset,
+        dataset: Samples,
         batch_size: int,
         *,
         seed: int = 0,

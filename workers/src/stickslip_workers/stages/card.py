@@ -65,7 +65,7 @@ def card(manifest: Manifest) -> bytes:
         f'sample = group["{_telling_array(spec)}"][int(valid.argmax())]\n```',
         "Read `valid` first: a rejected sample keeps its slot and holds fill values. The reader of stickslip checks "
         "every file against `manifest.json` and raises an error where one is missing or damaged:",
-        '```python\nfrom stickslip_training.kinds import open_samples\n\ntrain = open_samples(".", "train")\n```',
+        '```python\nfrom stickslip_training.data.samples import Samples\n\ntrain = Samples(".", "train")\n```',
         "## How to check it",
         "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every other file"
         f"{_in_sections(manifest)}. "
