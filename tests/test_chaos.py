@@ -25,12 +25,12 @@ from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import samples
 from stickslip_schemas.store import DirectoryStore, Store, open_store
 from stickslip_services.database.opening import connect
 from stickslip_services.queue.audit import audit
 from stickslip_services.settings import Settings
 from stickslip_sim_core import solve_rods
+from stickslip_testing.samples import samples
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import LocalStore, ObjectStore
 

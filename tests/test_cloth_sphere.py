@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from harness import Service, read_arrays
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_training.data.samples import Samples
 
 SPEC: dict[str, Any] = {

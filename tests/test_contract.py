@@ -17,7 +17,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_sphere import ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.kinds.shawl import BONES, SKIN_TRIANGLES, SKIN_VERTICES, ShawlSpec, Swing
-from stickslip_schemas.plan.points import keyed_points, samples
+from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
 from stickslip_services.queue.plan import Terms
@@ -29,6 +29,7 @@ from stickslip_sim_core.cloth.bodies import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_sim_core.scenes import cloth_sphere, shawl
+from stickslip_testing.samples import samples
 from stickslip_testing.worker import BUILDS
 from stickslip_training.benchmark.sets import load_set
 from stickslip_workers.kinds import kind

@@ -17,10 +17,10 @@ from stickslip_schemas.kinds.cloth.names import Lighting, Substrate
 from stickslip_schemas.kinds.cloth.spec import ClothRender
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import samples
 from stickslip_schemas.spec.appearance import Calibration
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.fabrics import Texture
+from stickslip_testing.samples import samples
 
 BUILDS = Builds(sim_core="1" * 64, simulate="2" * 64, render="3" * 64, pack="4" * 64)
 LAB: dict[str, Any] = {

@@ -7,7 +7,8 @@ from pydantic import ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import publish_key, samples
+from stickslip_schemas.plan.points import publish_key
+from stickslip_testing.samples import samples
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 

@@ -12,18 +12,11 @@ from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.kinds.shawl import ShawlViewpoint
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import (
-    Sample,
-    dataset_id,
-    pack_key,
-    publish_key,
-    render_key,
-    samples,
-    simulation_key,
-    split_of,
-)
+from stickslip_schemas.plan.grid import dataset_id
+from stickslip_schemas.plan.points import pack_key, publish_key
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.fabrics import Material, Texture
+from stickslip_testing.samples import Sample, render_key, samples, simulation_key, split_of
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 

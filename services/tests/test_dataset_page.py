@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.format.manifest import Contents, Manifest, Rejection
-from stickslip_schemas.plan.points import dataset_id, samples
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_services.coordinator import make_app
 from stickslip_services.pages.dataset_page import LISTED, dataset_page
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed, rods
+from stickslip_testing.samples import samples
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import BUILDS, PretendWorker, rejection
 

@@ -18,8 +18,9 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import dataset_id, samples
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.arrays import FORMAT, SPLITS, ArrayLayout, describe
+from stickslip_testing.samples import samples
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
 POINTS = 150

@@ -18,8 +18,9 @@ from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry, Rejection
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import dataset_id, samples
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import DirectoryStore
+from stickslip_testing.samples import samples
 from stickslip_workers.cluster import Cluster
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish

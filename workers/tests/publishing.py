@@ -6,7 +6,7 @@ from typing import Any
 from stickslip_schemas.documents.tasks import PackOutput, PublishSection, PublishTask
 from stickslip_schemas.format.manifest import Rejection, section_samples
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
 

@@ -23,12 +23,13 @@ from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
 from stickslip_schemas.kinds.cloth.spec import PICTURE_DECIBELS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import dataset_id, samples
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
 from stickslip_sim_core import Fabric, fabric
 from stickslip_sim_core.scenes import cloth_drag
+from stickslip_testing.samples import samples
 from stickslip_workers.stages import pack as pack_module
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from stickslip_schemas.base.keys import canonical_json, sha256
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import samples
 from stickslip_schemas.spec.arrays import SPLITS
+from stickslip_testing.samples import samples
 from stickslip_training.benchmark import sets
 from stickslip_training.benchmark.records import enter, read_record, table, with_tables
 from stickslip_training.benchmark.rods import NOISES, RodTask

@@ -15,7 +15,7 @@ from stickslip_schemas.format.manifest import (
     check_seal,
     seal_text,
 )
-from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
 from stickslip_services.database.tables import dataset_versions, datasets

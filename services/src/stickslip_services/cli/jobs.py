@@ -8,7 +8,7 @@ from rich.table import Table
 from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.format.layout import bytes_estimate
-from stickslip_schemas.plan.counting import count
+from stickslip_schemas.plan.grid import count
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.addresses import DEFAULT_URL

@@ -5,7 +5,7 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.plan.points import grid
+from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.pages.grid_map import MOST_SAMPLES

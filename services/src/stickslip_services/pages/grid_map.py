@@ -7,7 +7,7 @@ from itertools import combinations, islice
 from typing import Any
 
 from stickslip_schemas.base.states import TaskState
-from stickslip_schemas.plan.points import grid
+from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.jobs import JobSpec
 
 CELLS = 12

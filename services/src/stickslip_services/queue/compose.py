@@ -12,7 +12,7 @@ from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask,
 from stickslip_schemas.format.manifest import section_samples
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
 

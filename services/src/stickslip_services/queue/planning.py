@@ -11,10 +11,9 @@ from itertools import islice
 from typing import Any
 
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.plan.points import KeyedPoint, keyed_points, pack_key, publish_key
+from stickslip_schemas.plan.points import Shard, publish_key, shards
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.database.database import batches
 from stickslip_services.queue.plan import Plan, PlannedSample, PlannedTask, Terms
 
 _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
@@ -54,30 +53,30 @@ def pieces(
     Together they are the plan that `expand` returns, however they are cut. Who goes on from slot `first` gives the keys
     of the pack tasks before it, in order.
     """
-    builds, per_shard = terms.builds, spec.samples_per_shard
+    per_shard = spec.samples_per_shard
     previewed = preview_slots(spec.sample_count, previews)
     pack_keys = list(packed)
-    shards = enumerate(batches(keyed_points(spec, builds, first=first), per_shard), start=first // per_shard)
-    while some := list(islice(shards, -(-size // per_shard))):
+    waiting = shards(spec, terms.builds, first=first // per_shard)
+    while some := list(islice(waiting, -(-size // per_shard))):
         yield _piece(spec, terms, some, previewed, pack_keys)
 
 
 def _piece(
     spec: JobSpec,
     terms: Terms,
-    shards: Sequence[tuple[int, list[KeyedPoint]]],
+    some: Sequence[Shard],
     previewed: set[int],
     pack_keys: list[str],
 ) -> Plan:
     """Return the plan of some shards; add the keys of their pack tasks to `pack_keys`."""
     builds = terms.builds
-    plan = Plan(spec, shards[0][1][0].slot)
+    plan = Plan(spec, some[0].points[0].slot)
     tasks_by_key = plan.tasks
     packs: dict[bytes, PlannedTask] = {}
     renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by shading: those that can be made together
-    for shard, members in shards:
+    for shard in some:
         last: dict[bytes, None] = {}  # an ordered set: a grid may have one sample in two slots
-        for point in members:
+        for point in shard.points:
             key = simulate = bytes.fromhex(point.simulation_key)
             render: bytes | None = None
             if simulate not in tasks_by_key:
@@ -93,10 +92,9 @@ def _piece(
                     group[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview, cost)
             last[key] = None
             plan.samples.append(PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text))
-        name = pack_key(spec, shard, members, builds)
-        pack_keys.append(name)
-        payload = json.dumps({"shard": shard})
-        packs[bytes.fromhex(name)] = PlannedTask(_PACK, builds.pack, payload, tuple(last))
+        pack_keys.append(shard.pack_key)
+        payload = json.dumps({"shard": shard.number})
+        packs[bytes.fromhex(shard.pack_key)] = PlannedTask(_PACK, builds.pack, payload, tuple(last))
     for group in renders.values():
         tasks_by_key.update(group)
     tasks_by_key.update(packs)

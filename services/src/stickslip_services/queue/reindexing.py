@@ -13,7 +13,7 @@ from stickslip_schemas.base.keys import Sha256, sha256
 from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
-from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import ShownVersion, Store, in_parallel
 
 from stickslip_services.catalog.versions import (

@@ -5,7 +5,7 @@ from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.documents.responses import Validation
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.counting import count
+from stickslip_schemas.plan.grid import count
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.database import Database, batches

@@ -13,7 +13,7 @@ from stickslip_schemas.format.codecs import decode_sample
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.format.pictures import labelled, moving, sheet
-from stickslip_schemas.plan.points import grid
+from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis

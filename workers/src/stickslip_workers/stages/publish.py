@@ -26,7 +26,7 @@ from stickslip_schemas.format.manifest import (
     section_samples,
     with_manifest_digest,
 )
-from stickslip_schemas.plan.points import dataset_id
+from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 

@@ -1,21 +1,46 @@
-"""How many samples, simulations, renders and shards a spec means, from its axes and without walking the grid."""
+"""The points of a parameter grid, and the numbers of samples and tasks without walking it."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from math import ceil, prod
+from typing import Any
 
 import numpy as np
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.spec.arrays import SPLITS
-from stickslip_schemas.spec.axes import AnyAxis, ListAxis, range_values
+from stickslip_schemas.spec.axes import AnyAxis, ListAxis, axis_values, range_values
 from stickslip_schemas.spec.jobs import JobSpec, SeedRule
+
+
+def dataset_id(spec: JobSpec) -> str:
+    """Return the id of the dataset that answers `spec`: the same spec has the same dataset, in any build."""
+    return f"ds-{spec.content_digest[:16]}"
+
+
+def grid(spec: JobSpec) -> Iterator[dict[str, Any]]:
+    """Yield the point of the parameter grid of each sample, in the order of the slots."""
+    names = tuple(spec.named_axes)
+    for point in combined(spec, columns_of(spec)):
+        yield dict(zip(names, point, strict=True))
+
+
+def columns_of(spec: JobSpec) -> list[list[Any]]:
+    """Return the values of each axis, in order."""
+    zipped = spec.combine == "zip"
+    axes = spec.named_axes.values()
+    return [axis_values(axis, dimension=position if zipped else 0) for position, axis in enumerate(axes)]
+
+
+def combined(spec: JobSpec, columns: Sequence[Iterable[Any]]) -> Iterator[tuple[Any, ...]]:
+    """Combine one column of cells for each axis as the spec says: all with all, or row by row."""
+    return zip(*columns, strict=True) if spec.combine == "zip" else product(*columns)
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What a spec means, in numbers."""
+    """Numbers of samples and tasks of a spec."""
 
     samples: int
     simulations: int
