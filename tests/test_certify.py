@@ -13,7 +13,7 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.cli import app
 from stickslip_services.client.http import Client
 from stickslip_services.local.certifying import read_certificate
-from stickslip_testing.servers import RunningServer, start_server
+from stickslip_testing.servers import RunningServer, served
 from stickslip_testing.worker import BUILDS
 from typer.testing import CliRunner, Result
 
@@ -26,9 +26,8 @@ NOBODY = "http://127.0.0.1:9"
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
-    running = start_server(tmp_path_factory.mktemp("certify") / "data")
-    yield running
-    running.stop()
+    with served(tmp_path_factory.mktemp("certify") / "data") as running:
+        yield running
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from stickslip_services.database.opening import connect
 from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock
-from stickslip_testing.servers import RunningServer, start_server
+from stickslip_testing.servers import RunningServer, served
 from stickslip_testing.worker import PretendWorker
 
 if TYPE_CHECKING:
@@ -130,15 +130,13 @@ def worker(coordinator: Coordinator) -> PretendWorker:
 
 @pytest.fixture
 def server(tmp_path: Path, database: str) -> Iterator[RunningServer]:
-    """A coordinator of its own for one test."""
-    running = start_server(tmp_path / "data")
-    yield running
-    running.stop()
+    """A server for one test."""
+    with served(tmp_path / "data") as running:
+        yield running
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
-    """A coordinator for all tests of a module that do not disturb each other."""
-    running = start_server(tmp_path_factory.mktemp("shared") / "data")
-    yield running
-    running.stop()
+    """A server for all tests that do not depend on its other jobs."""
+    with served(tmp_path_factory.mktemp("shared") / "data") as running:
+        yield running

@@ -19,7 +19,7 @@ from stickslip_services.cli import app as cli
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import RunningServer, serving, start_server, wait_until
+from stickslip_testing.servers import serving, start_server, wait_until
 from typer.testing import CliRunner
 
 WORKER_PATHS = ("/v1/workers", "/v1/worker/lease", "/v1/worker/heartbeat", "/v1/worker/report")
@@ -269,7 +269,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_a_coordinator_speaks_tls_and_wants_keys(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
     files = [str(path) for path in certificate]
-    server: RunningServer = start_server(
+    server = start_server(
         tmp_path / "data", options=["--host", "0.0.0.0", "--tls-certificate", files[0], "--tls-key", files[1]]
     )
     try:

@@ -61,8 +61,8 @@ def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningSer
     assert "it [fell] off" in shown
     assert json.loads(cli("show", job, "--json").stdout)["state"] == "succeeded_with_rejects"
     assert job in cli("jobs").stdout
-    assert [item["id"] for item in json.loads(cli("jobs", "--json").stdout)] == [job]
-    (dataset,) = json.loads(cli("datasets", "--json").stdout)
+    assert json.loads(cli("jobs", "--json").stdout)[0]["id"] == job
+    dataset = json.loads(cli("datasets", "--json").stdout)[0]
     assert f"{dataset['id']}:v1" in cli("datasets").stdout
     pulled = cli("pull", dataset["id"], tmp_path / "d")
     assert "8 files downloaded" in pulled.stdout, pulled.output

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import httpx
 import pytest
@@ -14,7 +15,7 @@ from stickslip_services.api import connections
 from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import RunningServer, serving
+from stickslip_testing.servers import ServerProcess, serving, start_server
 
 HEADERS = b"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
 HALF_HEADERS = HEADERS[:30]
@@ -29,7 +30,15 @@ def connect(url: str, opening: bytes) -> socket.socket:
     return connection
 
 
-def test_600_half_open_requests_are_closed_within_20_seconds(server: RunningServer) -> None:
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[ServerProcess]:
+    """A server that does not share the file descriptors of the test."""
+    running = start_server(tmp_path / "data")
+    yield running
+    running.stop()
+
+
+def test_600_half_open_requests_are_closed_within_20_seconds(server: ServerProcess) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     begin = time.monotonic()

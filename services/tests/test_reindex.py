@@ -22,7 +22,7 @@ from stickslip_services.queue.coordinator import Coordinator
 from stickslip_services.queue.reindexing import reindex
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
-from stickslip_testing.servers import start_server
+from stickslip_testing.servers import served
 from stickslip_testing.worker import PretendWorker, rejection
 from typer.testing import CliRunner, Result
 
@@ -74,14 +74,11 @@ def test_datasets_are_found_again(settings: Settings, made: dict[str, object], t
     assert "2 versions found again, 0 known before, 0 left out" in result.stderr
     again = run(settings)
     assert "0 versions found again, 2 known before, 0 left out" in again.stderr
-    server = start_server(settings.data)
-    try:
+    with served(settings.data) as server:
         for dataset in made:
             pulled = CliRunner().invoke(app, ["pull", dataset, str(tmp_path / dataset), "--url", server.url])
             assert pulled.exit_code == 0, pulled.output
             assert CliRunner().invoke(app, ["verify", str(tmp_path / dataset)]).exit_code == 0
-    finally:
-        server.stop()
     coordinator = Coordinator(settings)
     coordinator.start()
     found = {dataset.id: dataset for dataset in list_datasets(coordinator)}

@@ -27,7 +27,9 @@ from stickslip_schemas.documents.worker_api import (
 )
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.api.connections import PatientProtocol
+from stickslip_services.coordinator import make_app
 from stickslip_services.local.process import listen
+from stickslip_services.settings import Settings
 
 from stickslip_testing.worker import PretendWorker
 
@@ -36,24 +38,30 @@ A = TypeVar("A", bound=BaseModel)
 
 @dataclass
 class RunningServer:
-    """A coordinator as a process of its own."""
+    """A coordinator that answers over HTTP."""
 
     url: str
     data: Path
-    process: "subprocess.Popen[str]"
 
     @property
     def store(self) -> DirectoryStore:
-        """Its store."""
+        """The store of the coordinator."""
         return DirectoryStore(self.data / "store")
 
     def worker(self, **options: Any) -> PretendWorker:
-        """Return a worker that has registered."""
+        """Return a registered worker that calls the server over HTTP."""
         key = (self.data / "worker-key").read_text().strip()
         return PretendWorker(HttpApi(self.url, key), self.store, **options).register()
 
+
+@dataclass
+class ServerProcess(RunningServer):
+    """A coordinator in a separate process."""
+
+    process: "subprocess.Popen[str]"
+
     def stop(self) -> None:
-        """Stop it."""
+        """Stop the process."""
         self.process.terminate()
         self.process.wait(20)
         if self.process.stdout is not None:
@@ -61,13 +69,13 @@ class RunningServer:
 
 
 class HttpApi:
-    """The four verbs of the worker API over HTTP."""
+    """The worker API over HTTP."""
 
     def __init__(self, url: str, key: str, post: Callable[..., httpx.Response] | None = None) -> None:
         self._url = url
         self._key = key
         self._send = post or partial(httpx.post, trust_env=False)
-        """Sends requests; by default each over a connection of its own."""
+        """Sends a request; by default over a new connection."""
 
     def register(self, document: WorkerRegistration) -> WorkerSession:
         """Register a worker."""
@@ -110,8 +118,15 @@ def serving(app: FastAPI) -> Iterator[str]:
         listener.close()
 
 
-def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> RunningServer:
-    """Start a coordinator and wait until it answers."""
+@contextmanager
+def served(data: Path) -> Iterator[RunningServer]:
+    """Serve a coordinator with the data directory `data` from a thread of this process, which starts in 0.2 s."""
+    with serving(make_app(Settings(data=data, durable=False))) as url:
+        yield RunningServer(url, data)
+
+
+def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> ServerProcess:
+    """Start a coordinator in a separate process, which takes 2 s, and wait until it answers."""
     command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", str(port)]
     command += options
     log = (data.parent / f"{data.name}.log").open("ab")
@@ -120,12 +135,12 @@ def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> Runn
     assert process.stdout is not None
     words = process.stdout.readline().split()
     assert words, "the coordinator did not start"
-    return RunningServer(words[-1], data, process)
+    return ServerProcess(words[-1], data, process)
 
 
 def wait_until(condition: Callable[[], bool], *, seconds: float = 20.0) -> None:
     """Return when `condition` holds; fail after `seconds`."""
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, "it did not come to pass"
+        assert time.monotonic() < deadline, f"the condition did not hold within {seconds:g} s"
         time.sleep(0.02)
