@@ -136,53 +136,27 @@ def _contents(client: Client, dataset: str) -> Contents:
 
 
 @shows_errors
-def export(
-    dataset: Annotated[str, typer.Argument(metavar="DATASET[:vN]", help="or a directory, or the URL of a version")],
-    hdf5: Annotated[Path | None, typer.Option(metavar="FILE", help="one HDF5 file")] = None,
-    webdataset: Annotated[Path | None, typer.Option(metavar="DIR", help="tar files for WebDataset")] = None,
-    huggingface: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Parquet files for Hugging Face datasets")
-    ] = None,
-    usd: Annotated[Path | None, typer.Option(metavar="DIR", help="moving meshes of cloth for USD")] = None,
-    obj: Annotated[Path | None, typer.Option(metavar="DIR", help="meshes of cloth, one file an instant")] = None,
-    arrays: ArraysOption = None,
-    split: SplitOption = None,
-    where: WhereOption = None,
-    gzip: Annotated[int | None, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = None,
-    licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
-    url: UrlOption = DEFAULT_URL,
-) -> None:
-    """Export a dataset to a format of another library, with Croissant metadata. Existing files are not overwritten.
+def export(context: typer.Context, url: UrlOption = DEFAULT_URL) -> None:
+    """Export a dataset to a format of another library, with Croissant metadata.
 
-    Needs the training package: pip install 'stickslip-training[export]'.
+    Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes the URL of a version.
     """
-    source = dataset
-    if _ID.match(dataset):
-        with Client(url) as client:
-            name, version = _resolve(client, dataset)
-        source = f"{coordinator_url(url)}/v1/datasets/{name}/versions/{version}"
-    options = {
-        "--hdf5": hdf5,
-        "--webdataset": webdataset,
-        "--huggingface": huggingface,
-        "--usd": usd,
-        "--obj": obj,
-        "--arrays": arrays,
-        "--split": split,
-        "--gzip": gzip,
-        "--license": licence,
-    }
-    given = [text for name, value in options.items() if value is not None for text in (name, str(value))]
-    given += [text for condition in where or () for text in ("--where", condition)]
     if find_spec("stickslip_training") is None:
         raise ClientError("`stickslip export` needs the training package: pip install 'stickslip-training[export]'")
+    arguments = [_version_url(argument, url) if _ID.match(argument) else argument for argument in context.args]
     key = os.environ.get("STICKSLIP_KEY")
     ended = subprocess.run(
-        [sys.executable, "-m", "stickslip_training.cli", "export", source, *given],
+        [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
         env=os.environ | ({"STICKSLIP_API_KEY": key} if key else {}),
         check=False,
     )
     raise typer.Exit(ended.returncode)
+
+
+def _version_url(dataset: str, url: str) -> str:
+    with Client(url) as client:
+        name, version = _resolve(client, dataset)
+    return f"{coordinator_url(url)}/v1/datasets/{name}/versions/{version}"
 
 
 _ID = re.compile(r"ds-[0-9a-f]{16}(:|$)")

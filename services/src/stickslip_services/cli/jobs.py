@@ -1,5 +1,6 @@
-"""Commands for jobs: validate, submit, list, watch, pause, prioritise and cancel."""
+"""Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise and cancel."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -26,7 +27,7 @@ from stickslip_services.cli.common import (
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.cli.specs import check_spec, read_spec
 from stickslip_services.cli.watch import GOOD, watch
-from stickslip_services.client.errors import UnreachableError
+from stickslip_services.client.errors import ClientError, UnreachableError
 from stickslip_services.client.http import Client
 from stickslip_services.units import duration, size
 
@@ -227,3 +228,36 @@ def prioritise(
     with Client(url) as client:
         job = client.prioritise(job_id, priority)
     console().print(f"{job.id} has priority {job.priority}")
+
+
+@shows_errors
+def upload(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="square PNG or JPEG files")],
+    url: UrlOption = DEFAULT_URL,
+    as_json: JsonOption = False,
+) -> None:
+    """Upload pictures as textures, and print their entries for `textures` in a spec."""
+    found = []
+    with Client(url) as client:
+        for file in files:
+            try:
+                data = file.read_bytes()
+            except OSError as error:
+                raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
+            try:
+                found.append(client.upload_texture(data))
+            except ClientError as error:
+                raise ClientError(f"{file} was refused: {error}") from error
+    if as_json:
+        return print_json(found)
+    say("In a spec, under any names:")
+    console().print("textures:")
+    for file, entry in zip(files, found, strict=True):
+        console().print(f"  {_name(file)}: {entry.texture}")
+    return None
+
+
+def _name(file: Path) -> str:
+    """Return the name of a texture, from the name of its file."""
+    word = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in file.stem.lower())
+    return word.strip("-")[:60] or "custom"

@@ -10,12 +10,21 @@ from stickslip_services.cli.admin import audit_log, keys, projects, webhooks
 from stickslip_services.cli.certificates import certificates, certify, register
 from stickslip_services.cli.datasets import app as datasets
 from stickslip_services.cli.datasets import export, pull_dataset, verify
-from stickslip_services.cli.jobs import cancel, jobs, pause, prioritise, resume, show, submit, validate, watch_job
+from stickslip_services.cli.jobs import (
+    cancel,
+    jobs,
+    pause,
+    prioritise,
+    resume,
+    show,
+    submit,
+    upload,
+    validate,
+    watch_job,
+)
 from stickslip_services.cli.maintenance import gc, reindex, rm
 from stickslip_services.cli.scenes import simulate
-from stickslip_services.cli.textures import upload
-from stickslip_services.cli.up import up
-from stickslip_services.cli.workers import workers
+from stickslip_services.cli.service import up, workers
 
 app = typer.Typer(
     name="stickslip",
@@ -48,7 +57,6 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "cancel": cancel,
     "pull": pull_dataset,
     "verify": verify,
-    "export": export,
     "rm": rm,
     "gc": gc,
     "reindex": reindex,
@@ -61,6 +69,8 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 
 for _name, _command in _COMMANDS.items():
     app.command(name=_name)(_command)
+_PASSING = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+app.command(name="export", context_settings=_PASSING)(export)
 
 app.add_typer(datasets, name="datasets")
 app.add_typer(keys, name="keys")

@@ -1,6 +1,7 @@
-"""The command that runs a coordinator and a dispatcher on this machine."""
+"""Commands for the service: run it on this machine, and list its workers."""
 
 import re
+from datetime import UTC, datetime
 from pathlib import Path
 from socket import gethostname
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,9 +10,20 @@ import typer
 from rich.markup import escape
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, console
+from stickslip_services.cli.common import (
+    DEFAULT_DATA,
+    DatabaseOption,
+    JsonOption,
+    StoreOption,
+    UrlOption,
+    console,
+    print_json,
+    table,
+)
 from stickslip_services.cli.errors import shows_errors
+from stickslip_services.client.http import Client
 from stickslip_services.installed import require_server
+from stickslip_services.units import duration
 
 if TYPE_CHECKING:
     from stickslip_services.settings import Settings
@@ -80,3 +92,24 @@ def up(
         ),
     )
     raise typer.Exit(status)
+
+
+@shows_errors
+def workers(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+    """List the registered workers, newest first."""
+    with Client(url) as client:
+        found = client.workers()
+    if as_json:
+        return print_json(found)
+    shown = table("worker", "kinds", "slots", "tasks", "last seen", no_wrap=("worker",))
+    now = datetime.now(UTC)
+    for worker in found:
+        ago = duration(max(0.0, (now - worker.last_seen_at).total_seconds()))
+        shown.add_row(
+            worker.name,
+            ", ".join(worker.builds),
+            str(worker.slots),
+            str(worker.leased),
+            f"{ago} ago" if worker.alive else f"[red]{ago} ago: not connected[/]",
+        )
+    return console().print(shown)
