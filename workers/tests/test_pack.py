@@ -4,10 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zarr
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackTask
+from stickslip_schemas.format.chunks import decode_chunk, decode_shard_index
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.metadata import create_array
@@ -41,6 +43,28 @@ def test_files_are_those_of_zarr_python(make_dataset: Callable[..., Any], tmp_pa
 def test_packing_again_gives_the_same_files(make_dataset: Callable[..., Any]) -> None:
     made = make_dataset()
     assert [pack(task, made.store) for task in made.pack_tasks] == [pack(task, made.store) for task in made.pack_tasks]
+
+
+def test_a_rejected_slot_keeps_its_labels(make_dataset: Callable[..., Any]) -> None:
+    """What stages found before the rejection is kept, too; only what no stage could add is missing."""
+    made = make_dataset(count=4, per_shard=4, rejected=(2,))
+    (task,) = made.pack_tasks
+    slots = list(task.slots)
+    rejection = slots[2].rejection.model_copy(update={"labels": slots[2].labels | {"energy": 1.5}})
+    slots[2] = slots[2].model_copy(update={"rejection": rejection})
+    output = pack(task.model_copy(update={"slots": tuple(slots)}), made.store)
+    arrays = [array for array in layout(made.spec) if array.is_label]
+    data = made.store.read(output.labels)
+    read = {}
+    for array, (offset, length) in zip(arrays, decode_shard_index(data, len(arrays)), strict=True):
+        read[array.name] = np.empty((4, *array.shape), array.dtype)
+        decode_chunk(data[offset : offset + length], read[array.name])
+    assert read["valid"].tolist() == [True, True, False, True]
+    for name in ("gamma", "phi0", "phi1", "split", "sample_key"):
+        assert np.array_equal(read[name], made.arrays[name]), name
+    assert read["gamma"][2] == task.slots[2].labels["gamma"]
+    assert read["energy"][2] == 1.5
+    assert np.isnan(read["color"][2]).all()
 
 
 def _with_first_slot(task: PackTask, **changes: Any) -> PackTask:

@@ -16,7 +16,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpe
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 
 RODS: dict[str, Any] = {
     "kind": "rod_hang",

@@ -1,22 +1,18 @@
 """Content keys: pinned, and sensitive to exactly what a result depends on."""
 
-from dataclasses import replace
+import json
+from collections import Counter
 
 import pytest
-from stickslip_schemas.base.keys import canonical_json, content_key, derived_seed
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.kinds.cloth.arrays import KERNELS
-from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
 from stickslip_schemas.kinds.rod_hang import RodHangRender
-from stickslip_schemas.kinds.shawl import ShawlViewpoint
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
-from stickslip_schemas.plan.points import pack_key, publish_key
+from stickslip_schemas.plan.points import keyed_points, pack_key, publish_key, shards
 from stickslip_schemas.spec.arrays import SPLITS
-from stickslip_schemas.spec.fabrics import Material, Texture
-from stickslip_testing.samples import Sample, render_key, samples, simulation_key, split_of
+from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_testing.samples import Sample, samples, split_of
 
 BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
@@ -34,16 +30,6 @@ def one(
     }
     (sample,) = samples(job_spec_adapter.validate_python(document), builds)
     return sample
-
-
-def test_canonical_json_is_one_text() -> None:
-    assert canonical_json({"b": [1, 2.0, -0.0], "a": "µ"}) == '{"a":"\\u00b5","b":[1,2.0,0.0]}'
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        canonical_json(float("nan"))
-
-
-def test_purposes_keep_keys_apart() -> None:
-    assert content_key("one", 1) != content_key("two", 1)
 
 
 def test_pinned_keys() -> None:
@@ -103,16 +89,6 @@ def test_neighbours_in_the_grid_change_no_sample() -> None:
     assert all(after[key].split == sample.split for key, sample in before.items())
 
 
-def test_pack_and_publish_keys_hold_what_they_are_made_of() -> None:
-    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": [1, 2], "phi0": 1, "phi1": 6}})
-    first, second = samples(spec, BUILDS)
-    key = pack_key(spec, 0, [first, second], BUILDS)
-    assert key != pack_key(spec, 0, [second, first], BUILDS)
-    assert key != pack_key(spec, 1, [first, second], BUILDS)
-    assert key != pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"pack": "d" * 64}))
-    assert publish_key(spec, [key], BUILDS) != publish_key(spec, [key, key], BUILDS)
-
-
 GRID = {
     "kind": "cloth_drag",
     "axes": {
@@ -146,25 +122,120 @@ def test_renders_of_one_simulation_share_its_split() -> None:
     assert {split for splits in split_of.values() for split in splits} == {0, 1, 2}
 
 
-def test_split_shares_come_out() -> None:
-    spec = job_spec_adapter.validate_python(
-        {
-            "kind": "rod_hang",
-            "axes": {"gamma": {"type": "linspace", "start": 0, "stop": 1, "num": 4000}, "phi0": 1, "phi1": 6},
-            "views": None,
-        }
+SPLIT_SPEC = {
+    "kind": "rod_hang",
+    "axes": {"gamma": {"type": "linspace", "start": 0, "stop": 1, "num": 4000}, "phi0": 1, "phi1": 6},
+    "splits": {"train": 0.5, "validation": 0.35, "test": 0.15},
+    "views": None,
+}
+
+
+def test_each_split_has_its_share() -> None:
+    """Code 0 is train, 1 validation and 2 test; shares are within five standard deviations of 4000 draws."""
+    drawn = Counter(point.split for point in keyed_points(job_spec_adapter.validate_python(SPLIT_SPEC), BUILDS))
+    for split, share in enumerate((0.5, 0.35, 0.15)):
+        assert abs(drawn[split] / 4000 - share) < 5 * (share * (1 - share) / 4000) ** 0.5, SPLITS[split]
+
+
+@pytest.mark.parametrize("alone", SPLITS)
+def test_a_share_of_one_is_everything(alone: str) -> None:
+    shares = {name: float(name == alone) for name in SPLITS}
+    spec = job_spec_adapter.validate_python(GRID | {"splits": shares})
+    assert {SPLITS[point.split] for point in keyed_points(spec, BUILDS)} == {alone}
+
+
+def test_a_larger_training_share_only_takes_samples_from_validation() -> None:
+    """Validation follows train: the interval of test stays where it is."""
+    wide = SPLIT_SPEC | {"splits": {"train": 0.6, "validation": 0.25, "test": 0.15}}
+    moves = Counter(
+        (before.split, after.split)
+        for before, after in zip(
+            keyed_points(job_spec_adapter.validate_python(SPLIT_SPEC), BUILDS),
+            keyed_points(job_spec_adapter.validate_python(wide), BUILDS),
+            strict=True,
+        )
     )
-    counts = [0, 0, 0]
-    for sample in samples(spec, BUILDS):
-        counts[sample.split] += 1
-    # Binomial: five standard deviations of 4000 draws.
-    assert abs(counts[0] / 4000 - 0.8) < 5 * (0.8 * 0.2 / 4000) ** 0.5
-    assert abs(counts[2] / 4000 - 0.1) < 5 * (0.1 * 0.9 / 4000) ** 0.5
+    assert set(moves) == {(0, 0), (1, 1), (1, 0), (2, 2)}
 
 
-def test_seed_zero_is_a_seed() -> None:
-    assert derived_seed(0, "color", 1) != derived_seed(1, "color", 1)
-    assert derived_seed(0, "color", 1) == derived_seed(0, "color", 1)
+def test_another_seed_draws_other_splits() -> None:
+    first, second = (
+        [point.split for point in keyed_points(job_spec_adapter.validate_python(GRID | {"seed": seed}), BUILDS)]
+        for seed in (0, 1)
+    )
+    assert first != second
+
+
+def _rods(count: int = 5, **more: object) -> JobSpec:
+    axes = {"gamma": list(range(1, count + 1)), "phi0": 1, "phi1": 6}
+    return job_spec_adapter.validate_python({"kind": "rod_hang", "axes": axes, "samples_per_shard": 2, **more})
+
+
+def test_shards_are_whole_and_have_their_keys() -> None:
+    spec = _rods()
+    points = tuple(keyed_points(spec, BUILDS))
+    found = list(shards(spec, BUILDS))
+    assert [shard.number for shard in found] == [0, 1, 2]
+    assert [shard.points for shard in found] == [points[:2], points[2:4], points[4:]]
+    assert [shard.pack_key for shard in found] == [
+        pack_key(spec, shard.number, shard.points, BUILDS) for shard in found
+    ]
+
+
+@pytest.mark.parametrize("combine", ["product", "zip"])
+@pytest.mark.parametrize("first", [0, 1, 2, 3])
+def test_shards_go_on_from_any_number(first: int, combine: str) -> None:
+    axes = {"gamma": [1, 2, 3, 4, 5], "phi0": [1, 2, 3, 4, 5] if combine == "zip" else 1, "phi1": 6}
+    if combine == "zip":
+        axes["phi1"] = [6, 7, 8, 9, 10]
+    spec = _rods(axes=axes, combine=combine)
+    assert list(shards(spec, BUILDS, first=first)) == list(shards(spec, BUILDS))[first:]
+
+
+def test_a_pack_key_holds_what_a_shard_is_made_of() -> None:
+    spec = _rods(2)
+    first, second = keyed_points(spec, BUILDS)
+    key = pack_key(spec, 0, [first, second], BUILDS)
+    others = {
+        "order": pack_key(spec, 0, [second, first], BUILDS),
+        "number": pack_key(spec, 1, [first, second], BUILDS),
+        "samples": pack_key(spec, 0, [first], BUILDS),
+        "split": pack_key(spec, 0, [first._replace(split=(first.split + 1) % 3), second], BUILDS),
+        "build": pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"pack": "d" * 64})),
+        "samples_per_shard": pack_key(_rods(2, samples_per_shard=3), 0, [first, second], BUILDS),
+    }
+    assert len({key, *others.values()}) == 1 + len(others), others
+    assert key == pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"sim_core": "d" * 64}))
+
+
+def test_a_pack_key_holds_the_codes_of_labels() -> None:
+    document = {
+        "kind": "cloth_drag",
+        "materials": {"mine": {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}},
+        "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
+    }
+    (one,) = shards(job_spec_adapter.validate_python(document), BUILDS)
+    (two,) = shards(job_spec_adapter.validate_python(document | {"materials": {}}), BUILDS)
+    assert one.points == two.points
+    assert one.pack_key != two.pack_key
+
+
+def test_a_publish_key_holds_what_a_version_is_made_of() -> None:
+    spec = _rods(2)
+    key = publish_key(spec, ["a", "b"], BUILDS)
+    others = {
+        "order": publish_key(spec, ["b", "a"], BUILDS),
+        "shards": publish_key(spec, ["a"], BUILDS),
+        "spec": publish_key(_rods(2, seed=1), ["a", "b"], BUILDS),
+        "certificate": publish_key(spec, ["a", "b"], BUILDS, "c" * 64),
+        "other certificate": publish_key(spec, ["a", "b"], BUILDS, "d" * 64),
+        **{
+            stage: publish_key(spec, ["a", "b"], BUILDS.model_copy(update={stage: "e" * 64}))
+            for stage in ("sim_core", "simulate", "render", "pack")
+        },
+    }
+    assert len({key, *others.values()}) == 1 + len(others), others
+    assert key == publish_key(_rods(2, name="x"), ["a", "b"], BUILDS)
 
 
 PINNED: dict[str, object] = {
@@ -178,47 +249,7 @@ PINNED: dict[str, object] = {
 }
 
 
-def test_a_pack_key_holds_the_splits_and_the_arrays() -> None:
-    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": [1, 2], "phi0": 1, "phi1": 6}})
-    members = list(samples(spec, BUILDS))
-    moved = [replace(members[0], split=(members[0].split + 1) % 3), members[1]]
-    assert pack_key(spec, 0, moved, BUILDS) != pack_key(spec, 0, members, BUILDS)
-    document = {
-        "kind": "cloth_drag",
-        "materials": {"mine": {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}},
-        "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
-    }
-    one = job_spec_adapter.validate_python(document)
-    two = job_spec_adapter.validate_python(document | {"materials": {}})
-    members = list(samples(one, BUILDS))
-    assert [sample.key for sample in samples(two, BUILDS)] == [sample.key for sample in members]
-    assert pack_key(one, 0, members, BUILDS) != pack_key(two, 0, members, BUILDS)  # the codes of materials differ
-
-
-def test_codes_of_labels_are_pinned() -> None:
-    """A code is stored in datasets for good: a name may be added at the end, and none may move."""
-    assert {name: code for code, name in enumerate(Material)} == {
-        "11oz-black-denim": 0,
-        "camel-ponte-roma": 1,
-        "gray-interlock": 2,
-        "ivory-rib-knit": 3,
-        "navy-sparkle-sweat": 4,
-        "pink-ribbon-brown": 5,
-        "royal-target": 6,
-        "tango-red-jet-set": 7,
-        "white-dots-on-blk": 8,
-        "white-swim-solid": 9,
-    }
-    textures = ["checker", "dots", "stripes", "plaid", "gingham", "herringbone", "houndstooth", "floral"]
-    assert list(Texture)[:8] == textures
-    assert list(Viewpoint)[:3] == ["calibrated", "left", "right"]
-    assert list(SphereViewpoint) == ["front", "side", "high"]
-    assert list(ShawlViewpoint) == ["front", "side", "high"]
-    assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
-    assert SPLITS == ("train", "validation", "test")
-
-
-def test_documents_of_samples_are_those_that_are_keyed() -> None:
+def test_points_are_the_samples_of_the_models() -> None:
     """The fast way over texts and the plain way over models give the same keys, for every kind and optional axis."""
     own = {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}
     cloth = {"material": ["mine", "royal-target"], "mu": [0.3, 1.0], "texture": ["dots", "plaid"]}
@@ -248,11 +279,17 @@ def test_documents_of_samples_are_those_that_are_keyed() -> None:
     ]
     for document in documents:
         spec = job_spec_adapter.validate_python(document)
-        for sample in samples(spec, BUILDS):
-            assert sample.simulation_key == simulation_key(sample.simulation, BUILDS)
+        for slot, (point, sample) in enumerate(zip(keyed_points(spec, BUILDS), samples(spec, BUILDS), strict=True)):
+            assert point.slot == sample.slot == slot
+            assert point.labels == sample.labels
+            assert json.loads(point.labels_text) == sample.labels
+            assert json.loads(point.simulation_text) == sample.simulation.model_dump(mode="json")
+            assert point.simulation_key == sample.simulation_key
             assert sample.render is not None
-            assert sample.render_key == render_key(sample.render, sample.simulation_key, BUILDS)
-            assert sample.split == split_of(spec, sample.labels)
+            assert point.render_text is not None
+            assert json.loads(point.render_text) == sample.render.model_dump(mode="json")
+            assert point.render_key == sample.render_key
+            assert point.split == sample.split
             assert job_spec_adapter.validate_json(spec.model_dump_json()) == spec
 
 

@@ -1,0 +1,31 @@
+"""Codes of labels, which datasets store."""
+
+from stickslip_schemas.kinds.cloth.arrays import KERNELS
+from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
+from stickslip_schemas.kinds.cloth_sphere import SphereViewpoint
+from stickslip_schemas.kinds.shawl import ShawlViewpoint
+from stickslip_schemas.spec.arrays import SPLITS
+from stickslip_schemas.spec.fabrics import Material, Texture
+
+
+def test_codes_of_labels_are_pinned() -> None:
+    """A code is stored in datasets for good: a name may be added at the end, and none may move."""
+    assert {name: code for code, name in enumerate(Material)} == {
+        "11oz-black-denim": 0,
+        "camel-ponte-roma": 1,
+        "gray-interlock": 2,
+        "ivory-rib-knit": 3,
+        "navy-sparkle-sweat": 4,
+        "pink-ribbon-brown": 5,
+        "royal-target": 6,
+        "tango-red-jet-set": 7,
+        "white-dots-on-blk": 8,
+        "white-swim-solid": 9,
+    }
+    textures = ["checker", "dots", "stripes", "plaid", "gingham", "herringbone", "houndstooth", "floral"]
+    assert list(Texture)[:8] == textures
+    assert list(Viewpoint)[:3] == ["calibrated", "left", "right"]
+    assert list(SphereViewpoint) == ["front", "side", "high"]
+    assert list(ShawlViewpoint) == ["front", "side", "high"]
+    assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
+    assert SPLITS == ("train", "validation", "test")
