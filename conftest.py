@@ -15,7 +15,8 @@ for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write i
     os.environ.pop(_name, None)
 
 GROUPS = {"service": "service", "cluster": "ray", "postgresql": "postgresql", "database": "postgresql"}
-"""Fixtures that start a server once a process, and the group of their tests: xdist runs a group in one process."""
+"""Fixtures that start a server once a process, and the group of their tests: xdist runs a group in one process. These
+tests are marked `real`."""
 
 CPU_SECONDS = pytest.StashKey[float]()
 
@@ -31,6 +32,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for fixture, group in GROUPS.items():
             if fixture in names and (fixture != "database" or "postgresql" in item.name):
                 item.add_marker(pytest.mark.xdist_group(group))
+                item.add_marker(pytest.mark.real)
                 break
 
 

@@ -71,14 +71,14 @@ def up(
     from stickslip_services.settings import Settings
 
     screen = console()
-    doors = {
+    auth = {
         "allowed_hosts": tuple(allow_host or ()),
         "require_keys": require_keys,
         "behind_proxy": behind_proxy,
         "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
         "tls_key": None if tls_key is None else tls_key.absolute(),
     }
-    given: dict[str, Any] = {name: value for name, value in doors.items() if value}
+    given: dict[str, Any] = {name: value for name, value in auth.items() if value}
     given |= {name: value for name, value in (("store", store), ("database", database)) if value is not None}
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)

@@ -187,12 +187,12 @@ def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     module = "stickslip_services.coordinator"
     place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
     place += [] if settings.store is None else ["--store", settings.store]
-    doors = [f"--allow-host={host}" for host in settings.allowed_hosts]
-    doors += ["--require-keys"] if settings.require_keys else []
-    doors += ["--behind-proxy"] if settings.behind_proxy else []
+    auth = [f"--allow-host={host}" for host in settings.allowed_hosts]
+    auth += ["--require-keys"] if settings.require_keys else []
+    auth += ["--behind-proxy"] if settings.behind_proxy else []
     if settings.tls_certificate is not None:
-        doors += ["--tls-certificate", str(settings.tls_certificate), "--tls-key", str(settings.tls_key)]
-    return [sys.executable, "-m", module, *place, *doors]
+        auth += ["--tls-certificate", str(settings.tls_certificate), "--tls-key", str(settings.tls_key)]
+    return [sys.executable, "-m", module, *place, *auth]
 
 
 def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
