@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import Service, read_arrays
-from stickslip_sim_core.character import bones, figure
+from stickslip_sim_core.scenes.character import bones, figure
 from stickslip_training.data.samples import Samples
 
 SPEC: dict[str, Any] = {

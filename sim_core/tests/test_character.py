@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stickslip_sim_core import character
-from stickslip_sim_core.character import BONES, EASE, STILL, bones, distance, figure
+from stickslip_sim_core.scenes.character import BONES, EASE, STILL, bones, distance, figure
 
 
 def _sides(triangles: np.ndarray) -> np.ndarray:

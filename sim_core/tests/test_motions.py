@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stickslip_sim_core import Keyframes, MovingMesh, read_moving_mesh
-from stickslip_sim_core.motions import read_obj, rotation
+from stickslip_sim_core.scenes.motions import read_obj, rotation
 
 SQUARE = """# a square of two triangles, and a corner that is named from the end
 v 0 0 0

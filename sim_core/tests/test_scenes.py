@@ -7,7 +7,7 @@ import pytest
 
 from stickslip_sim_core import DropAndDrag, drop_and_drag, drop_on_cloth, fabric, fabric_names, shawl_on_figure
 from stickslip_sim_core import stage as scenes
-from stickslip_sim_core.character import STILL, bones, distance, figure
+from stickslip_sim_core.scenes.character import STILL, bones, distance, figure
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes import shawl

@@ -27,8 +27,10 @@ from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
-from stickslip_sim_core import Fabric, fabric
+from stickslip_sim_core import ClothRun, Fabric, Scene, fabric, preset_named
+from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
+from stickslip_sim_core.scenes.scene import cloth_kind
 from stickslip_testing.samples import samples
 from stickslip_workers.stages import pack as pack_module
 from stickslip_workers.stages.metadata import create_array
@@ -41,27 +43,6 @@ BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" 
 SIDE = 5
 
 
-@dataclass(frozen=True)
-class Run:
-    """What `drop_and_drag` returns."""
-
-    positions: np.ndarray[Any, Any]
-    rest: np.ndarray[Any, Any]
-    triangles: np.ndarray[Any, Any]
-    self_intersections: np.ndarray[Any, Any]
-    contact_force: np.ndarray[Any, Any]
-    holder_force: np.ndarray[Any, Any]
-    steps: int = 1200
-    unconverged_steps: int = 3
-    worst_residual: float = 2e-4
-    bias_side: int = -1
-    landed_side: int = 1
-    bias: float = 1e-5
-    kernel: str = "baseline"
-    valid: bool = True
-    reason: str = ""
-
-
 @dataclass
 class Core:
     """A core that moves a sheet at once: slides it with mu, and breaks where it is told to."""
@@ -69,35 +50,54 @@ class Core:
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     changes: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(
+    def scene(
         self,
-        fabric: Fabric,
+        material: Fabric,
         mu: float,
         *,
         self_friction: float | None,
         preset: str,
-        vertices: int,
+        mesh: int,
         frames: int,
         seed: int,
-        on_frame: Callable[[int, int], None],
-    ) -> Run:
-        on_frame(frames, frames)
-        self.calls.append((fabric.name, mu, self_friction, preset, vertices, frames, seed))
-        line = np.linspace(-0.1, 0.1, vertices)
-        rest = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-        number = np.arange(vertices**2).reshape(vertices, vertices)
-        a, b, c, d = (number[i : vertices - 1 + i, j : vertices - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
-        t = np.linspace(0.0, 1.0, frames)
-        positions = np.zeros((frames, len(rest), 3))
+    ) -> Any:
+        self.calls.append((material.name, mu, self_friction, preset, mesh, frames, seed))
+        square = meshes.grid(0.2, 0.2, mesh - 1, mesh - 1)
+        return Scene(
+            mesh=square,
+            fabrics=[material],
+            preset=preset_named(preset),
+            start=np.zeros((len(square.rest), 3)),
+            motion=lambda _time: ([], [], []),
+            frames=frames,
+            frame_rate=2.4,
+            record={"mu": np.array(mu)},
+        )
+
+    def run(self, scene: Scene, on_frame: Callable[[int, int], None]) -> ClothRun:
+        on_frame(scene.frames, scene.frames)
+        mu, t = float(scene.record["mu"]), np.linspace(0.0, 1.0, scene.frames)
+        positions = np.zeros((scene.frames, len(scene.mesh.rest), 3))
         positions[..., 0] = mu * t[:, None]
-        positions[..., 1:] = rest + np.array([0.0, 0.11])
-        run = Run(
+        positions[..., 1:] = scene.mesh.rest + np.array([0.0, 0.11])
+        run = ClothRun(
             positions=positions,
-            rest=rest,
-            triangles=np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)]),
-            self_intersections=np.arange(frames) * 1000,
-            contact_force=np.outer(t, (mu, 0.0, 1.0)),
-            holder_force=np.outer(t, (-mu, 0.0, -1.0)),
+            rest=scene.mesh.rest,
+            triangles=scene.mesh.triangles,
+            times=t,
+            record={
+                "contact_force": np.outer(t, (mu, 0.0, 1.0)),
+                "holder_force": np.outer(t, (-mu, 0.0, -1.0)),
+            },
+            labels={"bias_side": -1, "landed_side": 1, "bias": 1e-5},
+            others=positions[:, :0],
+            self_intersections=(np.arange(scene.frames) * 1000).astype(np.int32),
+            least_distance=np.inf,
+            kernel="baseline",
+            steps=1200,
+            unconverged_steps=3,
+            worst_residual=2e-4,
+            reason="",
         )
         return replace(run, **self.changes)
 
@@ -106,7 +106,8 @@ class Core:
 def core(monkeypatch: pytest.MonkeyPatch) -> Core:
     """A core that answers at once, in place of the one that takes minutes."""
     core = Core()
-    monkeypatch.setattr(cloth_drag, "drop_and_drag", core)
+    monkeypatch.setattr(cloth_drag, "KIND", cloth_kind(core.scene))
+    monkeypatch.setattr(Scene, "run", lambda scene, on_frame: core.run(scene, on_frame))
     return core
 
 
@@ -155,12 +156,12 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
 
 
 def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: Core, store: DirectoryStore) -> None:
-    core.changes = {"valid": False, "reason": "12 of 1200 steps did not converge"}
+    core.changes = {"reason": "12 of 1200 steps did not converge"}
     (result,) = run_tasks([_task()], store)
     assert (result.outcome, result.reason) == ("rejected", Reason.solver_diverged)
     assert result.message == (
-        "12 of 1200 steps did not converge at material = gray-interlock, mu = 0.25 with preset fast, "
-        "5 vertices a side, seed 7"
+        "12 of 1200 steps did not converge at material = gray-interlock, density = 1, bending = 1, stretching = 1, "
+        "mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
     )
     assert not (store.root / "artifacts").exists()
 

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import stickslip_sim_core
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
+from stickslip_sim_core.scenes import rod_hang
 from stickslip_workers.stages.run import run_tasks
 
 
@@ -59,7 +59,7 @@ def test_labels_say_what_a_rod_looks_like(store: DirectoryStore) -> None:
 
 def test_a_rod_does_not_depend_on_its_batch(store: DirectoryStore) -> None:
     tasks = _rods(7)
-    # Other settings in the same batch make an artifact of their own.
+    # Rods of other settings are solved apart, and may be stored together.
     odd = SimulateTask(simulation=RodHangSimulation(gamma=9.0, phi0=1.0, phi1=1.0, poisson=0.3))
     together = run_tasks([odd, *tasks], store)[1:]
     for task, result in zip(tasks, together, strict=True):
@@ -70,7 +70,7 @@ def test_a_rod_does_not_depend_on_its_batch(store: DirectoryStore) -> None:
 
 
 def test_a_rod_without_a_stable_shape_is_rejected(store: DirectoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    solve = stickslip_sim_core.solve_rods
+    solve = rod_hang.solve_rods
 
     def fail_some(*args: Any, **kwargs: Any) -> Any:
         solution = solve(*args, **kwargs)
@@ -78,7 +78,7 @@ def test_a_rod_without_a_stable_shape_is_rejected(store: DirectoryStore, monkeyp
         solution.stable[1:3] = False
         return solution
 
-    monkeypatch.setattr(stickslip_sim_core, "solve_rods", fail_some)
+    monkeypatch.setattr(rod_hang, "solve_rods", fail_some)
     results = run_tasks(_rods(4), store)
     assert [result.outcome for result in results] == ["succeeded", "rejected", "rejected", "succeeded"]
     assert {result.reason for result in results[1:3]} == {Reason.solver_diverged}
@@ -88,13 +88,13 @@ def test_a_rod_without_a_stable_shape_is_rejected(store: DirectoryStore, monkeyp
 
 
 def test_all_rejected_makes_no_artifact(store: DirectoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    solve = stickslip_sim_core.solve_rods
+    solve = rod_hang.solve_rods
 
     def fail(*args: Any, **kwargs: Any) -> Any:
         solution = solve(*args, **kwargs)
         solution.stable[:] = False
         return solution
 
-    monkeypatch.setattr(stickslip_sim_core, "solve_rods", fail)
+    monkeypatch.setattr(rod_hang, "solve_rods", fail)
     assert {result.outcome for result in run_tasks(_rods(2), store)} == {"rejected"}
     assert not (store.root / "artifacts").exists()

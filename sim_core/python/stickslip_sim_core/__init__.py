@@ -6,26 +6,22 @@ from stickslip_sim_core.cloth.contact import PairForces, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.motions import Keyframes, MovingMesh, read_moving_mesh
 from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
 from stickslip_sim_core.rods.general import solve_general_rods
 from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import reach, self_contact_distance
 from stickslip_sim_core.rods.multistability import OtherMinima, other_minima
 from stickslip_sim_core.rods.solve import RodSolution, solve_rods
-from stickslip_sim_core.scenes.cloth_drag import drop_and_drag
-from stickslip_sim_core.scenes.cloth_on_cloth import drop_on_cloth
-from stickslip_sim_core.scenes.cloth_sphere import RotatingSphere, rotating_sphere
-from stickslip_sim_core.scenes.own import SceneRun, Sheet, run_scene
-from stickslip_sim_core.scenes.shawl import Shawl, shawl_on_figure
-from stickslip_sim_core.stage import DropAndDrag
+from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, read_moving_mesh
+from stickslip_sim_core.scenes.own import Sheet
+from stickslip_sim_core.scenes.scene import ClothRun, Scene
 
 __all__ = [
     "PRESETS",
     "Body",
     "BuildInfo",
     "Cloth",
-    "DropAndDrag",
+    "ClothRun",
     "Fabric",
     "Keyframes",
     "MovingMesh",
@@ -35,18 +31,14 @@ __all__ = [
     "PairForces",
     "ParameterFit",
     "RodSolution",
-    "RotatingSphere",
-    "SceneRun",
+    "Scene",
     "SelfContact",
-    "Shawl",
     "Sheet",
     "SolverSettings",
     "Surface",
     "box",
     "build_info",
     "cylinder",
-    "drop_and_drag",
-    "drop_on_cloth",
     "fabric",
     "fabric_names",
     "fit_natural_curvature",
@@ -59,11 +51,8 @@ __all__ = [
     "preset_named",
     "reach",
     "read_moving_mesh",
-    "rotating_sphere",
-    "run_scene",
     "self_contact_distance",
     "self_intersections",
-    "shawl_on_figure",
     "solve_general_rods",
     "solve_rods",
     "sphere",

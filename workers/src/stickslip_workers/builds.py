@@ -9,7 +9,7 @@ from importlib import metadata
 from stickslip_schemas.base.keys import content_key
 from stickslip_schemas.plan.sources import UNCOUNTED, digests, sources
 
-from stickslip_workers.kinds import kind
+from stickslip_workers.kinds import kind, scene_module
 
 _STAGES = "stickslip_workers.stages"
 _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
@@ -18,7 +18,7 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 def roots(stage: str, name: str) -> tuple[str, ...]:
     """Return the modules that do the work of a stage for a kind."""
     if stage == "simulate":
-        return (f"{_STAGES}.actor", f"{_STAGES}.simulate", f"stickslip_workers.kinds.{name}")
+        return (f"{_STAGES}.actor", f"{_STAGES}.simulate", scene_module(name))
     if stage == "pack":
         return (f"{_STAGES}.actor", f"{_STAGES}.pack", f"{_STAGES}.publish", f"stickslip_schemas.kinds.{name}")
     raise ValueError(f"stage must be simulate or pack; got {stage!r}")

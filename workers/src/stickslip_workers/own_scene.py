@@ -13,14 +13,15 @@ from stickslip_schemas.base.keys import content_key
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.spec.scene_file import Box, Cylinder, Key, MeshBody, Motion, Plane, SceneFile, Sphere
 from stickslip_schemas.spec.scene_file import Sheet as SheetOfFile
-from stickslip_sim_core import Body, Surface, box, cylinder, plane, run_scene, sphere
+from stickslip_sim_core import Body, Surface, box, custom_fabric, cylinder, fabric, plane, sphere
 from stickslip_sim_core.cloth.meshes import Mesh, grid, unstructured
-from stickslip_sim_core.motions import Keyframes, MovingMesh, read_moving_mesh, rotation
 from stickslip_sim_core.protocols import CERTIFICATION, SCENE_PROTOCOLS
-from stickslip_sim_core.scenes.own import SceneRun, Sheet
+from stickslip_sim_core.scenes import own
+from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, read_moving_mesh, rotation
+from stickslip_sim_core.scenes.own import Sheet
+from stickslip_sim_core.scenes.scene import ClothRun
 
 from stickslip_workers.builds import solver_build
-from stickslip_workers.cloth import named_fabric
 
 RESULT_NAME = "scene.json"
 TRAJECTORY_NAME = "trajectory.npz"
@@ -122,7 +123,7 @@ def simulate_scene(
 
 
 def _write(
-    out: Path, scene: SceneFile, meshes: dict[str, Mesh], run: SceneRun, result: dict[str, Any], *, obj: bool
+    out: Path, scene: SceneFile, meshes: dict[str, Mesh], run: ClothRun, result: dict[str, Any], *, obj: bool
 ) -> None:
     arrays: dict[str, Any] = {
         "times": run.times,
@@ -130,7 +131,8 @@ def _write(
         "holder_force": run.holder_force,
         "self_intersections": run.self_intersections,
     }
-    for name, path in zip(scene.sheets, run.positions, strict=True):
+    ends = np.cumsum([len(mesh.rest) for mesh in meshes.values()])[:-1]
+    for name, path in zip(scene.sheets, np.split(run.positions, ends, axis=1), strict=True):
         arrays |= {
             f"{name}/positions": path,
             f"{name}/rest": meshes[name].rest,
@@ -152,7 +154,7 @@ def _write_obj(folder: Path, mesh: Mesh, path: Array) -> None:
 
 def _run(
     scene: SceneFile, folder: Path, meshes: dict[str, Mesh], on_frame: Callable[[int, int], None] | None
-) -> SceneRun:
+) -> ClothRun:
     sheets = [_sheet(scene, name, meshes[name]) for name in scene.sheets]
     names = list(scene.sheets)
     rigid = [
@@ -164,7 +166,7 @@ def _run(
         if isinstance(body, MeshBody)
     ]
     try:
-        return run_scene(
+        return own.scene(
             sheets,
             [[scene.mu(one, other) for other in names] for one in names],
             duration=scene.duration,
@@ -173,8 +175,7 @@ def _run(
             surfaces=surfaces,
             gravity=scene.gravity,
             preset=scene.preset.value,
-            on_frame=on_frame,
-        )
+        ).run(on_frame)
     except ValueError as error:
         raise SceneError(str(error)) from error
 
@@ -189,6 +190,7 @@ def _mesh(sheet: SheetOfFile) -> Mesh:
 def _sheet(scene: SceneFile, name: str, mesh: Mesh) -> Sheet:
     """Return a sheet where it starts, with its holders."""
     given = scene.sheets[name]
+    numbers = scene.materials.get(given.material)
     start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))]) @ rotation(given.turn).T + np.array(given.origin)
     parts: list[tuple[npt.NDArray[np.int64], Callable[[float], Array]]] = []
     taken = np.zeros(len(start), dtype=bool)
@@ -208,7 +210,7 @@ def _sheet(scene: SceneFile, name: str, mesh: Mesh) -> Sheet:
 
     return Sheet(
         mesh,
-        named_fabric(given.material, scene.materials.get(given.material)),
+        custom_fabric(given.material, **numbers.model_dump()) if numbers else fabric(given.material),
         start,
         held=vertices,
         held_at=held_at,

@@ -42,6 +42,11 @@ class Body:
         if not 0.0 <= self.mu <= MU_MAX:
             raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {self.mu}")
 
+    @property
+    def pose(self) -> Floats:
+        """(3, 4): from its own axes to the world, x -> A x + b [m]."""
+        return np.column_stack([self.rotation, self.origin])
+
     def as_tuple(self) -> BodyTuple:
         """Return the arguments of the C++ core."""
         return (

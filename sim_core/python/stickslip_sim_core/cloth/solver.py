@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh, sheet_count
+from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh, cloth_kernels, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.bodies import Body, BodyTuple
 from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, PairForces, SelfContact, Surface
@@ -26,6 +26,11 @@ GRAVITY = 9.81
 
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
 """From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies."""
+
+
+def kernel_level() -> str:
+    """Return the default level of the kernels: that of the environment variable, or the widest of this processor."""
+    return os.environ.get(KERNEL_VARIABLE) or cloth_kernels()[-1]
 
 
 class Cloth:
@@ -262,8 +267,10 @@ class Cloth:
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
-        It is the rate of momentum less weight and the force of the holders.
+        It is the rate of momentum less weight and the force of the holders; zero before the first step.
         """
+        if not self.steps:
+            return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
         force: Floats = np.asarray(self._solver.momentum_rate()) - weight - holders

@@ -1,1 +1,1 @@
-"""What is simulated: cloth, what holds it, what it touches, and how these move."""
+"""Scenes: what is simulated. The module of a kind of simulations offers it as `KIND`."""

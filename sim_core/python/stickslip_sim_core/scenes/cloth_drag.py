@@ -1,58 +1,284 @@
-"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3]."""
+"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3].
 
-from collections.abc import Callable
+`cloth_on_cloth` shares the path of the holders and the cloth that hangs from them.
+"""
 
-from stickslip_sim_core import stage
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import plane
+from stickslip_sim_core.cloth.bodies import Body, plane
 from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import Cloth
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, Motion
+from stickslip_sim_core.scenes.kind import Record
+from stickslip_sim_core.scenes.scene import ClothRun, Scene, check_range, cloth_kind
+
+SIDE = 0.2
+"""Side of the square of cloth [m]."""
+
+HOLDER = 0.01
+"""Side of the square holders at two corners [m]."""
+
+CLEARANCE = 0.01
+"""Height of the lower edge over the floor at the start [m]."""
+
+DROP, DRAG, LEGS = 0.06, 0.3, 4
+"""Travel down, travel of each leg [m], and number of legs: there, back, there, back."""
+
+SPEED, ACCELERATION = 0.01, 0.01
+"""Of the holders [m/s, m/s^2]."""
+
+FRAME_RATE = 2.4
+"""[1/s]"""
 
 
-def drop_and_drag(
-    fabric: str | Fabric,
+def travel(time: float, distance: float) -> float:
+    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at `SPEED`."""
+    ramp = SPEED / ACCELERATION
+    duration = duration_of(distance)
+    t = min(max(time, 0.0), duration)
+    if t < ramp:
+        return 0.5 * ACCELERATION * t * t
+    if t > duration - ramp:
+        return distance - 0.5 * ACCELERATION * (duration - t) ** 2
+    return SPEED * (t - 0.5 * ramp)
+
+
+def duration_of(distance: float) -> float:
+    """Return the time of a travel of at least SPEED^2 / ACCELERATION [s]."""
+    return distance / SPEED + SPEED / ACCELERATION
+
+
+def holder_path(time: float) -> Floats:
+    """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]."""
+    start, leg = duration_of(DROP), duration_of(DRAG)
+    x, direction = 0.0, 1.0
+    for i in range(LEGS):
+        x += direction * travel(time - start - i * leg, DRAG)
+        direction = -direction
+    return np.array([x, -travel(time, DROP)])
+
+
+DURATION = duration_of(DROP) + LEGS * duration_of(DRAG)
+"""Of drop-and-drag [s]."""
+
+HANGING = SolverSettings("hanging", 0.05, tolerance=1e-5, step_error=None)
+"""Solver settings of the hung shape, so that all presets start from the same."""
+
+HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
+"""Factors of the bias, in turn: with a large bias the cloth has one shape, which is followed as the bias falls."""
+
+SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
+"""Steps with each factor, and their damping [1/s]."""
+
+FIRST_STEP, GROWTH = 0.002, 1.3
+"""First step [s], and growth of the next ones up to 50 ms: the flat cloth buckles when it is released."""
+
+LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
+"""Steps then grow to this length [s] until no vertex moves further than this in one [m]; at most so many steps."""
+
+SHORTENED = 0.1
+"""Share of each displacement that is taken once one is longer than half of the one before. A step has the stiffness of
+its start, so a fabric that stiffens fast would swing about its shape at rest for ever."""
+
+FRAMES = 300
+"""Frames of a whole drop-and-drag."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt:
+    """Gravity along x, over that along -z, which breaks the symmetry of the drop."""
+
+    side: int
+    bias: float
+    of_vertices: Floats
+    """(V,)"""
+
+
+def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
+    """Return the vertices under the holders, at the two corners of the upper edge."""
+    inner = SIDE / 2 - HOLDER - 1e-9
+    return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
+
+
+@dataclass(frozen=True, eq=False)
+class Hung:
+    """The shape of a cloth at rest under its holders."""
+
+    positions: Floats
+    """(V, 3) [m]"""
+
+    held: NDArray[np.intp]
+    """Vertices under the holders."""
+
+    tilt: Tilt
+    softest: float
+    """Smallest eigenvalue of stiffness over mass [1/s^2]; positive if it is stable."""
+
+    reason: str
+    """Reason why it is no stable equilibrium, or empty."""
+
+
+def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = None) -> Hung:
+    """Return the shape in which the cloth hangs at rest under its holders, over the floor.
+
+    A cloth held at two corners has many shapes at rest. This one is reached as the tilt of gravity falls from 30 times
+    the bias to the bias. It is settled until nothing moves, and its stability is checked.
+    """
+    held = held_by_holders(mesh)
+    cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
+    flat = np.zeros((len(mesh.rest), 3))
+    flat[:, 1] = mesh.rest[:, 0]
+    flat[:, 2] = mesh.rest[:, 1] + SIDE / 2 + CLEARANCE
+    rng = np.random.default_rng(seed)
+    side = 1 if rng.random() < 0.5 else -1
+    bias = float(rng.uniform(1e-3, 3e-3))
+    twist = float(rng.uniform(-0.3, 0.3))
+    tilt = Tilt(side, bias, side * bias * (1.0 + twist * mesh.rest[:, 0] / (SIDE / 2)))
+    cloth.set_state(flat)
+    dt = FIRST_STEP
+    for times in HANGING_TILTS:
+        cloth.gravity[:, 0] = times * tilt.of_vertices * GRAVITY
+        for _ in range(SETTLING_STEPS):
+            cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
+            dt = min(GROWTH * dt, HANGING.time_step)
+    moved, steps, share = np.inf, 0, 1.0
+    while (dt < LONGEST or moved > AT_REST) and steps < HANGING_STEPS_MAX:
+        before, moved_before = cloth.positions, moved
+        dt = min(1.5 * dt, LONGEST)
+        cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
+        moved, steps = float(np.abs(cloth.positions - before).max()), steps + 1
+        if dt == LONGEST and moved > 0.5 * moved_before:
+            share = SHORTENED
+        if share < 1.0 and moved > AT_REST:
+            cloth.set_state(before + share * (cloth.positions - before))
+    softest = cloth.softest()
+    reason = ""
+    if not moved <= AT_REST:
+        reason = f"the hung cloth did not come to rest: it moved by {moved:.1e} m in {dt:g} s"
+    elif not softest > 0.0:
+        reason = f"the hung cloth is not stable: its softest eigenvalue is {softest:.2g} 1/s^2"
+    return Hung(cloth.positions, held, tilt, softest, reason)
+
+
+def scene(
+    material: str | Fabric,
     mu: float,
     *,
-    preset: str | SolverSettings = "certified",
-    vertices: int = 41,
-    frames: int = stage.FRAMES,
-    seed: int = 0,
-    mesh: meshes.Mesh | None = None,
     self_friction: float | None = SELF_FRICTION,
+    preset: str | SolverSettings = "certified",
+    mesh: int | meshes.Mesh = 41,
+    frames: int = FRAMES,
+    seed: int = 0,
     kernel: str | None = None,
-    on_frame: Callable[[int, int], None] | None = None,
-) -> stage.DropAndDrag:
-    """Hold a square of cloth by two corners, lower it onto a plane and drag it to and fro [thesis, 4.2.3].
+) -> Scene:
+    """Return the scene of a cloth that is lowered onto a plane and dragged to and fro.
 
     The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A drop without imperfection would
     buckle to neither side: gravity is tilted along x by `bias`, a little more on one side of the cloth than on the
     other, both drawn from `seed`, until the drop ends, and set upright within the second after.
 
     Args:
-        fabric: One of `fabric_names()`, or a custom one.
+        material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge.
         mu: Coefficient of friction between cloth and floor, 0 ... 10.
+        self_friction: Coefficient of friction of the cloth with itself, 0 ... 10; None turns self-contact off.
         preset: Solver settings, or their name.
-        vertices: Vertices a side of the mesh, at least 5.
-        frames: Frames to simulate, 2.4 a second from 0 on; 300 are the whole motion.
+        mesh: Vertices a side of a grid, at least 5; or a mesh of the square of side `SIDE`.
+        frames: Frames, 2.4 a second from 0 on; 300 are the whole motion.
         seed: Of the bias.
-        mesh: Instead of the structured mesh of `vertices`: one of the square of side `stage.SIDE`.
-        self_friction: Coefficient of friction of the cloth with itself, 0 ... 10; None: it passes through itself.
         kernel: Level of the kernels, see `Cloth`.
-        on_frame: Called with (frames done, frames) after every frame.
 
     Raises:
         ValueError: An argument breaks its rule.
     """
-    settings = preset_named(preset)
-    stage.frames_checked(frames, vertices)
-    mesh = meshes.grid(stage.SIDE, stage.SIDE, vertices - 1, vertices - 1) if mesh is None else mesh
-    held = stage.held_by_holders(mesh)
-    floor = [plane(mu)]
-    feels = None if self_friction is None else SelfContact(self_friction)
-    cloth = Cloth(mesh, fabric_of(fabric), settings, held=held, self_contact=feels, kernel=kernel)
-    hung = stage.hang(mesh, cloth.fabrics[0], seed=seed, kernel=kernel)
-    cloth.set_state(hung.positions)
-    motion = stage.motion_of(cloth, floor, hung.positions[held], hung.tilt)
-    return stage.run(cloth, mesh, hung, motion, frames=frames, contact_force=Cloth.contact_force, on_frame=on_frame)
+    square = checked_square(mesh, frames)
+    hung = hang(square, fabric_of(material), seed=seed, kernel=kernel)
+    return Scene(
+        mesh=square,
+        fabrics=[fabric_of(material)],
+        preset=preset_named(preset),
+        start=hung.positions,
+        held=hung.held,
+        motion=motion_of(hung, len(square.rest), [plane(mu)]),
+        self_contact=None if self_friction is None else SelfContact(self_friction),
+        frames=frames,
+        frame_rate=FRAME_RATE,
+        forces=lambda cloth: dragged_forces(cloth, hung, cloth.contact_force()),
+        tracks={"holder_pose": holder_pose},
+        labels=lambda run: drop_labels(run, hung),
+        kernel=kernel,
+        reason=hung.reason,
+    )
+
+
+KIND = cloth_kind(scene)
+
+
+def checked_square(mesh: int | meshes.Mesh, frames: int) -> meshes.Mesh:
+    """Return the mesh of the square of cloth.
+
+    Raises:
+        ValueError: There are too few vertices, or too many frames.
+    """
+    check_range("frames", frames, 1, FRAMES)
+    if isinstance(mesh, meshes.Mesh):
+        return mesh
+    check_range("mesh", mesh, 5, np.inf)
+    return meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
+
+
+def motion_of(hung: Hung, vertices: int, floor: Sequence[Body], fixed: ArrayLike = ()) -> Motion:
+    """Return the motion of the drag scene; gravity is upright one second after the drop.
+
+    Args:
+        hung: The dragged sheet, which comes first.
+        vertices: Number of vertices of all sheets.
+        floor: Bodies below.
+        fixed: (F, 3): positions of the held vertices of other sheets, which stay [m].
+    """
+    start, stay = hung.positions[hung.held], np.asarray(fixed, float).reshape(-1, 3)
+
+    def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
+        upright = min(max(time - duration_of(DROP), 0.0), 1.0)
+        gravity = np.tile([0.0, 0.0, -GRAVITY], (vertices, 1))
+        gravity[: len(hung.positions), 0] = hung.tilt.of_vertices * GRAVITY * (1.0 - upright)
+        x, z = holder_path(time)
+        return gravity, np.concatenate([start + np.array([x, 0.0, z]), stay]), floor
+
+    return motion
+
+
+def holder_pose(time: float) -> Floats:
+    """Return the pose (3, 4) of the holders, relative to their start."""
+    x, z = holder_path(time)
+    return np.column_stack([np.eye(3), [x, 0.0, z]])
+
+
+def dragged_forces(cloth: Cloth, hung: Hung, contact: Floats) -> Record:
+    """Return the forces of bodies and other cloth, and of the holders, on the dragged sheet (3,) [N].
+
+    Before the first step the holders bear its weight.
+    """
+    if cloth.steps:
+        return {"contact_force": contact, "holder_force": cloth.reactions[hung.held].sum(axis=0)}
+    weight = cloth.masses[: len(hung.positions)].sum() * np.array([0.0, 0.0, GRAVITY])
+    return {"contact_force": np.zeros(3), "holder_force": weight}
+
+
+def drop_labels(run: ClothRun, hung: Hung) -> dict[str, float]:
+    """Return the labels of a drop: the bias, and the side of the holders on which the cloth lay when the drop ended.
+
+    `landed_side` is the sign of its mean x less that of the holders, in the first frame after the drop; 0 without one.
+    """
+    frame = int(np.ceil(duration_of(DROP) * FRAME_RATE))
+    landed = 0
+    if frame < len(run.positions):
+        x = run.positions[frame, :, 0]
+        landed = int(np.sign(x.mean() - x[hung.held].mean()))
+    return {"bias_side": hung.tilt.side, "bias": hung.tilt.bias, "landed_side": landed}

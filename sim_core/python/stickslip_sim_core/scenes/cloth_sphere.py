@@ -1,12 +1,7 @@
 """Cloth on a sphere: a square of cloth falls on a sphere that then turns and drags it over the floor [thesis, 4.6]."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
-from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.bodies import Body, plane, sphere
@@ -14,6 +9,8 @@ from stickslip_sim_core.cloth.contact import THICKNESS, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.scenes.kind import Record
+from stickslip_sim_core.scenes.scene import Scene, check_range, cloth_kind
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -28,7 +25,7 @@ SETTLING = 2.0
 """Time before the sphere begins to turn [s], and the time over which it then gains its speed."""
 
 SPEED = 1.0
-"""Of the sphere about its vertical axis, unless another is asked for [rad/s]."""
+"""Default angular speed of the sphere about its vertical axis [rad/s]."""
 
 SPEED_MAX = 20.0
 """[rad/s]"""
@@ -41,56 +38,6 @@ FRAME_RATE = 15.0
 """[1/s]"""
 
 FRAMES_MAX = 3000
-
-
-@dataclass(frozen=True, eq=False)
-class RotatingSphere:
-    """A cloth that fell on a sphere which then turned. World axes: z up, the floor is z = 0, the sphere's axis is z."""
-
-    positions: Floats
-    """(frames, V, 3) [m]"""
-
-    rest: Floats
-    """(V, 2) [m]"""
-
-    triangles: NDArray[np.int32]
-    """(T, 3)"""
-
-    times: Floats
-    """(frames,) [s]"""
-
-    angle: Floats
-    """(frames,): by which the sphere has turned [rad]."""
-
-    contacts: NDArray[np.int32]
-    """(frames, V): 0 on the floor, 1 on the sphere, -1 on neither."""
-
-    contact_force: Floats
-    """(frames, 3) [N]: of floor and sphere on the cloth, from the balance of momentum."""
-
-    floor_force: Floats
-    """(frames, 3) [N]: of the floor, summed over the vertices that touch it."""
-
-    sphere_force: Floats
-    """(frames, 3) [N]: of the sphere, likewise."""
-
-    self_intersections: NDArray[np.int32]
-    """(frames,): pairs of triangles that cross."""
-
-    bias: tuple[float, float]
-    """Horizontal over vertical gravity (x, y) until the sphere turns."""
-
-    kernel: str
-    """Level of the solver's kernels: levels differ in the last digits."""
-
-    steps: int
-    unconverged_steps: int
-    worst_residual: float
-    """Largest residual force of a node in any step, in weights of 25 mm^2 of the cloth."""
-
-    valid: bool
-    reason: str
-    """Why it is not valid, or empty."""
 
 
 def turned(time: float, speed: float = SPEED) -> float:
@@ -121,98 +68,80 @@ def triangulated(mu: float, speed: float, subdivisions: int) -> Surface:
     return Surface(triangles, at, mu, thickness=0.0)
 
 
-def rotating_sphere(
-    fabric: str | Fabric,
+def scene(
+    material: str | Fabric,
     mu: float,
     *,
     mu_floor: float | None = None,
-    speed: float = SPEED,
+    angular_speed: float = SPEED,
     preset: str | SolverSettings = "certified",
-    vertices: int = 41,
+    mesh: int = 41,
     frames: int = FRAMES,
     frame_rate: float = FRAME_RATE,
     seed: int = 0,
     subdivisions: int | None = None,
     kernel: str | None = None,
-    on_frame: Callable[[int, int], None] | None = None,
-) -> RotatingSphere:
-    """Drop a square of cloth on a sphere that stands on the floor, and turn the sphere, which drags it [thesis, 4.6].
+) -> Scene:
+    """Return the scene of a square of cloth that falls on a sphere, which then turns and drags it.
 
     The cloth falls from rest, flat and centred, and drapes over the sphere until its hem lies on the floor.
 
     Args:
-        fabric: One of `fabric_names()`, or a custom one.
+        material: One of `fabric_names()`, or a fabric.
         mu: Coefficient of friction between cloth and sphere, 0 ... 10.
         mu_floor: Between cloth and floor; None is `mu`.
-        speed: Angular speed of the sphere about its vertical axis [rad/s], -20 ... 20.
+        angular_speed: Of the sphere about its vertical axis [rad/s], -20 ... 20.
         preset: Solver settings, or their name.
-        vertices: Vertices a side of the mesh, at least 5.
-        frames: Frames to simulate, from time 0 on, 1 ... 3000.
+        mesh: Vertices a side of the grid, at least 5.
+        frames: Frames, from time 0 on, 1 ... 3000.
         frame_rate: Frames a second.
         seed: Of the bias.
         subdivisions: Of an icosahedron, 1 ... 7, for a sphere of triangles; None: the sphere is round.
         kernel: Level of the kernels, see `Cloth`.
-        on_frame: Called with (frames done, frames) after every frame.
 
     Raises:
         ValueError: An argument breaks its rule.
     """
-    settings = preset_named(preset)
-    if not 1 <= frames <= FRAMES_MAX:
-        raise ValueError(f"frames: must be 1 ... {FRAMES_MAX}, got {frames}")
-    if vertices < 5:
-        raise ValueError(f"vertices: must be at least 5, got {vertices}")
+    check_range("frames", frames, 1, FRAMES_MAX)
+    check_range("mesh", mesh, 5, np.inf)
+    check_range("angular_speed", angular_speed, -SPEED_MAX, SPEED_MAX)
     if not (np.isfinite(frame_rate) and frame_rate > 0.0):
         raise ValueError(f"frame_rate: must be finite and > 0, got {frame_rate}")
-    if not abs(speed) <= SPEED_MAX:
-        raise ValueError(f"speed: must be in [-{SPEED_MAX:g}, {SPEED_MAX:g}] rad/s, got {speed}")
-    if subdivisions is not None and not 1 <= subdivisions <= 7:
-        raise ValueError(f"subdivisions: must be 1 ... 7, got {subdivisions}")
+    if subdivisions is not None:
+        check_range("subdivisions", subdivisions, 1, 7)
     floor = plane(mu if mu_floor is None else mu_floor)
-    mesh = meshes.grid(SIDE, SIDE, vertices - 1, vertices - 1)
-    surfaces = [] if subdivisions is None else [triangulated(mu, speed, subdivisions)]
-    cloth = Cloth(mesh, fabric_of(fabric), settings, surfaces=surfaces, kernel=kernel)
-    cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), 2.0 * RADIUS + CLEARANCE)]))
+    square = meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
     bias = np.random.default_rng(seed).uniform(-BIAS, BIAS, 2)
-
-    down = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
+    down = np.tile([0.0, 0.0, -GRAVITY], (len(square.rest), 1))
     tilted = down + GRAVITY * np.append(bias, 0.0)
 
     def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
-        bodies = [floor, ball(mu, turned(time, speed))] if subdivisions is None else [floor]
+        bodies = [floor, ball(mu, turned(time, angular_speed))] if subdivisions is None else [floor]
         return (tilted if time < SETTLING else down), np.empty((0, 3)), bodies
 
-    positions, contacts, forces = [cloth.positions], [cloth.contacts], [np.zeros((3, 3))]
-    for frame in range(1, frames):
-        cloth.advance(frame / frame_rate, motion)
-        positions.append(cloth.positions)
-        contacts.append(cloth.contacts)
-        by_body = [cloth.reactions[contacts[-1] == body].sum(axis=0) for body in (0, 1)]
-        forces.append(np.stack([cloth.contact_force(), *by_body]))
-        if on_frame is not None:
-            on_frame(frame + 1, frames)
-        if not np.isfinite(positions[-1]).all():
-            break
-    path, force = np.stack(positions), np.stack(forces)
-    finite = bool(np.isfinite(path).all())
-    times = np.arange(len(path)) / frame_rate
-    reason = cloth.why_invalid(path)
-    return RotatingSphere(
-        positions=path,
-        rest=mesh.rest,
-        triangles=mesh.triangles,
-        times=times,
-        angle=np.array([turned(float(t), speed) for t in times]),
-        contacts=np.stack(contacts),
-        contact_force=force[:, 0],
-        floor_force=force[:, 1],
-        sphere_force=force[:, 2],
-        self_intersections=np.array([self_intersections(p, mesh.triangles) if finite else 0 for p in path], np.int32),
-        bias=(float(bias[0]), float(bias[1])),
-        kernel=cloth.kernel,
-        steps=cloth.steps,
-        unconverged_steps=cloth.unconverged_steps,
-        worst_residual=cloth.worst_residual,
-        valid=not reason,
-        reason=reason,
+    return Scene(
+        mesh=square,
+        fabrics=[fabric_of(material)],
+        preset=preset_named(preset),
+        start=np.column_stack([square.rest, np.full(len(square.rest), 2.0 * RADIUS + CLEARANCE)]),
+        motion=motion,
+        surfaces=[] if subdivisions is None else [triangulated(mu, angular_speed, subdivisions)],
+        frames=frames,
+        frame_rate=frame_rate,
+        forces=forces,
+        tracks={
+            "angle": lambda time: turned(time, angular_speed),
+            "sphere_pose": lambda time: ball(mu, turned(time, angular_speed)).pose,
+        },
+        labels=lambda _run: {"bias": bias.tolist()},
+        kernel=kernel,
     )
+
+
+KIND = cloth_kind(scene)
+
+
+def forces(cloth: Cloth) -> Record:
+    """Return the forces on the cloth (3,) [N]: of all bodies, and of floor and sphere over the vertices they touch."""
+    of_floor, of_sphere = (cloth.reactions[cloth.contacts == body].sum(axis=0) for body in (0, 1))
+    return {"contact_force": cloth.contact_force(), "floor_force": of_floor, "sphere_force": of_sphere}

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import self_intersections, sheet_count
+from stickslip_sim_core._sim_core import sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.bodies import Body
@@ -15,6 +15,8 @@ from stickslip_sim_core.cloth.contact import THICKNESS, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.scenes.kind import Record
+from stickslip_sim_core.scenes.scene import Scene
 
 FRAMES_MAX = 10_000
 """Of a scene."""
@@ -39,42 +41,7 @@ class Sheet:
     """[m]"""
 
 
-@dataclass(frozen=True, eq=False)
-class SceneRun:
-    """What became of a scene of S sheets."""
-
-    positions: tuple[Floats, ...]
-    """Of each sheet: (frames, V, 3) [m]."""
-
-    times: Floats
-    """(frames,) [s]"""
-
-    contact_force: Floats
-    """(frames, S, 3) [N]: of bodies, surfaces and other sheets on each sheet."""
-
-    holder_force: Floats
-    """(frames, S, 3) [N]: of its holders on each sheet."""
-
-    self_intersections: NDArray[np.int32]
-    """(frames,): pairs of triangles of all sheets that cross."""
-
-    least_distance: float
-    """Of pieces of cloth that do not hang together, and of cloth and surfaces, at the ends of all steps [m]."""
-
-    kernel: str
-    """Level of the solver's kernels: levels differ in the last digits."""
-
-    steps: int
-    unconverged_steps: int
-    worst_residual: float
-    """Largest residual force of a node in any step, in weights of 25 mm^2 of the lightest fabric."""
-
-    valid: bool
-    reason: str
-    """Why it is not valid, or empty."""
-
-
-def run_scene(
+def scene(
     sheets: Sequence[Sheet],
     friction: ArrayLike,
     *,
@@ -85,9 +52,11 @@ def run_scene(
     gravity: ArrayLike = (0.0, 0.0, -GRAVITY),
     preset: str | SolverSettings = "certified",
     kernel: str | None = None,
-    on_frame: Callable[[int, int], None] | None = None,
-) -> SceneRun:
-    """Run a scene. Nothing in it crosses: sheets feel themselves, each other, bodies and surfaces.
+) -> Scene:
+    """Return a scene with contact within and between sheets, and with bodies and surfaces. Nothing in it crosses.
+
+    Its run records `contact_force`, of bodies, surfaces and other sheets on each sheet, and `holder_force`, of its
+    holders: (frames, S, 3) [N].
 
     Args:
         sheets: The pieces of cloth, at least one.
@@ -100,12 +69,10 @@ def run_scene(
         gravity: (3,) [m/s^2].
         preset: Solver settings, or their name.
         kernel: Level of the kernels, see `Cloth`.
-        on_frame: Called with (frames done, frames) after every frame.
 
     Raises:
-        ValueError: An argument breaks its rule; or a sheet starts across itself, another or a surface.
+        ValueError: An argument breaks its rule.
     """
-    settings = preset_named(preset)
     if not sheets:
         raise ValueError("sheets: must be at least one, got none")
     for name, value in (("duration", duration), ("frame_rate", frame_rate)):
@@ -125,62 +92,41 @@ def run_scene(
             raise ValueError(f"mesh: of sheet {number} must hang together in one piece")
     ends = np.cumsum([0, *map(len, starts)])
     held = [np.asarray(sheet.held, dtype=np.int64).reshape(-1) for sheet in sheets]
-    cloth = Cloth(
-        meshes.together(*(sheet.mesh for sheet in sheets)),
-        [sheet.fabric for sheet in sheets],
-        settings,
-        held=np.concatenate([own + begin for own, begin in zip(held, ends, strict=False)]),
-        self_contact=SelfContact(np.asarray(friction, float).reshape(len(sheets), -1), [s.thickness for s in sheets]),
-        surfaces=surfaces,
-        kernel=kernel,
-    )
-    cloth.set_state(np.concatenate(starts))
-    field_of_gravity = np.tile(down, (len(cloth.mesh.rest), 1))
+    mesh = meshes.together(*(sheet.mesh for sheet in sheets))
+    weight = np.tile(down, (len(mesh.rest), 1))
 
     def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
         at = [
             np.asarray(start[own] if sheet.held_at is None else sheet.held_at(time), float).reshape(-1, 3)
             for sheet, start, own in zip(sheets, starts, held, strict=True)
         ]
-        return field_of_gravity, np.concatenate(at), bodies(time) if callable(bodies) else bodies
+        return weight, np.concatenate(at), bodies(time) if callable(bodies) else bodies
 
-    positions, contact, holders = [cloth.positions], [np.zeros((len(sheets), 3))], [np.zeros((len(sheets), 3))]
-    for frame in range(1, frames):
-        cloth.advance(frame / frame_rate, motion)
-        positions.append(cloth.positions)
-        forces = [_forces(cloth, begin, end) for begin, end in pairwise(ends.tolist())]
-        contact.append(np.stack([force for force, _ in forces]))
-        holders.append(np.stack([force for _, force in forces]))
-        if on_frame is not None:
-            on_frame(frame + 1, frames)
-        if not np.isfinite(positions[-1]).all():
-            break
-    path = np.stack(positions)
-    finite = bool(np.isfinite(path).all())
-    triangles = cloth.mesh.triangles
-    reason = cloth.why_invalid(path)
-    return SceneRun(
-        positions=tuple(np.split(path, ends[1:-1], axis=1)),
-        times=np.arange(len(path)) / frame_rate,
-        contact_force=np.stack(contact),
-        holder_force=np.stack(holders),
-        self_intersections=np.array([self_intersections(p, triangles) if finite else 0 for p in path], np.int32),
-        least_distance=cloth.least_distance,
-        kernel=cloth.kernel,
-        steps=cloth.steps,
-        unconverged_steps=cloth.unconverged_steps,
-        worst_residual=cloth.worst_residual,
-        valid=not reason,
-        reason=reason,
+    return Scene(
+        mesh=mesh,
+        fabrics=[sheet.fabric for sheet in sheets],
+        preset=preset_named(preset),
+        start=np.concatenate(starts),
+        motion=motion,
+        frames=frames,
+        frame_rate=frame_rate,
+        held=np.concatenate([own + begin for own, begin in zip(held, ends, strict=False)]),
+        self_contact=SelfContact(np.asarray(friction, float).reshape(len(sheets), -1), [s.thickness for s in sheets]),
+        surfaces=surfaces,
+        forces=lambda cloth: _forces(cloth, ends),
+        kernel=kernel,
     )
 
 
-def _forces(cloth: Cloth, begin: int, end: int) -> tuple[Floats, Floats]:
-    """Return the force [N] of all that touches it on a sheet's vertices, and that of its holders."""
+def _forces(cloth: Cloth, ends: NDArray[np.int64]) -> Record:
+    """Return the forces [N] on each sheet, whose vertices lie between two `ends`: (S, 3)."""
     is_held = np.zeros(len(cloth.masses), dtype=bool)
     is_held[cloth.held] = True
-    of_bodies = cloth.reactions[begin:end][~is_held[begin:end]].sum(axis=0)
-    of_holders = cloth.reactions[begin:end][is_held[begin:end]].sum(axis=0)
-    pairs = cloth.pair_forces
-    share = (pairs.weights * ((pairs.vertices >= begin) & (pairs.vertices < end))).sum(axis=1)
-    return of_bodies + share @ pairs.forces, of_holders
+    pairs, reactions = cloth.pair_forces, cloth.reactions
+    contact, holders = [], []
+    for begin, end in pairwise(ends.tolist()):
+        own, fixed = reactions[begin:end], is_held[begin:end]
+        share = (pairs.weights * ((pairs.vertices >= begin) & (pairs.vertices < end))).sum(axis=1)
+        contact.append(own[~fixed].sum(axis=0) + share @ pairs.forces)
+        holders.append(own[fixed].sum(axis=0))
+    return {"contact_force": np.stack(contact), "holder_force": np.stack(holders)}

@@ -1,0 +1,233 @@
+"""Scenes of cloth: what a scene consists of, the driver that runs all of them, and the run that it returns."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stickslip_sim_core._sim_core import self_intersections
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.contact import SelfContact, Surface
+from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
+from stickslip_sim_core.cloth.meshes import Mesh
+from stickslip_sim_core.cloth.presets import SolverSettings
+from stickslip_sim_core.cloth.solver import Cloth, Motion, kernel_level
+from stickslip_sim_core.scenes.kind import Array, Kind, OnFrame, Outcome, Record
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ClothRun:
+    """The run of a scene. World axes: z up."""
+
+    positions: Floats
+    """(frames, V, 3) [m]"""
+
+    rest: Floats
+    """(V, 2) [m]"""
+
+    triangles: NDArray[np.int32]
+    """(T, 3)"""
+
+    times: Floats
+    """(frames,) [s]"""
+
+    record: Record
+    """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it: (frames, 3) [N]."""
+
+    labels: Mapping[str, Any]
+    """Numbers of the scene by name, such as the bias that breaks its symmetry."""
+
+    others: Floats
+    """(frames, W, 3) [m]: vertices of the sheets that `rest` does not have."""
+
+    self_intersections: NDArray[np.int32]
+    """(frames,): pairs of triangles that cross."""
+
+    least_distance: float
+    """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
+
+    kernel: str
+    """Level of the solver's kernels: levels differ in the last digits."""
+
+    steps: int
+    unconverged_steps: int
+    worst_residual: float
+    """Largest residual force of a node in any step, in weights of 25 mm^2 of the lightest fabric."""
+
+    reason: str
+    """Reason why the run is not valid, or empty."""
+
+    @property
+    def valid(self) -> bool:
+        return not self.reason
+
+    @property
+    def contact_force(self) -> Floats:
+        """(frames, 3) [N], see `record`."""
+        return self.record["contact_force"]
+
+    @property
+    def holder_force(self) -> Floats:
+        """(frames, 3) [N]: of the holders on the cloth, where there are holders."""
+        return self.record["holder_force"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """A scene of cloth: its start, its motion, and what its run reports."""
+
+    mesh: Mesh
+    """Of all sheets."""
+
+    fabrics: Sequence[Fabric]
+    """One, or one for each sheet."""
+
+    preset: SolverSettings
+
+    start: Floats
+    """(V, 3) [m]: positions of the vertices, at rest."""
+
+    motion: Motion
+    """Gravity, positions of held vertices, and bodies."""
+
+    frames: int
+    frame_rate: float
+    """[1/s]; the first frame is at 0 s."""
+
+    held: ArrayLike = ()
+    """(K,): vertices whose positions are prescribed."""
+
+    self_contact: SelfContact | None = None
+    surfaces: Sequence[Surface] = ()
+
+    damping: Callable[[float], float] = lambda _time: 0.0
+    """From the time at the end of a frame [s] to a damping [1/s]."""
+
+    sheet: Mesh | None = None
+    """The first sheet, if the run reports only that; None: all."""
+
+    forces: Callable[[Cloth], Record] = lambda cloth: {"contact_force": cloth.contact_force()}
+    """Arrays recorded at each frame; the first frame is before the first step."""
+
+    tracks: Mapping[str, Callable[[float], ArrayLike]] = field(default_factory=dict)
+    """Poses and other functions of the time, recorded at each frame. A pose is (3, 4): x -> A x + b."""
+
+    record: Record = field(default_factory=dict)
+    """Arrays recorded once."""
+
+    labels: Callable[[ClothRun], Mapping[str, Any]] = lambda _run: {}
+
+    kernel: str | None = None
+    """Level of the kernels, see `Cloth`."""
+
+    reason: str = ""
+    """Reason why no run of the scene is valid, or empty."""
+
+    def run(self, on_frame: OnFrame | None = None) -> ClothRun:
+        """Simulate the scene frame by frame, until it ends or a position is not finite.
+
+        Args:
+            on_frame: Called with (frames done, frames) after every frame.
+
+        Raises:
+            ValueError: A sheet starts across itself, another or a surface.
+        """
+        cloth = Cloth(
+            self.mesh,
+            self.fabrics,
+            self.preset,
+            held=self.held,
+            self_contact=self.self_contact,
+            surfaces=self.surfaces,
+            kernel=self.kernel,
+        )
+        cloth.set_state(self.start)
+        paths, forces = [cloth.positions], [self.forces(cloth)]
+        for frame in range(1, self.frames):
+            time = frame / self.frame_rate
+            cloth.advance(time, self.motion, damping=self.damping(time))
+            paths.append(cloth.positions)
+            forces.append(self.forces(cloth))
+            if on_frame is not None:
+                on_frame(frame + 1, self.frames)
+            if not np.isfinite(paths[-1]).all():
+                break
+        everything, sheet = np.stack(paths), self.sheet or self.mesh
+        path, others = np.split(everything, [len(sheet.rest)], axis=1)
+        times = np.arange(len(path)) / self.frame_rate
+        finite = bool(np.isfinite(path).all())
+        record: dict[str, Array] = {name: np.stack([each[name] for each in forces]) for name in forces[0]}
+        record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
+        run = ClothRun(
+            positions=path,
+            rest=sheet.rest,
+            triangles=sheet.triangles,
+            times=times,
+            record={**record, **self.record},
+            labels={},
+            others=others,
+            self_intersections=np.array(
+                [self_intersections(p, sheet.triangles) if finite else 0 for p in path], np.int32
+            ),
+            least_distance=cloth.least_distance,
+            kernel=cloth.kernel,
+            steps=cloth.steps,
+            unconverged_steps=cloth.unconverged_steps,
+            worst_residual=cloth.worst_residual,
+            reason=self.reason or cloth.why_invalid(everything),
+        )
+        return replace(run, labels=self.labels(run))
+
+    def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
+        """Run the scene and return the arrays and labels to store."""
+        run = self.run(on_frame)
+        if not run.valid:
+            return Outcome(reason=run.reason)
+        crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
+        arrays: Record = {"positions": run.positions, "rest": run.rest, "triangles": run.triangles, **run.record}
+        made = self.fabrics[0]
+        labels = {
+            "areal_density": made.density,
+            "bending_rigidity": np.diag(made.rigidity).tolist(),
+            "stretching_stiffness": made.stretching[0].tolist(),
+            "kernel": run.kernel,
+            "steps": run.steps,
+            "unconverged_steps": run.unconverged_steps,
+            "worst_residual": run.worst_residual,
+            **run.labels,
+        }
+        single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
+        return Outcome({**single, "self_intersections": crossings}, labels)
+
+
+def cloth_kind(scene: Callable[..., Scene]) -> Kind:
+    """Return the kind whose simulations are the scenes that `scene` makes of their physics."""
+
+    def simulate(simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None) -> list[Outcome]:
+        return [scene(**_of_materials(physics)).outcome(on_frame) for physics in simulations]
+
+    return Kind(simulate, "stickslip_sim_core.cloth", kernel=kernel_level)
+
+
+def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return physics with fabrics in place of their names, the user's own numbers, and factors."""
+    known = dict(physics)
+    factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
+    for prefix in ("", "substrate_"):
+        if f"{prefix}material" in known:
+            name, numbers = known.pop(f"{prefix}material"), known.pop(f"{prefix}fabric", None)
+            known[f"{prefix}material"] = fabric(name) if numbers is None else custom_fabric(name, **numbers)
+    known["material"] = known["material"].scaled(**factors)
+    return known
+
+
+def check_range(name: str, value: float, low: float, high: float) -> None:
+    """Refuse a number outside its range.
+
+    Raises:
+        ValueError: It is.
+    """
+    if not low <= value <= high:
+        raise ValueError(f"{name}: must be in [{low:g}, {high:g}], got {value}")

@@ -1,0 +1,34 @@
+"""Kinds of simulations as the simulation core offers them: one module of `stickslip_sim_core.scenes` for each kind."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from stickslip_schemas.kinds import KINDS, kind_named
+
+if TYPE_CHECKING:
+    from stickslip_sim_core.scenes.kind import Kind
+
+
+def scene_module(name: str) -> str:
+    """Return the module that simulates a kind.
+
+    Raises:
+        UnknownKindError: There is no such kind.
+    """
+    kind_named(name)
+    return f"stickslip_sim_core.scenes.{name}"
+
+
+def kind(name: str) -> "Kind":
+    """Return how a kind is simulated.
+
+    Raises:
+        UnknownKindError: There is no such kind.
+    """
+    found: Kind = import_module(scene_module(name)).KIND
+    return found
+
+
+def kind_names() -> tuple[str, ...]:
+    """Return the names of all kinds."""
+    return tuple(KINDS)
