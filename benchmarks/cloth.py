@@ -10,25 +10,26 @@ November 2026 that stepped by 20 ms (gray-interlock, mu 0.5, `certified`, 131 s)
 import argparse
 import time
 
-from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, plane, stage
+from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, plane
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.scenes import cloth_drag
 
 BEFORE = {21: (13.3, 6359, 3.91, 13.6, 0.45), 41: (82.3, 6359, 3.74, 15.5, 0.52), 81: (1037.0, 6319, 7.2, 57.6, 1.9)}
 """By vertices a side: CPU s, steps, and Newton, GMRES and factors a step; 81: those of 10 steps at 45.5 s."""
 
 
 def run(material: str, mu: float, preset: str, vertices: int, seconds: float) -> None:
-    """Drive the cloth as `drop_and_drag` does, and print a line."""
-    mesh = meshes.grid(stage.SIDE, stage.SIDE, vertices - 1, vertices - 1)
-    held = stage.held_by_holders(mesh)
+    """Drive the cloth as the drag scene does, and print a line."""
+    mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, vertices - 1, vertices - 1)
+    held = cloth_drag.held_by_holders(mesh)
     start = time.process_time()
-    hung = stage.hang(mesh, fabric(material), seed=0)
+    hung = cloth_drag.hang(mesh, fabric(material), seed=0)
     hanging = time.process_time() - start
     cloth = Cloth(mesh, fabric(material), PRESETS[preset], held=held)
     cloth.set_state(hung.positions)
-    motion = stage.motion_of(cloth, [plane(mu)], hung.positions[held], hung.tilt)
-    for frame in range(1, int(seconds * stage.FRAME_RATE + 1e-6) + 1):
-        cloth.advance(frame / stage.FRAME_RATE, motion)
+    motion = cloth_drag.motion_of(hung, len(mesh.rest), [plane(mu)])
+    for frame in range(1, int(seconds * cloth_drag.FRAME_RATE + 1e-6) + 1):
+        cloth.advance(frame / cloth_drag.FRAME_RATE, motion)
     cpu = time.process_time() - start
     phases = ", ".join(f"{name} {part:.1f}" for name, part in cloth.phases().items())
     steps = cloth.steps
@@ -50,7 +51,7 @@ def main() -> None:
     parser.add_argument("--mu", type=float, default=0.5)
     parser.add_argument("--material", choices=fabric_names(), default="gray-interlock")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="certified")
-    parser.add_argument("--seconds", type=float, default=(stage.FRAMES - 1) / stage.FRAME_RATE)
+    parser.add_argument("--seconds", type=float, default=(cloth_drag.FRAMES - 1) / cloth_drag.FRAME_RATE)
     args = parser.parse_args()
     print(f"{args.material}, mu {args.mu}, {args.preset}, core {build_info().build_hash[:12]}")
     print("| vertices | CPU s | phases [s] | steps | Newton | GMRES | factors a step | flips | halved | unconverged |")

@@ -26,22 +26,19 @@ from stickslip_sim_core import (
     Body,
     Cloth,
     SelfContact,
-    drop_and_drag,
-    drop_on_cloth,
     fabric,
     isotropic,
     plane,
     preset_named,
     protocols,
-    rotating_sphere,
     self_intersections,
-    stage,
 )
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import THICKNESS
 from stickslip_sim_core.protocols import capstan
 from stickslip_sim_core.reference import master_curves
+from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere
 from stickslip_sim_core.scenes.cloth_sphere import SETTLING
 from stickslip_testing import tumbles
 
@@ -59,13 +56,13 @@ def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tupl
 
     The seconds are without the hanging and without looking for crossings.
     """
-    mesh = meshes.grid(stage.SIDE, stage.SIDE, vertices - 1, vertices - 1)
-    held = stage.held_by_holders(mesh)
-    hung = stage.hang(mesh, fabric(material), seed=0)
+    mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, vertices - 1, vertices - 1)
+    held = cloth_drag.held_by_holders(mesh)
+    hung = cloth_drag.hang(mesh, fabric(material), seed=0)
     feels = None if mu is None else SelfContact(mu)
     cloth = Cloth(mesh, fabric(material), preset_named("certified"), held=held, self_contact=feels)
     cloth.set_state(hung.positions)
-    motion = stage.motion_of(cloth, [plane(0.5)], hung.positions[held], hung.tilt)
+    motion = cloth_drag.motion_of(hung, len(mesh.rest), [plane(0.5)])
     crossed = looking = 0.0
 
     def watched(at: float) -> tuple[Floats, ArrayLike, Sequence[Body]]:
@@ -77,7 +74,7 @@ def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tupl
 
     begin = time.process_time()
     for frame in range(1, frames):
-        cloth.advance(frame / stage.FRAME_RATE, watched)
+        cloth.advance(frame / cloth_drag.FRAME_RATE, watched)
     return time.process_time() - begin - looking, cloth, int(crossed)
 
 
@@ -98,9 +95,9 @@ def compare(material: str, vertices: int, frames: int) -> None:
 def stretched(vertices: int, frames: int) -> None:
     """Drag a cloth over a floor and over a stretched cloth of as many vertices."""
     begin = time.process_time()
-    drop_and_drag("gray-interlock", 0.5, vertices=vertices, frames=frames, self_friction=None)
+    cloth_drag.scene("gray-interlock", 0.5, mesh=vertices, frames=frames, self_friction=None).run()
     between = time.process_time()
-    cloth = drop_on_cloth("gray-interlock", "11oz-black-denim", 0.5, vertices=vertices, frames=frames)
+    cloth = cloth_on_cloth.scene("gray-interlock", "11oz-black-denim", 0.5, mesh=vertices, frames=frames).run()
     seconds = between - begin, time.process_time() - between
     print(
         f"{vertices} x {vertices}, {frames} frames, over a floor {seconds[0]:.1f} CPU s, over a stretched cloth "
@@ -181,13 +178,13 @@ def turned_spheres() -> None:
     found = []
     for subdivisions in (None, 2, 3, 4):
         begin = time.process_time()
-        scene = rotating_sphere(felt, 0.3, vertices=41, frames=75, subdivisions=subdivisions)
+        scene = cloth_sphere.scene(felt, 0.3, mesh=41, frames=75, subdivisions=subdivisions).run()
         found.append(scene)
         settled, off = scene.times > 0.75 * SETTLING, np.abs(scene.positions - found[0].positions).max(axis=(1, 2))
         print(
             f"sphere of {'no triangles' if subdivisions is None else 20 * 4**subdivisions}: "
             f"{time.process_time() - begin:.1f} CPU s, {scene.unconverged_steps} of {scene.steps} steps unconverged, "
-            f"bears {scene.sphere_force[settled, 2].mean():.6f} N; "
+            f"bears {scene.record['sphere_force'][settled, 2].mean():.6f} N; "
             f"off the round one by {1e3 * off[settled][0]:.2g} mm at rest, {1e3 * off[-1]:.2g} mm at the end",
             flush=True,
         )

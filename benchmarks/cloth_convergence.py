@@ -19,8 +19,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core import DropAndDrag, SolverSettings, build_info, drop_and_drag, preset_named
-from stickslip_sim_core.stage import FRAME_RATE, FRAMES
+from stickslip_sim_core import ClothRun, SolverSettings, build_info, preset_named
+from stickslip_sim_core.scenes import cloth_drag
+from stickslip_sim_core.scenes.cloth_drag import FRAME_RATE, FRAMES
 
 STEADY = (22.0, 37.0)  # s
 
@@ -34,18 +35,18 @@ def divided(preset: SolverSettings, divisor: int) -> SolverSettings:
     return replace(preset, name=f"{preset.name}, dt/{divisor}", step_error=None, time_step=step)
 
 
-def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> DropAndDrag:
+def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> ClothRun:
     start = time.process_time()
     preset = divided(preset_named(args.preset), divisor)
-    scene = drop_and_drag(
+    scene = cloth_drag.scene(
         args.material,
         args.mu,
         preset=preset,
-        vertices=vertices,
+        mesh=vertices,
         frames=args.frames,
         seed=args.seed,
         self_friction=None,
-    )
+    ).run()
     seconds = time.process_time() - start
     print(
         f"  {vertices:3d} x {vertices:<3d} dt {1e3 * preset.time_step:7.3f} ms  {seconds:8.1f} CPU s  "
@@ -56,7 +57,7 @@ def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> DropAndDr
     return scene
 
 
-def shared(scene: DropAndDrag, vertices: int, coarsest: int) -> NDArray[np.float64]:
+def shared(scene: ClothRun, vertices: int, coarsest: int) -> NDArray[np.float64]:
     """Return positions (frames, coarsest, coarsest, 3) of the vertices that all meshes have."""
     every = (vertices - 1) // (coarsest - 1)
     return scene.positions.reshape(len(scene.positions), vertices, vertices, 3)[:, ::every, ::every]

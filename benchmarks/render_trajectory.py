@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from stickslip_sim_core import drop_and_drag
+from stickslip_sim_core.scenes import cloth_drag
 
 
 def main() -> None:
@@ -17,7 +17,7 @@ def main() -> None:
     arguments.add_argument("--mu", type=float, default=0.3)
     arguments.add_argument("--mesh", type=int, default=41, help="vertices a side")
     options = arguments.parse_args()
-    run = drop_and_drag(options.material, options.mu, preset="fast", vertices=options.mesh, seed=1)
+    run = cloth_drag.scene(options.material, options.mu, preset="fast", mesh=options.mesh, seed=1).run()
     if not run.valid:
         raise SystemExit(f"not valid: {run.reason}")
     np.savez(options.out, track=run.positions.astype(np.float32), rest=run.rest, triangles=run.triangles)

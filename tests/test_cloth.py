@@ -12,7 +12,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth.arrays import SEGMENTS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.spec.appearance import shown_frames
-from stickslip_sim_core import drop_and_drag
+from stickslip_sim_core.scenes import cloth_drag
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
 
@@ -62,14 +62,14 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
     spec = job_spec_adapter.validate_python(SPEC)
     simulation = spec.simulation({"material": "gray-interlock", "mu": 0.4})
     assert isinstance(simulation, ClothDragSimulation)
-    run = drop_and_drag(
+    run = cloth_drag.scene(
         "gray-interlock",
         0.4,
         preset="fast",
-        vertices=9,
+        mesh=9,
         seed=simulation.seed,
         self_friction=simulation.self_friction,
-    )
+    ).run()
     arrays = read_arrays(directory)
     assert arrays["valid"].all()
     assert arrays["positions"].shape == (4, 300, 81, 3)
@@ -81,14 +81,16 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
         assert np.array_equal(arrays["holder_force"][slot], run.holder_force.astype(np.float32))
         assert np.array_equal(arrays["self_intersections"][slot], run.self_intersections)
         for name in ("bias_side", "landed_side", "bias", "steps", "unconverged_steps", "worst_residual"):
-            assert arrays[name][slot] == getattr(run, name), name
+            assert arrays[name][slot] == ({**vars(run), **run.labels})[name], name
     assert len(set(arrays["light_seed"].tolist())) == 2  # one for each viewpoint: textures share a trace
 
 
 def test_cloth_feels_itself_unless_its_spec_says_null(directory: Path) -> None:
     simulation = job_spec_adapter.validate_python(SPEC).simulation({"material": "gray-interlock", "mu": 0.4})
     assert isinstance(simulation, ClothDragSimulation)
-    through = drop_and_drag("gray-interlock", 0.4, preset="fast", vertices=9, seed=simulation.seed, self_friction=None)
+    through = cloth_drag.scene(
+        "gray-interlock", 0.4, preset="fast", mesh=9, seed=simulation.seed, self_friction=None
+    ).run()
     assert through.self_intersections.any()
     assert not read_arrays(directory)["self_intersections"].any()
 

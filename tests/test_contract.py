@@ -23,12 +23,11 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
 from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.planning import expand
 from stickslip_services.queue.terms import terms_for
-from stickslip_sim_core import character, stage
 from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth.bodies import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
-from stickslip_sim_core.scenes import cloth_sphere, shawl
+from stickslip_sim_core.scenes import character, cloth_drag, cloth_sphere, shawl
 from stickslip_testing.samples import samples
 from stickslip_testing.worker import BUILDS
 from stickslip_training.benchmark.sets import load_set
@@ -46,7 +45,7 @@ def test_materials_presets_and_kernels_have_one_name() -> None:
 
 
 def test_instants_are_those_of_the_scenes() -> None:
-    assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (stage.FRAMES, stage.FRAME_RATE)
+    assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (cloth_drag.FRAMES, cloth_drag.FRAME_RATE)
     assert (ClothSphereSpec.instants, ClothSphereSpec.instants_per_second) == (
         cloth_sphere.FRAMES,
         cloth_sphere.FRAME_RATE,
@@ -69,7 +68,7 @@ def test_the_figure_of_the_shawl_is_the_cores() -> None:
 
 def test_cloth_feels_itself_by_one_default_and_by_certified_contact() -> None:
     assert CORE_SELF_FRICTION == SELF_FRICTION
-    asked = inspect.signature(stickslip_sim_core.drop_and_drag).parameters["self_friction"].default
+    asked = inspect.signature(cloth_drag.scene).parameters["self_friction"].default
     assert ClothDragSpec.model_fields["self_friction"].default == asked == SELF_FRICTION
     for name, preset in CERTIFICATION.items():
         has = set(CONTACT_PROTOCOLS) & set(preset.protocols)

@@ -76,17 +76,17 @@ ZOOM: Mapping[str, float] = {"cloth-drag": 1.3, "cloth-on-cloth": 1.1, "cloth-sp
 
 def simulate(folder: Path, names: list[str]) -> None:
     """Simulate, and write what renderers take."""
-    from stickslip_sim_core import drop_and_drag, drop_on_cloth, rotating_sphere, shawl_on_figure
+    from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere, shawl
 
     made: Mapping[str, Callable[[str], Any]] = {
-        "cloth-drag": lambda material: drop_and_drag(material, 0.9, vertices=VERTICES, seed=1),
-        "cloth-on-cloth": lambda material: drop_on_cloth(
-            material, material, 0.4, vertices=COARSER, frames=SHOWN["cloth-on-cloth"][1], seed=1
-        ),
-        "cloth-sphere": lambda material: rotating_sphere(
-            material, 0.4, speed=LOOKS["cloth-sphere"]["angular_speed"], vertices=VERTICES
-        ),
-        "shawl": lambda material: shawl_on_figure(material, 0.5, vertices=VERTICES),
+        "cloth-drag": lambda material: cloth_drag.scene(material, 0.9, mesh=VERTICES, seed=1).run(),
+        "cloth-on-cloth": lambda material: cloth_on_cloth.scene(
+            material, material, 0.4, mesh=COARSER, frames=SHOWN["cloth-on-cloth"][1], seed=1
+        ).run(),
+        "cloth-sphere": lambda material: cloth_sphere.scene(
+            material, 0.4, angular_speed=LOOKS["cloth-sphere"]["angular_speed"], mesh=VERTICES
+        ).run(),
+        "shawl": lambda material: shawl.scene(material, 0.5, mesh=VERTICES).run(),
     }
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -103,7 +103,7 @@ def simulate(folder: Path, names: list[str]) -> None:
             positions=run.positions[None].astype(np.float32),
             rest=run.rest[None],
             triangles=run.triangles[None],
-            **{part: getattr(run, part)[None] for part in FIGURE if hasattr(run, part)},
+            **{part: run.record[part][None] for part in FIGURE if part in run.record},
         )
 
 

@@ -23,8 +23,9 @@ for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another
 import numpy as np  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
 from stickslip_schemas.spec.appearance import shown_frames  # noqa: E402
-from stickslip_sim_core import build_info, drop_and_drag, fabric_names  # noqa: E402
+from stickslip_sim_core import build_info, fabric_names  # noqa: E402
 from stickslip_sim_core.cloth import fabric as fabric_named  # noqa: E402
+from stickslip_sim_core.scenes import cloth_drag  # noqa: E402
 from stickslip_training.cloth.runs import STEP  # noqa: E402
 
 SHOWN = 30  # frames of a clip
@@ -70,9 +71,9 @@ def simulate(name: str, point: Point, vertices: int, preset: str, seed: int, fra
     """Run one simulation, and return what is kept of it."""
     started = time.process_time()
     fabric = fabric_named(name).scaled(**point.factors)
-    scene = drop_and_drag(
-        fabric, point.mu, vertices=vertices, preset=preset, seed=seed, frames=frames, self_friction=SELF_FRICTION
-    )
+    scene = cloth_drag.scene(
+        fabric, point.mu, mesh=vertices, preset=preset, seed=seed, frames=frames, self_friction=SELF_FRICTION
+    ).run()
     held, free = scene.rest[:, 1].argmax(), scene.rest[:, 1].argmin()
     edges = [np.isclose(scene.rest[:, 1], scene.rest[vertex, 1]) for vertex in (held, free)]
     fell = scene.positions[DROPPED, edges[1], 0].mean() - scene.positions[DROPPED, edges[0], 0].mean()
@@ -83,7 +84,7 @@ def simulate(name: str, point: Point, vertices: int, preset: str, seed: int, fra
         "bending_rigidity": np.diag(fabric.rigidity).tolist(),
         "factors": point.factors,
         "seed": seed,
-        "bias_side": scene.bias_side,
+        "bias_side": scene.labels["bias_side"],
         "landed_side": 1 if fell > 0 else -1,
         "vertices": vertices,
         "preset": preset,

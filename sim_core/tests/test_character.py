@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stickslip_sim_core import character
+from stickslip_sim_core.scenes import character
 from stickslip_sim_core.scenes.character import BONES, EASE, STILL, bones, distance, figure
 
 

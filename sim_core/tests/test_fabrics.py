@@ -9,13 +9,13 @@ from stickslip_sim_core import (
     PRESETS,
     Cloth,
     custom_fabric,
-    drop_and_drag,
     fabric,
     fabric_names,
     isotropic,
     preset_named,
 )
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.scenes import cloth_drag
 
 
 def test_ten_fabrics() -> None:
@@ -115,9 +115,9 @@ class TestOwnFabric:
 
     def test_scene_takes_it(self) -> None:
         """The same numbers give the same motion, whether by name or not."""
-        named = drop_and_drag("gray-interlock", 0.5, vertices=7, frames=4)
-        own = drop_and_drag(fabric("gray-interlock").scaled(), 0.5, vertices=7, frames=4)
-        heavy = drop_and_drag(fabric("gray-interlock").scaled(density=2.0), 0.5, vertices=7, frames=4)
+        named = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=4).run()
+        own = cloth_drag.scene(fabric("gray-interlock").scaled(), 0.5, mesh=7, frames=4).run()
+        heavy = cloth_drag.scene(fabric("gray-interlock").scaled(density=2.0), 0.5, mesh=7, frames=4).run()
         assert own.positions.tobytes() == named.positions.tobytes()
         assert heavy.holder_force[0, 2] == pytest.approx(2.0 * named.holder_force[0, 2])
 

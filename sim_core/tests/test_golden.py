@@ -26,7 +26,6 @@ from stickslip_sim_core import (
     Cloth,
     box,
     build_info,
-    drop_and_drag,
     fabric,
     isotropic,
     plane,
@@ -36,6 +35,7 @@ from stickslip_sim_core import (
     sphere,
 )
 from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.scenes import cloth_drag
 
 RECORDED = Path(__file__).with_name("golden.json")
 KERNEL = "STICKSLIP_CLOTH_KERNEL"
@@ -86,7 +86,9 @@ def clamped() -> str:
 
 def dragged(material: str, mu: float, vertices: int, frames: int, preset: str) -> str:
     """Drop and drag a cloth that passes through itself."""
-    scene = drop_and_drag(material, mu, vertices=vertices, frames=frames, preset=preset, seed=1, self_friction=None)
+    scene = cloth_drag.scene(
+        material, mu, mesh=vertices, frames=frames, preset=preset, seed=1, self_friction=None
+    ).run()
     counts = np.array([scene.steps, scene.unconverged_steps])
     return digest(scene.positions, scene.contact_force, scene.holder_force, scene.self_intersections, counts)
 

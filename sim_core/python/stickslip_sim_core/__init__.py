@@ -12,8 +12,8 @@ from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import reach, self_contact_distance
 from stickslip_sim_core.rods.multistability import OtherMinima, other_minima
 from stickslip_sim_core.rods.solve import RodSolution, solve_rods
+from stickslip_sim_core.scenes.custom import Sheet
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, read_moving_mesh
-from stickslip_sim_core.scenes.own import Sheet
 from stickslip_sim_core.scenes.scene import ClothRun, Scene
 
 __all__ = [

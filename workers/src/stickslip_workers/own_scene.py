@@ -16,9 +16,9 @@ from stickslip_schemas.spec.scene_file import Sheet as SheetOfFile
 from stickslip_sim_core import Body, Surface, box, custom_fabric, cylinder, fabric, plane, sphere
 from stickslip_sim_core.cloth.meshes import Mesh, grid, unstructured
 from stickslip_sim_core.protocols import CERTIFICATION, SCENE_PROTOCOLS
-from stickslip_sim_core.scenes import own
+from stickslip_sim_core.scenes import custom
+from stickslip_sim_core.scenes.custom import Sheet
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, read_moving_mesh, rotation
-from stickslip_sim_core.scenes.own import Sheet
 from stickslip_sim_core.scenes.scene import ClothRun
 
 from stickslip_workers.builds import solver_build
@@ -166,7 +166,7 @@ def _run(
         if isinstance(body, MeshBody)
     ]
     try:
-        return own.scene(
+        return custom.scene(
             sheets,
             [[scene.mu(one, other) for other in names] for one in names],
             duration=scene.duration,

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stickslip_sim_core import Keyframes, Sheet, fabric, plane, run_scene
+from stickslip_sim_core import Keyframes, Sheet, fabric, plane
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
+from stickslip_sim_core.scenes import custom
 
 MESH = meshes.grid(0.06, 0.06, 4, 4)
 
@@ -22,21 +23,21 @@ def sheet(height: float, **more: Any) -> Sheet:
 
 class TestRunScene:
     def test_two_sheets_on_a_floor(self) -> None:
-        run = run_scene(
+        run = custom.scene(
             [sheet(0.0), sheet(0.001)],
             [[0.5, 0.3], [0.3, 0.5]],
             duration=0.5,
             frame_rate=10.0,
             bodies=[plane(0.4)],
             preset="fast",
-        )
+        ).run()
         assert run.valid, run.reason
-        assert [path.shape for path in run.positions] == [(6, 25, 3)] * 2
+        assert run.positions.shape == (6, 50, 3)
         assert run.times == pytest.approx(np.arange(6) / 10)
         assert not run.self_intersections.any()
         weight = fabric("gray-interlock").density * 0.06**2 * GRAVITY
         assert run.contact_force[-1, :, 2] == pytest.approx([weight, weight], rel=1e-3)
-        assert run.positions[1][-1, :, 2] == pytest.approx(np.full(25, 5e-4), abs=1e-5)  # on the other
+        assert run.positions[-1, 25:, 2] == pytest.approx(np.full(25, 5e-4), abs=1e-5)  # on the other
         assert run.holder_force[-1] == pytest.approx(np.zeros((2, 3)))
 
     @pytest.mark.parametrize(("tilt", "slips"), [(0.9, False), (1.1, True)])
@@ -49,10 +50,10 @@ class TestRunScene:
             turn, _ = keys.at(time)
             return [plane(mu, normal=turn[:, 2])]
 
-        run = run_scene([sheet(0.0)], [[0.5]], duration=2.5, frame_rate=4.0, bodies=floor, preset="fast")
+        run = custom.scene([sheet(0.0)], [[0.5]], duration=2.5, frame_rate=4.0, bodies=floor, preset="fast").run()
         assert run.valid, run.reason
-        along = run.positions[0][-1, :, :] @ np.array([np.cos(angle), 0.0, -np.sin(angle)])
-        moved = along.mean() - run.positions[0][0, :, 0].mean()
+        along = run.positions[-1] @ np.array([np.cos(angle), 0.0, -np.sin(angle)])
+        moved = along.mean() - run.positions[0, :, 0].mean()
         assert (moved > 1e-3) == slips
 
     def test_holders_take_a_sheet_along(self) -> None:
@@ -60,15 +61,18 @@ class TestRunScene:
         start = flat(0.1)[corner]
         lifted = Keyframes([0.0, 1.0], np.array([[0, 0, 0], [0, 0, 0.05]]), np.zeros((2, 3)))
         held = sheet(0.1, held=corner, held_at=lambda time: start + lifted.at(time)[1])
-        run = run_scene([held], [[0.5]], duration=4.0, frame_rate=2.0, preset="fast")
+        run = custom.scene([held], [[0.5]], duration=4.0, frame_rate=2.0, preset="fast").run()
         assert run.valid, run.reason
-        assert run.positions[0][-1, corner] == pytest.approx(start + np.array([0.0, 0.0, 0.05]))
+        assert run.positions[-1, corner] == pytest.approx(start + np.array([0.0, 0.0, 0.05]))
         weight = fabric("gray-interlock").density * 0.06**2 * GRAVITY
         assert run.holder_force[-1, 0, 2] == pytest.approx(weight, rel=0.2)  # it swings a little
 
     def test_the_same_scene_gives_the_same_bits(self) -> None:
-        runs = [run_scene([sheet(0.001)], [[0.5]], duration=0.2, bodies=[plane(0.4)], preset="fast") for _ in range(2)]
-        assert np.array_equal(runs[0].positions[0], runs[1].positions[0])
+        runs = [
+            custom.scene([sheet(0.001)], [[0.5]], duration=0.2, bodies=[plane(0.4)], preset="fast").run()
+            for _ in range(2)
+        ]
+        assert np.array_equal(runs[0].positions, runs[1].positions)
 
     @pytest.mark.parametrize(
         ("change", "message"),
@@ -92,4 +96,4 @@ class TestRunScene:
     def test_refusals(self, change: dict[str, Any], message: str) -> None:
         arguments: dict[str, Any] = {"sheets": [sheet(0.1)], "friction": [[0.5]], "duration": 1.0}
         with pytest.raises(ValueError, match=message):
-            run_scene(**arguments | change)
+            custom.scene(**arguments | change).run()

@@ -1,4 +1,4 @@
-"""A scene of the user's own: sheets of cloth, bodies that move, and friction between each two."""
+"""Custom scenes: sheets of cloth, bodies that move, and friction between each two."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
