@@ -17,9 +17,9 @@ def test_without_a_collector_nothing_is_traced(coordinator: Coordinator, worker:
     coordinator.submit(parsed(rods()), None, traceparent=HOST)
     assert not tracing.is_on()
     assert {lease.traceparent for lease in worker.lease()} == {None}
-    with tracing.span("nothing") as span:
-        assert span.traceparent is None
-        span.note(job="none")
+    with tracing.span("nothing", parent=HOST):
+        assert tracing.traceparent() is None
+        tracing.note(job="none")
 
 
 def test_a_collector_without_the_packages_is_refused(tmp_path: Path) -> None:

@@ -5,11 +5,14 @@ and workers do for a job, hours later and on other machines, hangs below that sp
 """
 
 import os
-import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from opentelemetry.context import Context
+from opentelemetry.trace import NoOpTracerProvider, Span, Status, StatusCode, Tracer, TracerProvider, get_current_span
+from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.documents.worker_api import Lease
@@ -17,19 +20,19 @@ from stickslip_schemas.documents.worker_api import Lease
 ENDPOINT = "OTEL_EXPORTER_OTLP_ENDPOINT"
 """Environment variable with the URL of a collector; the other variables of OpenTelemetry's SDK hold as well."""
 
-_TRACEPARENT = re.compile(r"00-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})")
-
-_provider: Any = None
+_OFF = NoOpTracerProvider()
+_provider: TracerProvider = _OFF
+_propagator = TraceContextTextMapPropagator()
 
 
 class TracingUnavailableError(Exception):
-    """A collector is named, and OpenTelemetry is not installed."""
+    """A collector is named, and OpenTelemetry's SDK is not installed."""
 
 
 def start(service: str, *, exporter: Any = None) -> None:
     """Begin to export spans of this process, if a collector is named; tests give an exporter of their own.
 
-    Raises TracingUnavailableError where OpenTelemetry's packages are missing.
+    Raises TracingUnavailableError where the packages that export are missing.
     """
     global _provider
     if exporter is None and not os.environ.get(ENDPOINT):
@@ -55,57 +58,42 @@ def start(service: str, *, exporter: Any = None) -> None:
 
 
 def stop() -> None:
-    """Export what is left, and no more."""
+    """Export the remaining spans, and stop exporting."""
     global _provider
-    provider, _provider = _provider, None
-    if provider is not None:
+    provider, _provider = _provider, _OFF
+    if provider is not _OFF:
         provider.shutdown()
 
 
 def is_on() -> bool:
     """Tell whether spans are exported."""
-    return _provider is not None
-
-
-class Span:
-    """A span that is open; where nothing is exported, nothing."""
-
-    def __init__(self, span: Any) -> None:
-        self._span = span
-
-    @property
-    def traceparent(self) -> str | None:
-        """What others need to hang their spans below this one [W3C Trace Context]; None where nothing is exported."""
-        if self._span is None:
-            return None
-        context = self._span.get_span_context()
-        return f"00-{context.trace_id:032x}-{context.span_id:016x}-{int(context.trace_flags):02x}"
-
-    def note(self, **attributes: Any) -> None:
-        """Add attributes; their names get `stickslip.` before them."""
-        if self._span is not None:
-            self._span.set_attributes(_named(attributes))
+    return _provider is not _OFF
 
 
 @contextmanager
 def span(name: str, *, parent: str | None = None, **attributes: Any) -> Iterator[Span]:
     """Open a span below `parent`, a traceparent; one that is no traceparent counts as none."""
-    if _provider is None:
-        yield Span(None)
-        return
-    tracer = _provider.get_tracer("stickslip")
-    with tracer.start_as_current_span(name, context=_context(parent), attributes=_named(attributes)) as opened:
-        yield Span(opened)
+    with _tracer().start_as_current_span(name, context=_context(parent), attributes=_named(attributes)) as opened:
+        yield opened
+
+
+def traceparent() -> str | None:
+    """Return the open span as a W3C traceparent, for spans below it; None where nothing is exported."""
+    carrier: dict[str, str] = {}
+    if is_on():
+        _propagator.inject(carrier)
+    return carrier.get("traceparent")
+
+
+def note(**attributes: Any) -> None:
+    """Add attributes to the open span; their names get `stickslip.` before them."""
+    get_current_span().set_attributes(_named(attributes))
 
 
 def record(name: str, *, parent: str | None, seconds: float, failure: str = "", **attributes: Any) -> None:
     """Export a span that ends now and has lasted so long; `failure` says what went wrong, if anything did."""
-    if _provider is None:
-        return
-    from opentelemetry.trace import Status, StatusCode
-
     now = time.time_ns()
-    made = _provider.get_tracer("stickslip").start_span(
+    made = _tracer().start_span(
         name, context=_context(parent), attributes=_named(attributes), start_time=now - round(1e9 * seconds)
     )
     if failure:
@@ -115,12 +103,11 @@ def record(name: str, *, parent: str | None, seconds: float, failure: str = "", 
 
 def record_task(lease: Lease, result: TaskResult, seconds: float, *, worker: str) -> None:
     """Export the span of a task that a worker has run; it lasted as long as the call that it was a part of."""
-    failure = result.message[:500] if result.outcome == "failed" else ""
     record(
         lease.task.stage,
         parent=lease.traceparent,
         seconds=seconds,
-        failure=failure,
+        failure=result.message[:500] if result.outcome == "failed" else "",
         task=lease.task_id,
         attempt=lease.attempt,
         outcome=result.outcome,
@@ -130,18 +117,13 @@ def record_task(lease: Lease, result: TaskResult, seconds: float, *, worker: str
     )
 
 
-def _context(parent: str | None) -> Any:
-    """Return the context of a parent; an empty one where there is none, so that no span of this thread is taken."""
-    from opentelemetry.context import Context
-    from opentelemetry.trace import NonRecordingSpan, SpanContext, TraceFlags, set_span_in_context
+def _tracer() -> Tracer:
+    return _provider.get_tracer("stickslip")
 
-    parts = _TRACEPARENT.fullmatch(parent or "")
-    if parts is None:
-        return Context()
-    trace, own, flags = (int(part, 16) for part in parts.groups())
-    return set_span_in_context(
-        NonRecordingSpan(SpanContext(trace, own, is_remote=True, trace_flags=TraceFlags(flags))), Context()
-    )
+
+def _context(parent: str | None) -> Context:
+    """Return the context of a parent; an empty one where there is none, so that no span of this thread is taken."""
+    return _propagator.extract({"traceparent": parent or ""}, Context())
 
 
 def _named(attributes: dict[str, Any]) -> dict[str, Any]:

@@ -171,10 +171,10 @@ class Coordinator:
         check_textures(self.store, spec)
         with (
             collector_at_rest(),
-            tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count) as span,
+            tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count),
         ):
-            answer = self._submit(spec, idempotency_key, priority, span.traceparent)
-            span.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
+            answer = self._submit(spec, idempotency_key, priority, tracing.traceparent())
+            tracing.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
             return answer
 
     def _submit(
