@@ -26,8 +26,7 @@ from stickslip_training.rods.baselines import (  # noqa: E402
     finite_difference_curvature,
     quintic_spline_curvature,
 )
-from stickslip_training.rods.errors import bending  # noqa: E402
-from stickslip_training.rods.evaluation import estimate_strains  # noqa: E402
+from stickslip_training.rods.evaluation import bending, estimate_strains  # noqa: E402
 from stickslip_training.rods.local_global import load_local_global  # noqa: E402
 
 Lines = npt.NDArray[np.float32]

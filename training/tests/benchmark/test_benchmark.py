@@ -14,7 +14,7 @@ from stickslip_training.benchmark.rods import NOISES, RodTask
 from stickslip_training.benchmark.sets import frozen, load_set, set_names
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.rods.errors import bending
+from stickslip_training.rods.evaluation import bending
 from typer.testing import CliRunner
 
 runner = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"})

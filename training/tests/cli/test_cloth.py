@@ -56,7 +56,7 @@ def test_train_and_evaluate(packed, tmp_path):
     records = [json.loads(line) for line in (out / "records.jsonl").read_text().splitlines()]
     assert json.loads((out / "report.json").read_text())["scores"]["blind"]["clips"] == len(records)
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 8
+    assert page.count("data:image/png;base64,") == 2
     assert "http" not in page.replace("http://www.w3.org", "")
 
 

@@ -6,8 +6,8 @@ from stickslip_training.rods.baselines import (
     finite_difference_curvature,
     quintic_spline_curvature,
 )
-from stickslip_training.rods.errors import bending, relative_rms_error, rms
-from stickslip_training.rods.noise import with_white_noise
+from stickslip_training.rods.dataset import with_white_noise
+from stickslip_training.rods.evaluation import bending, relative_rms_error, rms
 
 S = np.linspace(0.0, 1.0, 150)
 METHODS = [finite_difference_curvature, cubic_spline_curvature, quintic_spline_curvature]

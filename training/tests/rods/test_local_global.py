@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from stickslip_training.rods.dataset import ReconstructionNoise
 from stickslip_training.rods.local_global import (
     LocalGlobalTraining,
     draw_noise,
@@ -8,8 +9,7 @@ from stickslip_training.rods.local_global import (
     save_local_global,
     train_local_global,
 )
-from stickslip_training.rods.local_global_net import LocalGlobalNet, relative_loss
-from stickslip_training.rods.noise import ReconstructionNoise
+from stickslip_training.rods.nets import LocalGlobalNet, relative_loss
 
 SMALL = {"width": 32, "blocks": 2, "local": 4}
 

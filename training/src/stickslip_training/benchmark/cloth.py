@@ -50,7 +50,9 @@ class ClothTask(Task):
         raise ValueError("a method is given the clips themselves: read the array video of the dataset")
 
     def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
-        return score_predictions(answers, reader.categories("material"), truth_of_slots(reader, slots)).as_dict()
+        return score_predictions(
+            answers, reader.categories("material"), slots.tolist(), truth_of_slots(reader, slots)
+        ).as_dict()
 
     def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
         blind, bands = scores["blind"], scores["bands"]

@@ -16,8 +16,8 @@ import numpy as np
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
 from stickslip_training.benchmark.task import Task
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.rods.errors import bending, relative_rms_error
-from stickslip_training.rods.noise import with_white_noise
+from stickslip_training.rods.dataset import with_white_noise
+from stickslip_training.rods.evaluation import bending, relative_rms_error
 
 NOISES = (0.001, 0.005, 0.01)
 """Standard deviation of every coordinate, over L."""

@@ -259,8 +259,10 @@ def score(
 
     with errors_told(), DatasetReader(dataset) as reader:
         check_kind(reader)
-        truth = truth_of_slots(reader, reader.slots(_split(split)))
-        scores = score_predictions(read_answers(predictions)[0], reader.categories("material"), truth)
+        slots = reader.slots(_split(split))
+        scores = score_predictions(
+            read_answers(predictions)[0], reader.categories("material"), slots.tolist(), truth_of_slots(reader, slots)
+        )
     Console().print(_scores(scores))
 
 

@@ -1,18 +1,26 @@
-"""The commands `stickslip-train info` and `stickslip-train coco`."""
+"""The commands `stickslip-train info`, `coco` and `export`."""
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, cast
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 from rich.table import Table
+from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, errors_told
-from stickslip_training.data.coco import export_coco
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
+from stickslip_training.export import huggingface, meshes, webdataset
+from stickslip_training.export.coco import export_coco
+from stickslip_training.export.content import Content, OnBytes
+from stickslip_training.export.writing import to_directory, to_file
 
 
 def info(
@@ -70,3 +78,82 @@ def coco(
 
 def _megabytes(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e5 else f"{count / 1e3:,.1f} kB"
+
+
+def export(
+    dataset: DatasetArgument,
+    to_hdf5: Annotated[Path | None, typer.Option("--hdf5", metavar="FILE", help="one HDF5 file")] = None,
+    to_webdataset: Annotated[
+        Path | None, typer.Option("--webdataset", metavar="DIR", help="tar files for WebDataset")
+    ] = None,
+    to_huggingface: Annotated[
+        Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
+    ] = None,
+    to_usd: Annotated[Path | None, typer.Option("--usd", metavar="DIR", help="moving meshes of cloth for USD")] = None,
+    to_obj: Annotated[
+        Path | None, typer.Option("--obj", metavar="DIR", help="meshes of cloth, an instant each")
+    ] = None,
+    arrays: Annotated[str | None, typer.Option(help="arrays to take, with commas between; labels always come")] = None,
+    split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
+    where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
+    licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
+    gzip: Annotated[int, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = 0,
+) -> None:
+    """Write a dataset in a format that other libraries read. Nothing is overwritten."""
+    targets = {
+        "--hdf5": to_hdf5,
+        "--webdataset": to_webdataset,
+        "--huggingface": to_huggingface,
+        "--usd": to_usd,
+        "--obj": to_obj,
+    }
+    with errors_told():
+        given = {option: path for option, path in targets.items() if path is not None}
+        if len(given) != 1:
+            raise ValueError(f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}")
+        [(option, target)] = given.items()
+        if gzip and option != "--hdf5":
+            raise ValueError("--gzip is for --hdf5 only")
+        _require(option)
+        selection = Selection.of_options(arrays, split, where)
+        with DatasetReader(dataset) as reader:
+            content = Content(reader, selection)
+            with _progress(content) as on_bytes:
+                if option == "--hdf5":
+                    to_file(content, target, on_bytes, gzip=gzip, licence=licence)
+                else:
+                    to_directory(content, target, on_bytes, _DIRECTORIES[option], licence=licence)
+        skipped = len(reader) - len(content.slots)
+        Console(soft_wrap=True, highlight=False).print(
+            f"{content.name} is in {target}: {len(content.slots)} samples"
+            + (f"; {skipped} rejected or not chosen" if skipped else ""),
+            markup=False,
+        )
+
+
+_DIRECTORIES = {
+    "--webdataset": webdataset.write,
+    "--huggingface": huggingface.write,
+    "--usd": meshes.write_usd,
+    "--obj": meshes.write_obj,
+}
+_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--usd": ["pxr"]}
+
+
+def _require(option: str) -> None:
+    missing = [name for name in _NEEDED.get(option, []) if find_spec(name) is None]
+    if missing:
+        extra = "usd" if option == "--usd" else "export"
+        raise ImportError(
+            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[{extra}]'"
+        )
+
+
+@contextmanager
+def _progress(content: Content) -> Iterator[OnBytes]:
+    """Show a bar on the terminal, where there is one."""
+    console = Console(stderr=True)
+    columns = (BarColumn(bar_width=32), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        row = bar.add_task("export", total=len(content.slots) * content.sample_bytes)
+        yield lambda count: bar.advance(row, count)

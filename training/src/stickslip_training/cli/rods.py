@@ -1,4 +1,4 @@
-"""The commands `stickslip-train curvature` and `stickslip-train local-global`."""
+"""The commands on rods: `stickslip-train curvature`, `local-global` and `reconstruct`."""
 
 import importlib.util
 import json
@@ -17,6 +17,7 @@ from stickslip_training.data.reader import DatasetReader
 if TYPE_CHECKING:
     from stickslip_training.rods.curvature import TrainingReport
     from stickslip_training.rods.evaluation import MethodReport
+
 
 _SECONDS_BETWEEN_LINES = 5.0  # epochs of a small dataset take less
 _EVALUATED_RODS = 1000  # at most
@@ -92,10 +93,9 @@ def local_global(
 ) -> None:
     """Train the network that pools local and global features, with fresh noise at every step."""
     from stickslip_training.engine.fit import EpochReport
-    from stickslip_training.rods.dataset import load_splits
+    from stickslip_training.rods.dataset import ReconstructionNoise, load_splits
     from stickslip_training.rods.evaluation import evaluate, noisy_test_centerline
     from stickslip_training.rods.local_global import LocalGlobalTraining, save_local_global, train_local_global
-    from stickslip_training.rods.noise import ReconstructionNoise
 
     console = Console()
 
@@ -157,3 +157,39 @@ def _methods(title: str, caption: str, methods: "tuple[MethodReport, ...]") -> T
             f"{1e3 * method.seconds_per_rod:,.2f}",
         )
     return table
+
+
+def reconstruct(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="one picture for each camera, named as the camera")],
+    calibration: Annotated[Path, typer.Option(help="cameras as in the rigs of stickslip-schemas")],
+    out: Annotated[Path, typer.Option(help="directory for the centreline, the overlay and the report")],
+    length: Annotated[float, typer.Option(help="of the rod, in the unit of the calibration")] = 1.0,
+    clamp: Annotated[tuple[float, float, float], typer.Option(help="where the rod leaves its clamp")] = (0, 0, 0),
+    direction: Annotated[tuple[float, float, float], typer.Option(help="of the rod in its clamp")] = (0, 0, -1),
+    radius: Annotated[float | None, typer.Option(help="of the rod; found if not given")] = None,
+    rig: Annotated[str | None, typer.Option(help="which rig of the calibration, if it has several")] = None,
+    points: Annotated[int, typer.Option(help="of the centreline, at uniform arc length", min=2)] = 150,
+) -> None:
+    """Reconstruct the centreline of a hanging rod from photographs by calibrated cameras."""
+    # Heavy, and not needed by the other commands.
+    from stickslip_training.reconstruction.photographs import reconstruct_folder, write_results
+
+    with errors_told():
+        result = reconstruct_folder(
+            folder,
+            calibration,
+            length=length,
+            clamp=clamp,
+            direction=direction,
+            rig=rig,
+            points=points,
+            radius=radius,
+        )
+        written = write_results(result, out)
+    found, console = result.reconstruction, Console()
+    console.print(
+        f"{found.verdict}: misfit {found.misfit:.1%}, residual {found.residual_rms:.2f} px, radius {found.radius:.4g}"
+    )
+    for reason in found.reasons:
+        console.print(f"Note: {reason}")
+    console.print(f"{out}: {', '.join(written)}", soft_wrap=True)

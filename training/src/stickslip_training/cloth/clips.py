@@ -246,11 +246,14 @@ def simulations(reader: DatasetReader, slots: Integers) -> Integers:
     return np.unique(np.concatenate(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
-def truth_of_slots(reader: DatasetReader, slots: Integers) -> dict[int, tuple[int, float, int]]:
-    """Return the code of the material, mu and the number of the simulation of slots, as `score_predictions` asks."""
-    material, mu = (reader.label(name)[slots].tolist() for name in ("material", "mu"))
-    groups = simulations(reader, slots).tolist()
-    return {slot: (m, x, run) for slot, m, x, run in zip(slots.tolist(), material, mu, groups, strict=True)}
+def truth_of_slots(reader: DatasetReader, slots: Integers) -> Truth:
+    """Return the true values of slots, but for the side to which the cloth fell."""
+    return Truth(
+        material=reader.label("material")[slots].astype(np.int64),
+        mu=reader.label("mu")[slots].astype(np.float64),
+        landed=np.zeros(len(slots), np.int64),
+        run=simulations(reader, slots),
+    )
 
 
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:

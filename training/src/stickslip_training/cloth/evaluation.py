@@ -89,29 +89,36 @@ class Truth:
 
 def score(posterior: Posterior, truth: Truth) -> Scores:
     """Compare posteriors with the truth."""
-    blind = estimates(posterior.mu, posterior.bins)
-    rank = (posterior.material > posterior.material[np.arange(len(posterior)), truth.material][:, None]).sum(axis=1)
     below = quantile_of_truth(posterior.mu, posterior.bins, truth.mu)
-
-    def share(values: Array) -> Measure:
-        return measure(values.astype(float), truth.run)
-
-    def part(chosen: Array) -> Errors:
-        return errors(_some(blind, chosen), truth.mu[chosen], truth.run[chosen])
-
-    bands = {
-        f"{low:g} to {high:g}": (truth.mu >= low) & (truth.mu < high + (high == BANDS[-1][1])) for low, high in BANDS
-    }
-    sides = {f"{side:+d}": truth.landed == side for side in (-1, 1)}
-    return Scores(
-        blind=errors(blind, truth.mu, truth.run),
+    return _scores(
+        estimates(posterior.mu, posterior.bins),
+        posterior.material,
+        truth,
         given=errors(estimates(posterior.given(truth.material), posterior.bins), truth.mu, truth.run),
-        top_1=share(rank < 1),
-        top_2=share(rank < 2),
         log_likelihood=measure(posterior.log_likelihood(truth.material, truth.mu), truth.run),
-        bands={name: part(chosen) for name, chosen in bands.items() if chosen.any()},
-        sides={name: part(chosen) for name, chosen in sides.items() if chosen.any()},
         reliability={f"{level:g}": float((np.abs(below - 0.5) <= level / 2).mean()) for level in LEVELS},
+    )
+
+
+def _scores(found: Estimates, material: Floats, truth: Truth, **more: Any) -> Scores:
+    """Return scores of estimates of mu and of probabilities of materials (clips, materials)."""
+    of_true = material[np.arange(len(material)), truth.material][:, None]
+    rank = (material >= of_true).sum(axis=1) - 1
+
+    def parts(masks: dict[str, Array]) -> dict[str, Errors]:
+        return {
+            name: errors(Estimates(found.median[one], found.low[one], found.high[one]), truth.mu[one], truth.run[one])
+            for name, one in masks.items()
+            if one.any()
+        }
+
+    return Scores(
+        blind=errors(found, truth.mu, truth.run),
+        top_1=measure((rank < 1).astype(float), truth.run),
+        top_2=measure((rank < 2).astype(float), truth.run),
+        bands=parts({f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}),
+        sides=parts({f"{side:+d}": truth.landed == side for side in (-1, 1)}),
+        **more,
     )
 
 
@@ -130,18 +137,6 @@ def errors(found: Estimates, mu: Floats, run: Integers) -> Errors:
     )
 
 
-def distance_to_interval(mu: Floats, reference: Floats, error: Floats) -> Floats:
-    """Return how far estimates lie outside reference +- error, the thesis's error on real videos [thesis, 4.5.2]."""
-    return np.maximum(np.abs(mu - reference) - error, 0.0)
-
-
-def median_of_videos(mu: Floats, group: Integers) -> tuple[Floats, Integers]:
-    """Return the median over the videos of each group, five of one cloth and substrate in the thesis, and the
-    groups."""
-    groups = np.unique(group)
-    return np.array([np.median(mu[group == each]) for each in groups]), groups
-
-
 def measure(values: Floats, run: Integers) -> Measure:
     """Return the mean of `values` (clips,), and the 5 % and 95 % quantile of it over drawn simulations."""
     _, number = np.unique(run, return_inverse=True)
@@ -151,10 +146,6 @@ def measure(values: Floats, run: Integers) -> Measure:
     means = totals[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.quantile(means, [0.05, 0.95])
     return Measure(float(values.mean()), float(low), float(high))
-
-
-def _some(found: Estimates, chosen: Array) -> Estimates:
-    return Estimates(found.median[chosen], found.low[chosen], found.high[chosen])
 
 
 def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, Any]]:
@@ -172,51 +163,41 @@ def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, An
     ]
 
 
-def score_predictions(
-    answers: Sequence[Any], materials: Sequence[str], truth: dict[int, tuple[int, float, int]]
-) -> Scores:
-    """Score a file of predictions, anybody's: `truth` has material, mu and simulation of each slot.
+def score_predictions(answers: Sequence[Any], materials: Sequence[str], slots: Sequence[int], truth: Truth) -> Scores:
+    """Score a file of predictions of any method; `truth` is that of `slots`, each of which must be answered once.
 
-    Every slot of `truth` must be answered once. Raises ValueError, which names the answer, where one is not what
-    `predictions` returns.
+    Raises ValueError, which names the answer, where one is not what `predictions` returns.
     """
-    found: dict[int, tuple[dict[str, float], tuple[float, float, float]]] = {}
+    found: dict[int, tuple[list[float], tuple[float, float, float]]] = {}
     for place, answer in enumerate(answers):
         try:
             slot = int(answer["slot"])
-            mu = tuple(float(answer["mu"][name]) for name in ("median", "low", "high"))
+            median, low, high = (float(answer["mu"][name]) for name in ("median", "low", "high"))
             probabilities = {str(name): float(p) for name, p in answer["material"].items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(
                 f"answer {place} must have slot, material and mu with median, low and high: {error!r}"
             ) from None
-        if slot not in truth:
+        if slot not in slots:
             raise ValueError(f"slot of answer {place} must be one of the test set, and is {slot}")
         if slot in found:
             raise ValueError(f"slot {slot} is answered twice, at {place} for the second time")
-        if not (np.isfinite(mu).all() and mu[1] <= mu[0] <= mu[2]):
+        if not (np.isfinite([low, median, high]).all() and low <= median <= high):
             raise ValueError(f"mu of answer {place} must be finite with low <= median <= high, and is {answer['mu']}")
         unknown = set(probabilities) - set(materials)
         if unknown or any(not 0 <= p <= 1 for p in probabilities.values()):
             raise ValueError(f"material of answer {place} must give probabilities of {', '.join(materials)}")
-        found[slot] = (probabilities, (mu[0], mu[1], mu[2]))
-    missing = sorted(set(truth) - set(found))
+        found[slot] = [probabilities.get(name, 0.0) for name in materials], (median, low, high)
+    missing = sorted(set(slots) - set(found))
     if missing:
         raise ValueError(f"every slot of the test set must be answered, and {len(missing)} are not, {missing[0]} first")
-    slots = sorted(truth)
-    material, true_mu, run = (np.array([truth[slot][i] for slot in slots]) for i in range(3))
-    median, low, high = (np.array([found[slot][1][i] for slot in slots]) for i in range(3))
-    told = Estimates(median, low, high)
-    certain = np.array([[found[slot][0].get(name, 0.0) for name in materials] for slot in slots])
-    rank = (certain >= certain[np.arange(len(slots)), material][:, None]).sum(axis=1) - 1
-    bands = {f"{a:g} to {b:g}": (true_mu >= a) & (true_mu < b + (b == BANDS[-1][1])) for a, b in BANDS}
-    return Scores(
-        blind=errors(told, true_mu, run),
+    told = Estimates(*np.array([found[slot][1] for slot in slots]).T)
+    inside = (told.low <= truth.mu) & (truth.mu <= told.high)
+    return _scores(
+        told,
+        np.array([found[slot][0] for slot in slots]),
+        truth,
         given=None,
-        top_1=measure((rank < 1).astype(float), run),
-        top_2=measure((rank < 2).astype(float), run),
         log_likelihood=None,
-        bands={n: errors(_some(told, c), true_mu[c], run[c]) for n, c in bands.items() if c.any()},
-        sides={},
-        reliability={f"{SHARE:g}": float(((low <= true_mu) & (true_mu <= high)).mean())},
+        reliability={f"{SHARE:g}": float(inside.mean())},
     )

@@ -22,11 +22,9 @@ from stickslip_training.engine.fit import (
     seeded,
     torch_threads,
 )
-from stickslip_training.rods.curvature_net import CurvatureNet, root_mean_square_loss
-from stickslip_training.rods.dataset import Rods, load_splits
-from stickslip_training.rods.errors import rms
-from stickslip_training.rods.evaluation import MethodReport, estimate_strains, evaluate, noisy_test_centerline
-from stickslip_training.rods.noise import with_white_noise
+from stickslip_training.rods.dataset import Rods, load_splits, with_white_noise
+from stickslip_training.rods.evaluation import MethodReport, estimate_strains, evaluate, noisy_test_centerline, rms
+from stickslip_training.rods.nets import CurvatureNet, root_mean_square_loss
 
 _TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apart
 

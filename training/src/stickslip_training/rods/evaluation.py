@@ -1,4 +1,9 @@
-"""How well networks, and methods that learn nothing, find the curvature of the same noisy rods."""
+"""Errors of the curvature that networks, and methods that learn nothing, find of the same noisy rods.
+
+kappa = (twist, bend1, bend2) L are the strains of a rod. Its centreline has the curvature |kappa| = sqrt(bend1^2 +
+bend2^2) L: the twist is that of the material about the centreline, which an estimate from the centreline alone cannot
+see. So errors that compare methods are errors of |kappa|.
+"""
 
 import time
 from dataclasses import dataclass
@@ -6,15 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from stickslip_training.arrays import Floats, SingleFloats
+from stickslip_training.arrays import AnyFloats, Floats, SingleFloats
 from stickslip_training.rods.baselines import (
     cubic_spline_curvature,
     finite_difference_curvature,
     quintic_spline_curvature,
 )
-from stickslip_training.rods.dataset import Rods
-from stickslip_training.rods.errors import bending, relative_rms_error, rms
-from stickslip_training.rods.noise import with_white_noise
+from stickslip_training.rods.dataset import Rods, with_white_noise
 
 _CHUNK = 256  # rods that go through a network at once
 _TEST = 2  # stream of random numbers of the noise on test rods, apart from those of training
@@ -22,7 +25,7 @@ _TEST = 2  # stream of random numbers of the noise on test rods, apart from thos
 
 @dataclass(frozen=True, kw_only=True)
 class MethodReport:
-    """How well one method finds the curvature of the test rods. Errors are of |kappa|: see `rods.errors`."""
+    """How well one method finds the curvature of the test rods. Errors are of |kappa|."""
 
     method: str
     rms: float
@@ -79,3 +82,22 @@ def _method(name: str, estimate: Floats, truth: Floats, started: float) -> Metho
         relative_p90=float(np.quantile(errors, 0.9)),
         seconds_per_rod=seconds,
     )
+
+
+def bending(strains: AnyFloats) -> Floats:
+    """Return |kappa| L, (..., points), of strains (..., points, 3)."""
+    return np.asarray(np.hypot(strains[..., 1], strains[..., 2]), dtype=np.float64)
+
+
+def rms(difference: AnyFloats) -> float:
+    """Return the root mean square of all entries."""
+    return float(np.sqrt(np.mean(np.square(difference, dtype=np.float64))))
+
+
+def relative_rms_error(estimate: AnyFloats, truth: AnyFloats) -> Floats:
+    """Return the RMS relative error of each rod, (rods,), of |kappa| L, (rods, points):
+
+    sqrt(mean_s (estimate - truth)^2) / sqrt(mean_s truth^2), over all points, the ends included.
+    """
+    error = np.sqrt(np.mean(np.square(estimate - truth, dtype=np.float64), axis=-1))
+    return np.asarray(error / np.sqrt(np.mean(np.square(truth, dtype=np.float64), axis=-1)))

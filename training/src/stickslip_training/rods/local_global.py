@@ -13,8 +13,8 @@ from torch import nn
 from stickslip_training.arrays import SingleFloats
 from stickslip_training.engine.files import load_tensors, save_tensors
 from stickslip_training.engine.fit import EpochReport, FitSettings, Learner, check_positive, cosine_rate, fit, seeded
-from stickslip_training.rods.local_global_net import LocalGlobalNet, relative_loss
-from stickslip_training.rods.noise import ReconstructionNoise
+from stickslip_training.rods.dataset import ReconstructionNoise
+from stickslip_training.rods.nets import LocalGlobalNet, relative_loss
 
 _RODS_FOR_COMPONENTS = 40_000  # at most: their principal components are known well enough
 _WARM_UP = 200  # steps: the moments of AdamW know nothing at first

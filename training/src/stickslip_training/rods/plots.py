@@ -8,9 +8,8 @@ import numpy as np
 from stickslip_training.engine.files import MODEL_NAME
 from stickslip_training.rods.baselines import quintic_spline_curvature
 from stickslip_training.rods.curvature import CurvatureTraining, TrainingReport, load_model, read_test_rods
-from stickslip_training.rods.curvature_net import POINTS
-from stickslip_training.rods.errors import bending, relative_rms_error
-from stickslip_training.rods.evaluation import estimate_strains
+from stickslip_training.rods.dataset import POINTS
+from stickslip_training.rods.evaluation import bending, estimate_strains, relative_rms_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,7 +22,6 @@ _QUANTILES = (0.1, 0.5, 0.9)
 def plot_curvature(config: CurvatureTraining, report: TrainingReport, path: Path) -> None:
     """Draw |kappa| along three test rods, true and estimated, and the losses of the run; write a PNG."""
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ModuleNotFoundError:
         raise ModuleNotFoundError("pictures need matplotlib: pip install 'stickslip-training[plots]'") from None
@@ -38,7 +36,6 @@ def plot_curvature(config: CurvatureTraining, report: TrainingReport, path: Path
     spline_errors = relative_rms_error(spline, truth[chosen])
 
     figure = Figure(figsize=(11, 7), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2)
     s = np.linspace(0.0, 1.0, POINTS)
     for place, (rod, quantile) in enumerate(zip(chosen, _QUANTILES, strict=True)):

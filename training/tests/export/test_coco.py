@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from stickslip_schemas.kinds.cloth.arrays import SEGMENTS
-from stickslip_training.data.coco import export_coco, run_lengths
 from stickslip_training.data.reader import DatasetReader
+from stickslip_training.export.coco import export_coco, run_lengths
 
 
 def test_run_lengths_give_the_mask_back() -> None:
