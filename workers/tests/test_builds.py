@@ -42,7 +42,7 @@ def note(frame, event, argument):
         ran.add(frame.f_code.co_filename)
 from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.documents.tasks import task_adapter
-from stickslip_workers.stages.actor import StageActor
+from stickslip_workers.stages.run import StageActor
 actor = StageActor(sys.argv[2])
 import stickslip_sim_core, stickslip_workers.stages.simulate  # what is run at import is no work
 from stickslip_workers.kinds import kind, kind_names
@@ -56,7 +56,7 @@ print(json.dumps({"results": results, "ran": sorted(ran)}))
 
 _IMPORT = """
 import sys
-import stickslip_workers.stages.actor, stickslip_workers.stages.pack, stickslip_workers.stages.publish
+import stickslip_workers.stages.run, stickslip_workers.stages.pack, stickslip_workers.stages.publish
 import stickslip_workers.stages.simulate
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.kinds import kind, kind_names

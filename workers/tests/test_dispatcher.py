@@ -17,8 +17,8 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.cluster import Cluster
-from stickslip_workers.coordinator_client import SupersededError
 from stickslip_workers.dispatcher import Dispatcher
+from stickslip_workers.lease_client import SupersededError
 from stickslip_workers.processes import StartError
 from stickslip_workers.settings import Settings
 

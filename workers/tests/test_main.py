@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 from stickslip_workers import cluster
-from stickslip_workers.backoff import Backoff
+from stickslip_workers.lease_client import Backoff
 
 PROGRAM = """
 import sys
 from pathlib import Path
 from stickslip_workers.__main__ import run_for_ever
-from stickslip_workers.backoff import Backoff
+from stickslip_workers.lease_client import Backoff
 sys.exit(run_for_ever([sys.executable, "-c", sys.argv[1], sys.argv[2]], Backoff(first=0.01)))
 """
 CHILD = """

@@ -16,8 +16,7 @@ from stickslip_schemas import tracing
 from stickslip_schemas.documents.tasks import task_adapter
 from stickslip_schemas.store import open_store, store_place
 
-from stickslip_workers.backoff import Backoff
-from stickslip_workers.coordinator_client import CoordinatorError
+from stickslip_workers.lease_client import Backoff, CoordinatorError
 from stickslip_workers.settings import Settings, default_blender_python
 
 STEADY_SECONDS = 60.0
@@ -75,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _certify(options)
     if options.command == "scene":
         return _scene(options)
-    from stickslip_workers.stages.actor import StageActor
+    from stickslip_workers.stages.run import StageActor
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
     return 0

@@ -18,9 +18,9 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 def roots(stage: str, name: str) -> tuple[str, ...]:
     """Return the modules that do the work of a stage for a kind."""
     if stage == "simulate":
-        return (f"{_STAGES}.actor", f"{_STAGES}.simulate", scene_module(name))
+        return (f"{_STAGES}.run", f"{_STAGES}.simulate", scene_module(name))
     if stage == "pack":
-        return (f"{_STAGES}.actor", f"{_STAGES}.pack", f"{_STAGES}.publish", f"stickslip_schemas.kinds.{name}")
+        return (f"{_STAGES}.run", f"{_STAGES}.pack", f"{_STAGES}.publish", f"stickslip_schemas.kinds.{name}")
     raise ValueError(f"stage must be simulate or pack; got {stage!r}")
 
 

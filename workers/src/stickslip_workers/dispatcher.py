@@ -28,22 +28,21 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.store import open_store
 
-from stickslip_workers.backoff import Backoff
 from stickslip_workers.cluster import Cluster, ClusterLostError
-from stickslip_workers.coordinator_client import (
+from stickslip_workers.kinds import kind, kind_names
+from stickslip_workers.lease_client import (
+    Backoff,
     CoordinatorClient,
     CoordinatorError,
+    HeartbeatThread,
+    LeaseBook,
     UnknownWorkerError,
     UnreachableError,
 )
-from stickslip_workers.failures import failed, failure, process_failure
-from stickslip_workers.heartbeat import HeartbeatThread
-from stickslip_workers.kinds import kind, kind_names
-from stickslip_workers.leases import LeaseBook
 from stickslip_workers.processes import Pool, PoolSettings, Process
+from stickslip_workers.results import failed, failure, merged, process_failure, shading_of, split
 from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
 from stickslip_workers.stages.run import AnyTask, with_damaged_inputs
-from stickslip_workers.together import apart, shading_of, together
 
 log = logging.getLogger(__name__)
 
@@ -136,7 +135,7 @@ class Dispatcher:
         self._stage_pool = Pool(
             PoolSettings(
                 sort="stage",
-                factory="stickslip_workers.stages.actor:StageActor",
+                factory="stickslip_workers.stages.run:StageActor",
                 tasks_per_process=10_000,
                 tells_frames=True,
                 **common,
@@ -389,7 +388,7 @@ class Dispatcher:
 
     def _assign(self, parts: list[list[Lease]], stage: Stage, process: Process) -> None:
         if stage is Stage.render:
-            arguments: list[Any] = [together(_renders(leases)).model_dump(mode="json") for leases in parts]
+            arguments: list[Any] = [merged(_renders(leases)).model_dump(mode="json") for leases in parts]
             ref = process.actor.call.remote("render", arguments)
         else:
             arguments = [_tasks.dump_json([lease.task for lease in leases]).decode() for leases in parts]
@@ -608,7 +607,7 @@ def _read_results(answer: Any, leases: list[Lease]) -> list[TaskResult]:
     """Return the result of each lease: the renderer answers with a dict, the stages with JSON."""
     try:
         if isinstance(answer, dict):
-            return apart(_renders(leases), TaskResult.model_validate(answer))
+            return split(_renders(leases), TaskResult.model_validate(answer))
         return _results.validate_json(answer)
     except ValidationError as error:
         return [failure(error)] * len(leases)

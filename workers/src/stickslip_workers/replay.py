@@ -8,7 +8,7 @@ from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import RenderTask, TaskResult
 from stickslip_schemas.store import open_store
 
-from stickslip_workers.failures import failed
+from stickslip_workers.results import failed
 from stickslip_workers.settings import RENDER_ACTOR
 from stickslip_workers.stages.run import AnyTask, run_tasks
 

@@ -1,16 +1,57 @@
-"""Runs tasks here and now: the one place where exceptions become results, and where time is measured."""
+"""Run tasks in this process. Exceptions become results here, and time is measured here."""
 
 import time
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
+from pydantic import TypeAdapter
 from stickslip_schemas.base.states import Reason
-from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, TaskResult, input_digests
-from stickslip_schemas.store import Store, in_parallel
+from stickslip_schemas.documents.tasks import (
+    PackTask,
+    PublishTask,
+    RenderTask,
+    SimulateTask,
+    Task,
+    TaskResult,
+    input_digests,
+)
+from stickslip_schemas.store import Store, in_parallel, open_store
 
-from stickslip_workers.failures import failure
+from stickslip_workers import builds, progress
+from stickslip_workers.kinds import kind_names
+from stickslip_workers.results import failure
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
+
+_tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
+_results = TypeAdapter(list[TaskResult])
+
+
+class StageActor:
+    """Runs simulate, pack and publish in a process that holds it, with JSON on both sides, as the renderer does."""
+
+    def __init__(self, store: str) -> None:
+        self._store = open_store(store)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the builds of each kind, and versions of libraries."""
+        return {
+            "builds": {name: builds.kind_builds(name) for name in kind_names()},
+            "versions": builds.versions(),
+        }
+
+    def run(self, tasks: str) -> str:
+        """Run tasks, see `run_tasks`."""
+        progress.forget()
+        try:
+            return _results.dump_json(run_tasks(_tasks.validate_json(tasks), self._store)).decode()
+        finally:
+            progress.forget()
+
+    def frames(self) -> tuple[int, int] | None:
+        """Return the progress of the running simulation, (frames done, frames total); another thread may call it."""
+        return progress.told()
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
@@ -37,9 +78,9 @@ def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
 
 
 def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:
-    """Return the result of a failed task with all damaged inputs named, so that they are made again at once.
+    """Return the result of a failed task with the digests of its damaged inputs, so that they are recomputed at once.
 
-    Nothing is known of inputs while the store itself cannot be used.
+    While the store is unavailable, inputs cannot be checked.
     """
     if result.reason is Reason.store_unavailable:
         return result
@@ -52,7 +93,7 @@ def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    """Hand the tasks to the module of their stage, which is imported only now: a packer needs no simulator."""
+    """Call the module of the stage, imported here: packing needs no simulator."""
     (stage,) = {task.stage for task in tasks}
     results: list[TaskResult] = import_module(f"stickslip_workers.stages.{stage}").run(tasks, store)
     return results

@@ -1,13 +1,55 @@
-"""Renders that share a shading are put together, and their result is taken apart again."""
+"""Results: each failure has its reason; renders of one shading are merged, and their result is split."""
+
+import errno
 
 import pytest
+from ray import exceptions as ray_errors
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
+from stickslip_schemas.format.chunks import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
-from stickslip_workers.together import apart, shading_of, together
+from stickslip_schemas.store import CorruptArtifactError
+from stickslip_workers.results import MESSAGE_LENGTH, failure, merged, process_failure, shading_of, split
 
 RECORD = RecordRef(digest="d" * 64, row=0)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), Reason.store_unavailable),
+        (PermissionError(errno.EACCES, "Permission denied"), Reason.store_unavailable),
+        (OSError(errno.EROFS, "Read-only file system"), Reason.store_unavailable),
+        (OSError(errno.EIO, "Input/output error"), Reason.storage_error),
+        (FileNotFoundError("artifact"), Reason.storage_error),
+        (CorruptArtifactError("artifact"), Reason.storage_error),
+        (CorruptChunkError("chunk"), Reason.storage_error),
+        (MemoryError(), Reason.oom_killed),
+        (ValueError("x" * 9999), Reason.internal_error),
+    ],
+)
+def test_what_a_stage_raises(error: Exception, reason: Reason) -> None:
+    result = failure(error)
+    assert (result.outcome, result.reason) == ("failed", reason)
+    assert len(result.message) <= MESSAGE_LENGTH
+
+
+@pytest.mark.parametrize(
+    ("error", "renders", "reason"),
+    [
+        (ray_errors.RayActorError(), True, Reason.renderer_crash),
+        (ray_errors.RayActorError(), False, Reason.process_crash),
+        (ray_errors.RayActorError(error_msg="The actor died because its node has died."), True, Reason.worker_lost),
+        (ray_errors.ActorUnavailableError("connection refused", None), True, Reason.worker_lost),
+        (ray_errors.OutOfMemoryError("low on memory"), True, Reason.oom_killed),
+        (ray_errors.WorkerCrashedError(), False, Reason.worker_lost),
+        (ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")), True, Reason.store_unavailable),
+        (ray_errors.RayTaskError("render", "traceback", "not an exception"), True, Reason.internal_error),
+    ],
+)
+def test_what_ray_raises(error: Exception, renders: bool, reason: Reason) -> None:
+    assert process_failure(error, renders=renders).reason is reason
 
 
 def clip(texture: str, *, preview: bool = False, record: RecordRef = RECORD, **look: object) -> RenderTask:
@@ -35,21 +77,21 @@ def test_only_the_texture_may_differ() -> None:
     others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
     assert same not in {shading_of(task) for task in others}
     with pytest.raises(ValueError, match="renders of one shading"):
-        together([clip("dots"), others[0]])
+        merged([clip("dots"), others[0]])
 
 
 def test_a_rod_shares_nothing() -> None:
     rod = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=1)
     task = RenderTask(render=rod, record=RECORD)
     assert shading_of(task) is None
-    assert together([task]) is task
+    assert merged([task]) is task
     with pytest.raises(ValueError, match="renders of one shading"):
-        together([task, task])
+        merged([task, task])
 
 
 def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     tasks = [clip("dots"), clip("plaid", preview=True), clip("floral")]
-    asked = together(tasks)
+    asked = merged(tasks)
     assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
     depth = {"depth": chunk(9)}
     output = RenderOutput(
@@ -58,7 +100,7 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
         clips={name: chunk(number) for number, name in enumerate(asked.textures)},
         previews=dict.fromkeys(asked.textures, "e" * 64),
     )
-    results = apart(tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0))
+    results = split(tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0))
     assert [result.output.chunks for result in results] == [{"video": chunk(n), **depth} for n in range(3)]
     assert [result.output.preview for result in results] == [None, "e" * 64, None]
     assert all(result.output.labels == {"light_seed": 1} for result in results)
@@ -69,17 +111,17 @@ def test_textures_of_the_users_own_go_by_their_pictures() -> None:
     """Two jobs may give one name to two pictures, and one picture may have two names."""
     one, other = (f"sha256:{digit * 64}" for digit in "12")
     tasks = [clip("dots"), clip("logo", image=one), clip("logo", image=other), clip("brand", image=one)]
-    asked = together(tasks)
+    asked = merged(tasks)
     assert asked.textures == ("dots", one, other)
     output = RenderOutput(chunks={}, labels={}, clips={name: chunk(n) for n, name in enumerate(asked.textures)})
-    results = apart(tasks, TaskResult(outcome="succeeded", output=output))
+    results = split(tasks, TaskResult(outcome="succeeded", output=output))
     assert [result.output.chunks["video"] for result in results] == [chunk(n) for n in (0, 1, 2, 1)]
 
 
-def test_what_is_wrong_with_a_trace_is_wrong_with_all_its_clips() -> None:
+def test_what_is_wrong_with_a_shading_is_wrong_with_all_its_clips() -> None:
     tasks = [clip("dots"), clip("plaid")]
     out = TaskResult(outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0)
-    assert [(result.reason, result.cpu_seconds) for result in apart(tasks, out)] == [(Reason.out_of_frame, 1.0)] * 2
+    assert [(result.reason, result.cpu_seconds) for result in split(tasks, out)] == [(Reason.out_of_frame, 1.0)] * 2
     lacking = RenderOutput(chunks={}, labels={}, clips={"dots": chunk(0)})
-    results = apart(tasks, TaskResult(outcome="succeeded", output=lacking))
+    results = split(tasks, TaskResult(outcome="succeeded", output=lacking))
     assert {result.outcome for result in results} == {"failed"}

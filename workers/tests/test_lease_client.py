@@ -1,0 +1,75 @@
+"""The client of the worker API: the back-off, the leases held and their heartbeat."""
+
+import threading
+import time
+from typing import Any, cast
+
+import pytest
+from stickslip_schemas.documents.tasks import SimulateTask
+from stickslip_schemas.documents.worker_api import Heartbeat, HeartbeatAnswer, Lease, WorkerSession
+from stickslip_schemas.kinds.rod_hang import RodHangSimulation
+from stickslip_workers.lease_client import Backoff, HeartbeatThread, LeaseBook
+
+
+def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("random.uniform", lambda low, high: high)
+    monkeypatch.setattr(time, "monotonic", lambda: 100.0)
+    backoff, waits = Backoff(first=0.2, most=1.0), []
+    for _ in range(4):
+        backoff.failed()
+        waits.append(backoff.next_try - 100.0)
+    assert waits == pytest.approx([0.2, 0.4, 0.8, 1.0])
+    backoff.succeeded()
+    assert (backoff.failures, backoff.next_try) == (0, 0.0)
+
+
+class SlowCoordinator:
+    """Answers when it is told to."""
+
+    def __init__(self) -> None:
+        self.asked, self.may_answer = threading.Event(), threading.Event()
+
+    def heartbeat(self, _: Heartbeat) -> HeartbeatAnswer:
+        self.asked.set()
+        assert self.may_answer.wait(timeout=4)
+        return HeartbeatAnswer(drop=())
+
+
+def test_a_heartbeat_in_progress_ends_before_its_connection_is_closed() -> None:
+    coordinator = SlowCoordinator()
+    session = WorkerSession(worker_id="worker-1", lease_seconds=0.03)
+    heartbeat = HeartbeatThread(cast(Any, coordinator), session, LeaseBook())
+    heartbeat.start()
+    assert coordinator.asked.wait(timeout=10)
+    threading.Timer(0.2, coordinator.may_answer.set).start()
+    heartbeat.stop()
+    assert not heartbeat.is_alive()
+
+
+def _lease(token: int) -> Lease:
+    task = SimulateTask(simulation=RodHangSimulation(gamma=1.0, phi0=0.0, phi1=0.0, poisson=0.5))
+    return Lease(task_id="one", token=token, attempt=1, task=task)
+
+
+def test_a_late_drop_spares_a_newer_lease() -> None:
+    book = LeaseBook()
+    book.add([_lease(1)])
+    said = book.states()
+    book.add([_lease(2)])
+    book.drop(["one"], as_of=said)
+    assert book.holds(_lease(2))
+    assert not book.holds(_lease(1))
+    book.drop(["one"], as_of=book.states())
+    assert book.states() == ()
+
+
+def test_started_is_said_and_a_reported_lease_forgotten() -> None:
+    book = LeaseBook()
+    book.add([_lease(1)])
+    assert [state.started for state in book.states()] == [False]
+    book.start([_lease(1)])
+    assert [state.started for state in book.states()] == [True]
+    book.remove("one", 7)
+    assert book.holds(_lease(1))
+    book.remove("one", 1)
+    assert book.states() == ()
