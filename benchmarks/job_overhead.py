@@ -24,7 +24,7 @@ from thesis_job import service
 TICKS = os.sysconf("SC_CLK_TCK")
 
 PARTS = (
-    ("-m stickslip_services.coordinator", "coordinator"),
+    ("-m stickslip_services.app", "coordinator"),
     ("-m stickslip_workers", "dispatcher"),
     ("ray::Host", "stage and render processes"),
     ("raylet/raylet", "Ray: raylet"),

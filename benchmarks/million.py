@@ -29,17 +29,20 @@ from typing import Any
 
 import httpx
 import numpy as np
-from plan import coordinator, peak_megabytes, spec
+from plan import context, peak_megabytes, spec
 from sqlalchemy import text
 from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
 from stickslip_schemas.format.chunks import encode_chunk, encode_shard
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 
 BEFORE_SECONDS = 5.0
 """How long leases are measured while nothing is planned [s]."""
@@ -87,7 +90,7 @@ def told(seconds: list[float]) -> dict[str, float]:
 
 def plan(samples: int) -> dict[str, Any]:
     """Measure the submission and the planning of a job."""
-    with tempfile.TemporaryDirectory() as directory, coordinator(Path(directory)) as (client, pid):
+    with tempfile.TemporaryDirectory() as directory, context(Path(directory)) as (client, pid):
         key = (Path(directory) / "worker-key").read_text().strip()
         worker = Worker(client, key, client.get("/v1/workers").json()[0]["id"])
         client.post("/v1/jobs", json=spec(1000, start=900.0), params={"priority": 5}).raise_for_status()
@@ -178,11 +181,11 @@ def _timed(result: dict[str, Any], name: str, work: Callable[[], Any]) -> Any:
 
 
 def _coordinate(data: Path, samples: int, delay: float) -> dict[str, Any]:
-    made = Coordinator(Settings.chosen(data=data, durable=False))
-    made.start()
-    worker = PretendWorker(made, made.store).register()
-    job = made.submit(parsed(spec(samples, start=0.0) | {"views": None}), None)
-    made.plan_large_jobs()
+    made = Context.open(Settings.chosen(data=data, durable=False))
+    start(made)
+    worker = PretendWorker(DirectApi(made), made.store).register()
+    job = submit_job(made, parsed(spec(samples, start=0.0) | {"views": None}), None)
+    Planner(made).run()
     result: dict[str, Any] = {"planned_peak_mb": round(peak_megabytes(os.getpid()), 1)}
     _say_that_all_has_ended(made, DirectoryStore(data / "store"))
     result["before_peak_mb"] = round(peak_megabytes(os.getpid()), 1)
@@ -208,7 +211,7 @@ def _coordinate(data: Path, samples: int, delay: float) -> dict[str, Any]:
     return result | {"worker": answer}
 
 
-def _say_that_all_has_ended(made: Coordinator, store: DirectoryStore) -> None:
+def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
     """Write results of all tasks but the last into the database, as if they had been reported."""
     record = RecordRef(digest=store.publish(b"a record"), row=0)
     with made.database.write() as connection:
@@ -226,7 +229,7 @@ def _say_that_all_has_ended(made: Coordinator, store: DirectoryStore) -> None:
         connection.execute(text("UPDATE tasks SET waiting_on = 0 WHERE stage = 'publish'"))
 
 
-def _packed(made: Coordinator, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
+def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
     """Yield what the packs of a job of rods without pictures might have made: curves that are all the same."""
     with made.database.read() as connection:
         row = connection.execute(text("SELECT seq, spec FROM jobs")).one()

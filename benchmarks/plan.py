@@ -39,7 +39,7 @@ def peak_megabytes(pid: int) -> float:
 @contextmanager
 def coordinator(data: Path) -> Iterator[tuple[httpx.Client, int]]:
     """Run a coordinator in a process of its own, with a worker for rods; yield a client and the process id."""
-    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", "0"]
+    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(data), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout is not None
         url = process.stdout.readline().split()[-1]

@@ -69,7 +69,7 @@ def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
             monkeypatch.setenv(name, value)
         stack.enter_context(running(tmp_path, "bucket", ["-m", "moto.server", "-H", HUB, "-p", "9000"], 9000))
         httpx.put(f"http://{HUB}:9000/lab", trust_env=False).raise_for_status()
-        words = ["-m", "stickslip_services.coordinator", "--data", str(tmp_path), "--store", BUCKET]
+        words = ["-m", "stickslip_services.app", "--data", str(tmp_path), "--store", BUCKET]
         words += ["--host", HUB, "--behind-proxy"]
         stack.enter_context(running(tmp_path, "coordinator", words, 8765))
         create = [str(STICKSLIP), "keys", "create", "test", "--scope", "admin", "--data", str(tmp_path)]

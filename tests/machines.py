@@ -21,7 +21,7 @@ from harness import wait_for
 from sqlalchemy import func, select, text
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import tasks, workers
-from stickslip_services.queue.audit import audit
+from stickslip_testing.invariants import violations
 
 HUB = "10.213.0.1"
 URL = f"http://{HUB}:8765"
@@ -190,7 +190,7 @@ class Lab:
 
     def faults(self) -> list[str]:
         with self._database.read() as connection:
-            return [str(fault) for fault in audit(connection)]
+            return [str(fault) for fault in violations(connection)]
 
 
 @contextmanager

@@ -27,9 +27,9 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.store import DirectoryStore, Store, open_store
 from stickslip_services.database.opening import connect
-from stickslip_services.queue.audit import audit
 from stickslip_services.settings import Settings
 from stickslip_sim_core import solve_rods
+from stickslip_testing.invariants import violations
 from stickslip_testing.samples import samples
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import LocalStore, ObjectStore
@@ -49,7 +49,7 @@ def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
     job = service.submit(SPEC)
 
     wait_for_renders(service, job, 4)
-    kill(service.child("stickslip_services.coordinator"))
+    kill(service.child("stickslip_services.app"))
     wait_for_renders(service, job, 10)
     kill(service.child("stickslip_workers"))
     wait_for_renders(service, job, 16)
@@ -112,7 +112,7 @@ def kill(pid: int) -> None:
 def check_ledger(settings: Settings) -> None:
     database = connect(settings)
     with database.read() as connection:
-        assert audit(connection) == []
+        assert violations(connection) == []
     database.close()
 
 
@@ -184,7 +184,7 @@ LONGEST_GAP = 30.0
 """How long a job may stand still after a death [s], at a load of 4; in proportion longer at more."""
 
 VICTIMS = {
-    "coordinator": "-m stickslip_services.coordinator",
+    "coordinator": "-m stickslip_services.app",
     "dispatcher": "-m stickslip_workers",
     "stage or render process": "ray::Host",
     "raylet": "raylet/raylet",

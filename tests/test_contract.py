@@ -20,9 +20,7 @@ from stickslip_schemas.kinds.shawl import BONES, SKIN_TRIANGLES, SKIN_VERTICES, 
 from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
-from stickslip_services.queue.plan import Terms
-from stickslip_services.queue.planning import expand
-from stickslip_services.queue.terms import terms_for
+from stickslip_services.queue.plan import Terms, expand, terms_for
 from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth.bodies import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION

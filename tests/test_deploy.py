@@ -23,7 +23,7 @@ SCRIPTS = [SBATCH, *sorted((ROOT / "tools").glob("*.sh")), *sorted((ROOT / "benc
 GUIDES = sorted((ROOT / "docs").glob("deploy-*.md"))
 COMPOSE = yaml.safe_load((DEPLOY / "compose" / "compose.yaml").read_text())
 
-PROGRAMS = ("stickslip_services.coordinator", "stickslip_workers")
+PROGRAMS = ("stickslip_services.app", "stickslip_workers")
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 
 

@@ -19,7 +19,7 @@ import httpx
 import pytest
 import yaml
 from stickslip_schemas.base.states import JobState, Stage, TaskState
-from stickslip_services.coordinator import GRACE_SECONDS, make_app
+from stickslip_services.app import GRACE_SECONDS, make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import HttpApi, serving
@@ -250,7 +250,7 @@ def test_pods_have_the_time_that_a_drain_takes() -> None:
 
 def commands(name: str) -> Iterator[tuple[str, list[str]]]:
     """Return the commands of our programs, by their module."""
-    images = {"coordinator": "stickslip_services.coordinator", "worker": "stickslip_workers"}
+    images = {"coordinator": "stickslip_services.app", "worker": "stickslip_workers"}
     for pod in pods(rendered(CI[name])).values():
         for container in pod["containers"]:
             if "command" not in container and "args" in container:
@@ -272,7 +272,7 @@ def options(program: str, *verb: str) -> set[str]:
 @pytest.mark.parametrize("name", CI)
 def test_programs_have_the_options_that_they_are_given(name: str) -> None:
     found = list(commands(name))
-    assert {program for program, _ in found} == {"stickslip_services.coordinator", "stickslip_workers"}
+    assert {program for program, _ in found} == {"stickslip_services.app", "stickslip_workers"}
     for program, arguments in found:
         verb = [word for word in arguments[:1] if not word.startswith("-")]
         given = {word.split("=")[0] for word in arguments if word.startswith("--")}
@@ -315,11 +315,11 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         def judge(task: Any) -> Any:
             return failure() if task.stage == "render" else None
 
-        worker = PretendWorker(api, app.state.coordinator.store, judge=judge).register()
+        worker = PretendWorker(api, app.state.context.store, judge=judge).register()
         httpx.post(f"{url}/v1/jobs", json=rods(), trust_env=False).raise_for_status()
         worker.finish(*worker.lease())
         worker.finish(*worker.lease())
-        app.state.coordinator.eta_watch.held[("rod_hang", True)] += 1
+        app.state.context.eta_watch.held[("rod_hang", True)] += 1
         text = httpx.get(f"{url}/metrics", trust_env=False).text
     found: dict[str, set[str]] = {}
     for name, labels in re.findall(r"^(stickslip_\w+)(?:\{(.*)\})? ", text, re.M):

@@ -18,7 +18,7 @@ WORKDIR /opt/stickslip/.venv/lib/python3.11/site-packages
 RUN rm -rf pip pip-* setuptools setuptools-* pkg_resources _distutils_hack distutils-precedence.pth ../../../bin/pip* \
  && find . -type d -name tests -prune -exec rm -rf {} + \
  && find . -name "*.so" -not -path "./*.libs/*" -exec strip --strip-unneeded {} + \
- && /opt/stickslip/.venv/bin/python -B -c "import numcodecs, obstore, PIL.Image, psycopg, scipy.stats, stickslip_services.coordinator" \
+ && /opt/stickslip/.venv/bin/python -B -c "import numcodecs, obstore, PIL.Image, psycopg, scipy.stats, stickslip_services.app" \
  && find scipy -type d -name __pycache__ -prune -exec rm -rf {} +
 
 FROM python:3.11-slim-bookworm
@@ -37,5 +37,5 @@ VOLUME /data
 EXPOSE 8765
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
   CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8765/livez', timeout=2)"]
-ENTRYPOINT ["python", "-m", "stickslip_services.coordinator", "--data", "/data"]
+ENTRYPOINT ["python", "-m", "stickslip_services.app", "--data", "/data"]
 CMD ["--port", "8765"]

@@ -13,11 +13,13 @@ import pytest
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.database.database import Database
 from stickslip_services.database.opening import connect
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock
 from stickslip_testing.servers import RunningServer, served
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 
 if TYPE_CHECKING:
     from stickslip_testing.postgresql import PostgresqlServer
@@ -115,17 +117,23 @@ def settings(tmp_path: Path, database: str) -> Settings:
 
 
 @pytest.fixture
-def coordinator(settings: Settings, clock: ManualClock) -> Iterator[Coordinator]:
-    made = Coordinator(settings, clock)
-    made.start()
+def context(settings: Settings, clock: ManualClock) -> Iterator[Context]:
+    made = Context.open(settings, clock)
+    start(made)
     yield made
     made.close()
 
 
 @pytest.fixture
-def worker(coordinator: Coordinator) -> PretendWorker:
+def planner(context: Context) -> Planner:
+    """The planner of the coordinator's background service."""
+    return Planner(context)
+
+
+@pytest.fixture
+def worker(context: Context) -> PretendWorker:
     """A registered worker that talks to the coordinator without HTTP."""
-    return PretendWorker(coordinator, coordinator.store).register()
+    return PretendWorker(DirectApi(context), context.store).register()
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods
 from stickslip_testing.servers import HttpApi, serving
-from stickslip_testing.worker import PretendWorker, failure, rejection
+from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 
 pytestmark = pytest.mark.databases
 
@@ -32,8 +32,8 @@ def client(app: FastAPI) -> Iterator[httpx.Client]:
 
 @pytest.fixture
 def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
-    coordinator = app.state.coordinator
-    return PretendWorker(coordinator, coordinator.store).register()
+    context = app.state.context
+    return PretendWorker(DirectApi(context), context.store).register()
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.
     app = make_app(Settings(data=tmp_path_factory.mktemp("untouched"), durable=False))
     headers = {"Authorization": f"Bearer {app.state.worker_key}"}
     with serving(app) as url, httpx.Client(base_url=url, timeout=30, headers=headers) as client:
-        coordinator = app.state.coordinator
-        yield client, PretendWorker(coordinator, coordinator.store).register()
+        context = app.state.context
+        yield client, PretendWorker(DirectApi(context), context.store).register()
 
 
 def problem(response: Any, status: int, code: str) -> dict[str, Any]:
@@ -230,8 +230,8 @@ def test_a_kind_that_no_worker_makes_is_a_problem(client: httpx.Client, worker: 
 def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> None:
     before = client.post("/v1/jobs:validate", json=rods()).json()
     assert (before["sample_count"], before["simulation_count"], before["cached_count"]) == (4, 4, None)
-    coordinator = app.state.coordinator
-    worker = PretendWorker(coordinator, coordinator.store).register()
+    context = app.state.context
+    worker = PretendWorker(DirectApi(context), context.store).register()
     assert client.post("/v1/jobs:validate", json=rods()).json()["cached_count"] == 0
     client.post("/v1/jobs", json=rods())
     worker.work()
@@ -325,7 +325,7 @@ def test_metrics_tell_how_tasks_ended_and_what_is_stored(app: FastAPI, client: h
             return rejection()
         return failure() if task.stage == "render" else None
 
-    worker = PretendWorker(api, app.state.coordinator.store, judge=judge).register()
+    worker = PretendWorker(api, app.state.context.store, judge=judge).register()
     client.post("/v1/jobs", json=rods())
     worker.finish(*worker.lease())
     worker.finish(*worker.lease())

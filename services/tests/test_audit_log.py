@@ -12,10 +12,12 @@ from stickslip_services.access.audit_log import NOBODY, acting, read_audit_log
 from stickslip_services.access.keys import create_key, revoke_key
 from stickslip_services.access.scopes import Scope
 from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
+from stickslip_services.app import make_app
 from stickslip_services.cli import app
-from stickslip_services.coordinator import make_app
 from stickslip_services.database.tables import audit_log
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed, rods
 from stickslip_testing.servers import serving
@@ -25,22 +27,22 @@ from typer.testing import CliRunner
 pytestmark = pytest.mark.databases
 
 
-def lines(coordinator: Coordinator, subject: str | None = None) -> list[tuple[str, str, dict[str, Any]]]:
+def lines(context: Context, subject: str | None = None) -> list[tuple[str, str, dict[str, Any]]]:
     """Return who did what, the oldest first."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         found = read_audit_log(connection, subject=subject)
     return [(line.actor, line.action, line.details) for line in reversed(found)]
 
 
-def test_every_change_of_a_job_has_its_line(coordinator: Coordinator, worker: PretendWorker) -> None:
+def test_every_change_of_a_job_has_its_line(context: Context, worker: PretendWorker) -> None:
     with acting("key-1 ada"):
-        job = coordinator.submit(parsed(rods(name="hers")), None, priority=3).id  # type: ignore[union-attr]
-        coordinator.pause(job)
+        job = submit_job(context, parsed(rods(name="hers")), None, priority=3).id  # type: ignore[union-attr]
+        pause_job(context, job)
     with acting("key-2 bert"):
-        coordinator.resume(job)
-        coordinator.prioritise(job, 7)
-        coordinator.cancel(job)
-    assert lines(coordinator, job) == [
+        resume_job(context, job)
+        prioritise_job(context, job, 7)
+        cancel_job(context, job)
+    assert lines(context, job) == [
         ("key-1 ada", "job.submit", {"name": "hers", "samples": 4, "priority": 3}),
         ("key-1 ada", "job.pause", {}),
         ("key-2 bert", "job.resume", {}),
@@ -49,27 +51,27 @@ def test_every_change_of_a_job_has_its_line(coordinator: Coordinator, worker: Pr
     ]
 
 
-def test_what_is_refused_or_fails_leaves_no_line(coordinator: Coordinator, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
+def test_what_is_refused_or_fails_leaves_no_line(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
     with pytest.raises(Exception, match="has changed since"):
-        coordinator.pause(job, if_match=['"another"'])
-    monkeypatch.setattr("stickslip_services.queue.coordinator.cancel_job", lambda *_: 1 / 0)
+        pause_job(context, job, if_match=['"another"'])
+    monkeypatch.setattr("stickslip_services.queue.control.give_up_tasks", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        coordinator.cancel(job)
-    again = coordinator.submit(parsed(rods()), "the same")
-    replayed = coordinator.submit(parsed(rods()), "the same")
+        cancel_job(context, job)
+    again = submit_job(context, parsed(rods()), "the same")
+    replayed = submit_job(context, parsed(rods()), "the same")
     assert type(replayed) is not type(again)
-    assert [action for _, action, _ in lines(coordinator)] == ["job.submit", "job.submit"]
+    assert [action for _, action, _ in lines(context)] == ["job.submit", "job.submit"]
 
 
-def test_keys_and_webhooks_have_lines(coordinator: Coordinator) -> None:
-    with acting("user ada"), coordinator.database.write() as connection:
+def test_keys_and_webhooks_have_lines(context: Context) -> None:
+    with acting("user ada"), context.database.write() as connection:
         key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
         revoke_key(connection, key.id, 2.0)
         hook, sign = create_webhook(connection, "https://example.org/hook", 3.0)
         retry_webhook(connection, hook.id, 4.0)
         delete_webhook(connection, hook.id, 5.0)
-    found = lines(coordinator)
+    found = lines(context)
     assert [(actor, action) for actor, action, _ in found] == [
         ("user ada", action)
         for action in ("key.create", "key.revoke", "webhook.create", "webhook.retry", "webhook.delete")
@@ -79,22 +81,22 @@ def test_keys_and_webhooks_have_lines(coordinator: Coordinator) -> None:
 
 
 @pytest.mark.parametrize("change", [update(audit_log).values(actor="nobody"), delete(audit_log)])
-def test_no_line_can_be_changed(coordinator: Coordinator, change: Any) -> None:
-    coordinator.submit(parsed(rods()), None)
-    before = lines(coordinator)
+def test_no_line_can_be_changed(context: Context, change: Any) -> None:
+    submit_job(context, parsed(rods()), None)
+    before = lines(context)
     with (
         pytest.raises(DBAPIError, match="the audit log is append-only"),
-        coordinator.database.write() as connection,
+        context.database.write() as connection,
     ):
         connection.execute(change)
-    assert lines(coordinator) == before != []
+    assert lines(context) == before != []
 
 
 def test_requests_are_told_apart_by_their_keys(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also when many come at once: each is noted with its own."""
     application = make_app(settings.model_copy(update={"require_keys": True}))
     with serving(application) as url:
-        with application.state.coordinator.database.write() as connection:
+        with application.state.context.database.write() as connection:
             made = [create_key(connection, name, [Scope.submit], time.time()) for name in ("ada", "bert")]
         time.sleep(1.1)  # so long a key may take to count
         for _ in range(3):
@@ -102,7 +104,7 @@ def test_requests_are_told_apart_by_their_keys(settings: Settings, monkeypatch: 
                 headers = {"Authorization": f"Bearer {secret}"}
                 answer = httpx.post(f"{url}/v1/jobs", json=rods(), headers=headers, trust_env=False, timeout=30)
                 assert answer.status_code == 202, answer.text
-        found = [actor for actor, action, _ in lines(application.state.coordinator) if action == "job.submit"]
+        found = [actor for actor, action, _ in lines(application.state.context) if action == "job.submit"]
     assert found == [f"{made[number % 2][0].id} {('ada', 'bert')[number % 2]}" for number in range(6)]
 
 

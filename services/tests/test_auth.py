@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from stickslip_services.access.keys import create_key, list_keys, revoke_key
 from stickslip_services.access.scopes import Scope
 from stickslip_services.api.auth import needed_scope
+from stickslip_services.app import make_app
 from stickslip_services.cli import app as cli
-from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving, start_server, wait_until
@@ -87,7 +87,7 @@ def test_the_key_lets_them_in(client: httpx.Client, app: FastAPI) -> None:
 
 
 def test_only_its_owner_reads_the_key(app: FastAPI, client: httpx.Client) -> None:
-    settings = app.state.coordinator.settings
+    settings = app.state.context.settings
     path = settings.worker_key_path
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert len(path.read_text().strip()) >= 40
@@ -111,7 +111,7 @@ def stranger(closed: FastAPI) -> Iterator[httpx.Client]:
 
 @pytest.fixture(scope="module")
 def secrets_(closed: FastAPI, stranger: httpx.Client) -> dict[Scope, str]:
-    with closed.state.coordinator.database.write() as connection:
+    with closed.state.context.database.write() as connection:
         return {scope: create_key(connection, scope, [scope], time.time())[1] for scope in Scope}
 
 
@@ -183,7 +183,7 @@ def test_browsers_show_a_key_as_password(stranger: httpx.Client, secrets_: dict[
 
 
 def test_a_revoked_key_opens_nothing_within_two_seconds(closed: FastAPI, stranger: httpx.Client) -> None:
-    database = closed.state.coordinator.database
+    database = closed.state.context.database
     with database.write() as connection:
         key, secret = create_key(connection, "leaver", [Scope.read], time.time())
     headers = {"Authorization": f"Bearer {secret}"}
@@ -194,14 +194,14 @@ def test_a_revoked_key_opens_nothing_within_two_seconds(closed: FastAPI, strange
 
 
 def test_secrets_are_not_in_the_database(closed: FastAPI, secrets_: dict[Scope, str]) -> None:
-    settings = closed.state.coordinator.settings
+    settings = closed.state.context.settings
     content = b"".join(path.read_bytes() for path in settings.data.glob("coordinator.sqlite3*"))
     assert b"local-worker" in content  # it is the right file
     assert not any(secret.encode() in content for secret in [*secrets_.values(), closed.state.worker_key])
 
 
 def test_on_loopback_a_key_for_something_else_does_not_make_a_worker(app: FastAPI, client: httpx.Client) -> None:
-    with app.state.coordinator.database.write() as connection:
+    with app.state.context.database.write() as connection:
         secret = create_key(connection, "reader", [Scope.read], time.time())[1]
     headers = {"Authorization": f"Bearer {secret}"}
     for path in WORKER_PATHS:
@@ -214,7 +214,7 @@ def test_a_revoked_worker_key_is_replaced_at_the_next_start(tmp_path: Path) -> N
     settings = Settings(data=tmp_path, durable=False)
     app = make_app(settings)
     old = app.state.worker_key
-    with serving(app), app.state.coordinator.database.write() as connection:
+    with serving(app), app.state.context.database.write() as connection:
         (key,) = list_keys(connection)
         revoke_key(connection, key.id, time.time())
     with serving(app) as url:
@@ -288,7 +288,7 @@ def test_a_coordinator_speaks_tls_and_wants_keys(tmp_path: Path, certificate: tu
 
 
 def test_a_coordinator_off_loopback_without_either_does_not_start(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(tmp_path), "--host", "0.0.0.0"]
+    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(tmp_path), "--host", "0.0.0.0"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2
     assert "must be a loopback address unless" in ended.stderr

@@ -12,11 +12,16 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload, CurveReport, ProtocolReport
-from stickslip_services.coordinator import make_app
+from stickslip_schemas.documents.responses import JobDetail
+from stickslip_services.app import make_app
+from stickslip_services.catalog.certificates import register_certificate
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.jobs import show_job
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed, rods
 from stickslip_testing.servers import serving, wait_until
-from stickslip_testing.worker import BUILDS, PretendWorker, rejection
+from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, rejection
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
 axe = pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python")
@@ -51,10 +56,10 @@ def url(app: FastAPI) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def worker(app: FastAPI, url: str) -> PretendWorker:
-    coordinator = app.state.coordinator
+    context = app.state.context
     return PretendWorker(
-        coordinator,
-        coordinator.store,
+        DirectApi(context),
+        context.store,
         whole=True,
         judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None,
     ).register()
@@ -63,18 +68,24 @@ def worker(app: FastAPI, url: str) -> PretendWorker:
 @pytest.fixture(scope="module")
 def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
     """The pages of a service that has made a dataset and is at another."""
-    coordinator = app.state.coordinator
-    done = coordinator.submit(parsed(rods(name="done", gamma=(1.0, 2.0, 3.0))), None)
+    context: Context = app.state.context
+    done = submit_job(context, parsed(rods(name="done", gamma=(1.0, 2.0, 3.0))), None)
     worker.work()
-    running = coordinator.submit(parsed(rods(name="running", gamma=(7.0, 8.0))), None)
+    running = submit_job(context, parsed(rods(name="running", gamma=(7.0, 8.0))), None)
     worker.start(*worker.lease(simulate=1))
-    with coordinator.database.read() as connection:
-        dataset = coordinator.show(connection, 1).dataset
+    with context.database.read() as connection:
+        dataset = show_job(context, connection, 1).dataset
+    assert isinstance(done, JobDetail)
+    assert isinstance(running, JobDetail)
+    assert dataset is not None
     root = f"/datasets/{dataset.dataset}/v{dataset.version}"
     jobs = [f"/jobs/{job.id}" for job in (done, running)]
     samples = [f"{root}/samples/{slot}" for slot in (0, 3)]
     uploads = [certificate(extent) for extent in ("full", "quick")]
-    certificates = [f"/certificates/{coordinator.add_certificate(upload).digest}" for upload in uploads]
+    certificates = [
+        f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
+        for upload in uploads
+    ]
     lost = f"/v1/datasets/{dataset.dataset}/versions/{dataset.version}/page"
     return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs", lost]
 

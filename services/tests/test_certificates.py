@@ -11,15 +11,16 @@ from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
+from stickslip_services.catalog.certificates import register_certificate
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import PresetNotCertifiedError
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.validating import validate
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.submit import submit_job, validate_spec
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import BUILDS, PretendWorker
+from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker
 
 KINDS = ("rod_hang", "cloth_drag", "cloth_on_cloth", "cloth_sphere")
 PAGE = "<!doctype html><title>c</title>"
@@ -55,31 +56,31 @@ def cloth(**rest: Any) -> Any:
     return parsed({"kind": "cloth_drag", "axes": axes, **rest})
 
 
-def manifest_of(coordinator: Coordinator, job: Any) -> Manifest:
-    shown = show_job(coordinator, job.id)
+def manifest_of(context: Context, job: Any) -> Manifest:
+    shown = show_job(context, job.id)
     assert shown.state is JobState.succeeded, shown.message
     assert shown.dataset is not None
-    return Manifest.model_validate_json(coordinator.store.read(shown.dataset.manifest))
+    return Manifest.model_validate_json(context.store.read(shown.dataset.manifest))
 
 
 @pytest.fixture
-def weaver(coordinator: Coordinator) -> PretendWorker:
-    return PretendWorker(coordinator, coordinator.store, kinds=KINDS).register()
+def weaver(context: Context) -> PretendWorker:
+    return PretendWorker(DirectApi(context), context.store, kinds=KINDS).register()
 
 
 class TestTheRule:
-    def test_cloth_needs_a_certificate(self, coordinator: Coordinator, weaver: PretendWorker) -> None:
+    def test_cloth_needs_a_certificate(self, context: Context, weaver: PretendWorker) -> None:
         refusal = r"^preset 'certified' .* `stickslip certify --preset certified`"
         with pytest.raises(PresetNotCertifiedError, match=refusal):
-            coordinator.submit(cloth(), None)
-        told = validate(coordinator.database, cloth())  # which counts all the same
+            submit_job(context, cloth(), None)
+        told = validate_spec(context, cloth())  # which counts all the same
         assert re.match(refusal, told.refusal or "")
         assert (told.sample_count, told.certificate, told.cached_count) == (2, None, None)
-        added = coordinator.add_certificate(upload())
-        assert validate(coordinator.database, cloth()).certificate == added.digest
-        job = coordinator.submit(cloth(), None)
+        added = register_certificate(context.database, context.store, upload(), context.clock())
+        assert validate_spec(context, cloth()).certificate == added.digest
+        job = submit_job(context, cloth(), None)
         weaver.work()
-        manifest = manifest_of(coordinator, job)
+        manifest = manifest_of(context, job)
         assert manifest.certificate == added.digest
 
     @pytest.mark.parametrize(
@@ -87,19 +88,17 @@ class TestTheRule:
         [{"preset": "fast"}, {"sim_core": "8" * 64}, {"extent": "quick"}, {"error": 0.02}],
         ids=["preset", "build", "quick", "failed"],
     )
-    def test_no_other_certificate_will_do(
-        self, coordinator: Coordinator, weaver: PretendWorker, other: dict[str, Any]
-    ) -> None:
-        coordinator.add_certificate(upload(**other))
+    def test_no_other_certificate_will_do(self, context: Context, weaver: PretendWorker, other: dict[str, Any]) -> None:
+        register_certificate(context.database, context.store, upload(**other), context.clock())
         with pytest.raises(PresetNotCertifiedError):
-            coordinator.submit(cloth(), None)
+            submit_job(context, cloth(), None)
 
     @pytest.mark.parametrize("missing", CONTACT_PROTOCOLS)
     def test_cloth_that_touches_cloth_needs_the_protocols_of_contact(
-        self, coordinator: Coordinator, weaver: PretendWorker, missing: str
+        self, context: Context, weaver: PretendWorker, missing: str
     ) -> None:
         has = tuple(name for name in ("stick-slip", *CONTACT_PROTOCOLS) if name != missing)
-        added = coordinator.add_certificate(upload(protocols=has))
+        added = register_certificate(context.database, context.store, upload(protocols=has), context.clock())
         axes = {"material": "gray-interlock", "mu": 0.1, "texture": "dots"}
         over = parsed(
             {"kind": "cloth_on_cloth", "axes": axes | {"viewpoint": "left", "substrate_material": "gray-interlock"}}
@@ -108,79 +107,79 @@ class TestTheRule:
             with pytest.raises(
                 PresetNotCertifiedError, match=f"it must have {missing}, since .* `self_friction: null`"
             ):
-                coordinator.submit(touching, None)
+                submit_job(context, touching, None)
         ball = parsed({"kind": "cloth_sphere", "axes": axes | {"viewpoint": "high", "angular_speed": 1.0}})
         for alone in (cloth(self_friction=None), ball):
-            assert validate(coordinator.database, alone).certificate == added.digest
-        job = coordinator.submit(cloth(allow_uncertified=True), None)
+            assert validate_spec(context, alone).certificate == added.digest
+        job = submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
-        assert manifest_of(coordinator, job).certificate is None
+        assert manifest_of(context, job).certificate is None
 
     def test_a_certificate_of_a_time_that_kept_no_protocols_counts_once_it_is_registered_again(
-        self, coordinator: Coordinator, weaver: PretendWorker
+        self, context: Context, weaver: PretendWorker
     ) -> None:
-        coordinator.add_certificate(upload())
-        with coordinator.database.write() as connection:
+        register_certificate(context.database, context.store, upload(), context.clock())
+        with context.database.write() as connection:
             connection.execute(update(certificates).values(protocols=""))  # as the migration leaves it
-        assert validate(coordinator.database, cloth()).refusal
-        assert not validate(coordinator.database, cloth(self_friction=None)).refusal
-        coordinator.add_certificate(upload())
-        assert not validate(coordinator.database, cloth()).refusal
+        assert validate_spec(context, cloth()).refusal
+        assert not validate_spec(context, cloth(self_friction=None)).refusal
+        register_certificate(context.database, context.store, upload(), context.clock())
+        assert not validate_spec(context, cloth()).refusal
 
     def test_the_full_one_that_came_last_stands(
-        self, coordinator: Coordinator, weaver: PretendWorker, clock: ManualClock
+        self, context: Context, weaver: PretendWorker, clock: ManualClock
     ) -> None:
-        good = coordinator.add_certificate(upload())
-        coordinator.add_certificate(upload(extent="quick", error=0.5))
-        assert validate(coordinator.database, cloth()).certificate == good.digest
-        coordinator.add_certificate(upload(error=0.02))
-        assert validate(coordinator.database, cloth()).refusal
+        good = register_certificate(context.database, context.store, upload(), context.clock())
+        register_certificate(context.database, context.store, upload(extent="quick", error=0.5), context.clock())
+        assert validate_spec(context, cloth()).certificate == good.digest
+        register_certificate(context.database, context.store, upload(error=0.02), context.clock())
+        assert validate_spec(context, cloth()).refusal
         clock.advance(1)
-        coordinator.add_certificate(upload())
-        assert validate(coordinator.database, cloth()).certificate == good.digest
+        register_certificate(context.database, context.store, upload(), context.clock())
+        assert validate_spec(context, cloth()).certificate == good.digest
 
-    def test_uncertified_where_the_spec_says_so(self, coordinator: Coordinator, weaver: PretendWorker) -> None:
-        job = coordinator.submit(cloth(allow_uncertified=True), None)
+    def test_uncertified_where_the_spec_says_so(self, context: Context, weaver: PretendWorker) -> None:
+        job = submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
-        manifest = manifest_of(coordinator, job)
+        manifest = manifest_of(context, job)
         assert manifest.certificate is None
         assert manifest.model_dump()["spec"]["allow_uncertified"] is True
 
     def test_a_certificate_that_comes_later_makes_a_version_and_no_sample(
-        self, coordinator: Coordinator, weaver: PretendWorker
+        self, context: Context, weaver: PretendWorker
     ) -> None:
-        coordinator.submit(cloth(allow_uncertified=True), None)
+        submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
-        added = coordinator.add_certificate(upload())
+        added = register_certificate(context.database, context.store, upload(), context.clock())
         before = len(weaver.ran)
-        job = coordinator.submit(cloth(allow_uncertified=True), None)
+        job = submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
         assert [name.partition("-")[0] for name in weaver.ran[before:]] == ["publish"]
-        manifest = manifest_of(coordinator, job)
+        manifest = manifest_of(context, job)
         assert (manifest.version, manifest.certificate) == (2, added.digest)
         # And the strict spec shares every sample with the lenient one.
         before = len(weaver.ran)
-        coordinator.submit(cloth(), None)
+        submit_job(context, cloth(), None)
         weaver.work()
         assert {name.partition("-")[0] for name in weaver.ran[before:]} == {"publish"}
 
-    def test_rods_need_none_and_carry_what_there_is(self, coordinator: Coordinator, worker: PretendWorker) -> None:
-        job = coordinator.submit(parsed(rods()), None)
+    def test_rods_need_none_and_carry_what_there_is(self, context: Context, worker: PretendWorker) -> None:
+        job = submit_job(context, parsed(rods()), None)
         worker.work()
-        assert manifest_of(coordinator, job).certificate is None
-        added = coordinator.add_certificate(upload(preset="rods"))
-        job = coordinator.submit(parsed(rods()), None)
+        assert manifest_of(context, job).certificate is None
+        added = register_certificate(context.database, context.store, upload(preset="rods"), context.clock())
+        job = submit_job(context, parsed(rods()), None)
         worker.work()
-        assert manifest_of(coordinator, job).certificate == added.digest
+        assert manifest_of(context, job).certificate == added.digest
 
-    def test_a_job_that_waited_for_a_worker_fails_with_the_reason(self, coordinator: Coordinator) -> None:
-        early = coordinator.submit(cloth(), None)
-        lenient = coordinator.submit(cloth(allow_uncertified=True), None)
-        PretendWorker(coordinator, coordinator.store, kinds=KINDS).register()
-        shown = show_job(coordinator, early.id)  # type: ignore[union-attr]  # no replay
+    def test_a_job_that_waited_for_a_worker_fails_with_the_reason(self, context: Context) -> None:
+        early = submit_job(context, cloth(), None)
+        lenient = submit_job(context, cloth(allow_uncertified=True), None)
+        PretendWorker(DirectApi(context), context.store, kinds=KINDS).register()
+        shown = show_job(context, early.id)  # type: ignore[union-attr]  # no replay
         assert (shown.state, shown.reason) == (JobState.failed, Reason.preset_not_certified)
         assert "stickslip certify" in shown.message
-        assert show_job(coordinator, lenient.id).state is JobState.queued  # type: ignore[union-attr]
+        assert show_job(context, lenient.id).state is JobState.queued  # type: ignore[union-attr]
 
 
 class TestHttp:
@@ -220,7 +219,7 @@ class TestHttp:
 
     def test_the_refusal_says_where_and_what_to_do(self, app: FastAPI) -> None:
         with serving(app) as url, httpx.Client(base_url=url) as client:
-            PretendWorker(app.state.coordinator, app.state.coordinator.store, kinds=KINDS).register()
+            PretendWorker(DirectApi(app.state.context), app.state.context.store, kinds=KINDS).register()
             answer = client.post("/v1/jobs", json=cloth(preset="fast").model_dump(mode="json"))
             problem = answer.json()
             assert (answer.status_code, problem["code"]) == (409, "preset_not_certified")

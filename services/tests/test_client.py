@@ -8,12 +8,12 @@ import httpx
 import pytest
 from fastapi import FastAPI
 from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStateEvent
+from stickslip_services.app import make_app
 from stickslip_services.client import Client, ProblemError, UnreachableError, pull, verify
-from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 
 
 @pytest.fixture
@@ -22,9 +22,9 @@ def app(settings: Settings) -> FastAPI:
 
 
 def test_a_job_from_its_spec_to_its_files(app: FastAPI, tmp_path: Path) -> None:
-    coordinator = app.state.coordinator
+    context = app.state.context
     with serving(app) as url, Client(url) as client:
-        worker = PretendWorker(coordinator, coordinator.store).register()
+        worker = PretendWorker(DirectApi(context), context.store).register()
         assert client.validate(rods()).sample_count == 4
         job = client.submit(rods(), idempotency_key="mine")
         assert client.submit(rods(), idempotency_key="mine").id == job.id

@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 from stickslip_services.api import connections
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import ServerProcess, serving, start_server

@@ -8,13 +8,13 @@ import pytest
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.format.manifest import Contents, Manifest, Rejection
 from stickslip_schemas.plan.grid import dataset_id
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.pages.dataset_page import LISTED, dataset_page
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed, rods
 from stickslip_testing.samples import samples
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import BUILDS, PretendWorker, rejection
+from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, rejection
 
 
 def manifest(spec: dict[str, Any], lose: Any = lambda _labels: False, message: str = "made up") -> Manifest:
@@ -135,7 +135,7 @@ def test_the_coordinator_serves_it(settings: Settings) -> None:
         return rejection() if task.stage == "simulate" and task.simulation.gamma > 1.5 else None
 
     with serving(app) as url, httpx.Client(base_url=url) as client:
-        worker = PretendWorker(app.state.coordinator, app.state.coordinator.store, judge=judge).register()
+        worker = PretendWorker(DirectApi(app.state.context), app.state.context.store, judge=judge).register()
         job = client.post("/v1/jobs", json=rods()).json()["id"]
         worker.work()
         dataset = client.get(f"/v1/jobs/{job}").json()["dataset"]["dataset"]

@@ -10,11 +10,12 @@ import pytest
 from fastapi import FastAPI
 from httpx_sse import ServerSentEvent, connect_sse
 from stickslip_services.api import sse
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
+from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker, failure
+from stickslip_testing.worker import DirectApi, PretendWorker, failure
 
 pytestmark = pytest.mark.databases
 
@@ -32,7 +33,7 @@ def client(app: FastAPI) -> Iterator[httpx.Client]:
 
 @pytest.fixture
 def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
-    return PretendWorker(app.state.coordinator, app.state.coordinator.store).register()
+    return PretendWorker(DirectApi(app.state.context), app.state.context.store).register()
 
 
 def follow(client: httpx.Client, job: str, last_id: str | None = None) -> Iterator[ServerSentEvent]:
@@ -103,7 +104,7 @@ def test_a_quiet_stream_says_that_it_lives_and_holds_no_connection(
             text += piece
             if text.count(": still here\n\n") == 2:
                 break
-        pool = app.state.coordinator.database._reader.pool
+        pool = app.state.context.database._reader.pool
         assert pool.checkedout() == 0
     assert text.startswith("retry: 1000\nid: 1\n")
     assert text.count("event: job.progress") == 1  # nothing has changed
@@ -139,7 +140,7 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     for _ in range(2):  # events of failed tries
         worker.report(*((lease, failure()) for lease in worker.lease(simulate=6)))
         clock.advance(5)
-        app.state.coordinator.sweep()
+        sweep(app.state.context)
     known = [str(number) for number in range(1, 14)]
     heard: dict[str | None, list[str]] = {}
 

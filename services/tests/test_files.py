@@ -13,11 +13,11 @@ import xarray
 import zarr
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 
 
 @dataclass
@@ -36,13 +36,13 @@ class Published:
 def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Published]:
     app = make_app(Settings(data=tmp_path_factory.mktemp("files"), durable=False))
     with serving(app) as url, httpx.Client(base_url=url) as client:
-        coordinator = app.state.coordinator
-        worker = PretendWorker(coordinator, coordinator.store).register()
+        context = app.state.context
+        worker = PretendWorker(DirectApi(context), context.store).register()
         job = client.post("/v1/jobs", json=rods()).json()["id"]
         worker.work()
         dataset = client.get(f"/v1/jobs/{job}").json()["dataset"]["dataset"]
         root = f"/v1/datasets/{dataset}/versions/1"
-        yield Published(client, coordinator.store, root, url + root)
+        yield Published(client, context.store, root, url + root)
 
 
 PATH = "views/c/0/0"

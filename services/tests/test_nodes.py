@@ -28,8 +28,8 @@ from stickslip_services.cli import app
 from stickslip_services.database.opening import connect
 from stickslip_services.database.tables import dataset_versions
 from stickslip_services.local.process import listen
-from stickslip_services.queue.audit import audit
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import wait_until
 from typer.testing import CliRunner
@@ -111,7 +111,7 @@ def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
     place = settings.data.parent
     made = []
     for name, url in zip(("a", "b"), urls, strict=True):
-        words = ["-m", "stickslip_services.coordinator", "--data", str(place / name), "--port", url.rsplit(":", 1)[1]]
+        words = ["-m", "stickslip_services.app", "--data", str(place / name), "--port", url.rsplit(":", 1)[1]]
         words += ["--store", settings.store_place]
         made.append(Node(f"coordinator {name}", words, place / f"{name}.log"))
     try:
@@ -199,7 +199,7 @@ def test_every_sample_once_whoever_is_killed(
     assert CliRunner().invoke(app, [*words, "--delete"]).exit_code == 0  # what calls that were killed had written
     assert CliRunner().invoke(app, words).output.startswith("0 files")
     with database.read() as connection:
-        assert audit(connection) == []
+        assert violations(connection) == []
         versions = connection.execute(select(dataset_versions)).all()
     database.close()
     assert len(versions) == len(jobs)

@@ -3,14 +3,14 @@
 import json
 from pathlib import Path
 
-from stickslip_services.coordinator import openapi_text
+from stickslip_services.app import openapi_text
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "openapi.json"
 
 
 def test_the_committed_document_is_up_to_date() -> None:
     assert COMMITTED.read_text() == openapi_text(), (
-        "run: python -m stickslip_services.coordinator --openapi > docs/openapi.json"
+        "run: python -m stickslip_services.app --openapi > docs/openapi.json"
     )
 
 

@@ -14,12 +14,13 @@ from PIL import Image
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState
 from stickslip_services.api.routes.pages.jobs import _changes
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.pages.plots import line_plot
+from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods, show_job
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker, failure, rejection
+from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def client(app: FastAPI) -> Iterator[httpx.Client]:
 
 @pytest.fixture
 def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
-    return PretendWorker(app.state.coordinator, app.state.coordinator.store, whole=True).register()
+    return PretendWorker(DirectApi(app.state.context), app.state.context.store, whole=True).register()
 
 
 def submit(client: httpx.Client, **spec: Any) -> str:
@@ -129,7 +130,7 @@ def test_what_failed_is_shown_with_its_reproducer(
     for _ in range(4):
         worker.work()
         clock.advance(10)
-        app.state.coordinator.sweep()
+        sweep(app.state.context)
     page = read(client, f"/jobs/{job}")
     assert "it crashed at line 7" in page
     assert "python -m stickslip_workers replay" in page
@@ -145,16 +146,16 @@ def test_names_cannot_break_out(client: httpx.Client) -> None:
 
 def test_buttons_change_jobs(client: httpx.Client, worker: PretendWorker, app: FastAPI) -> None:
     job = submit(client)
-    coordinator = app.state.coordinator
+    context = app.state.context
     for verb, state in (("pause", JobState.paused), ("resume", JobState.queued), ("cancel", JobState.cancelled)):
         assert f"/ui/jobs/{job}/{verb}" in read(client, "/")
         answer = client.post(f"/ui/jobs/{job}/{verb}")
         assert (answer.status_code, answer.headers["hx-redirect"]) == (204, f"/jobs/{job}")
-        assert show_job(coordinator, job).state is state
+        assert show_job(context, job).state is state
     again = client.post(f"/ui/jobs/{job}/resubmit").headers["hx-redirect"].rpartition("/")[2]
     assert again != job
     worker.work()
-    assert show_job(coordinator, again).state is JobState.succeeded
+    assert show_job(context, again).state is JobState.succeeded
     assert client.post(f"/ui/jobs/{job}/explode").status_code == 404
     assert client.post("/ui/jobs/job-0/pause").status_code == 404
 
@@ -163,15 +164,15 @@ def test_a_page_is_told_of_changes(app: FastAPI, client: httpx.Client) -> None:
     change = b"event: change\ndata: {}\n\n"
 
     async def follow() -> None:
-        stream = _changes(app.state.coordinator)
+        stream = _changes(app.state.context)
         assert await anext(stream) == b"retry: 2000\n\n"
         assert await anext(stream) == change  # at once, for what happened before
-        app.state.coordinator.bell.ring()  # while it pauses
+        app.state.context.notifier.notify()  # while it pauses
         assert await asyncio.wait_for(anext(stream), 5) == change
         following = asyncio.ensure_future(anext(stream))
         await asyncio.sleep(1.2)
         assert not following.done()
-        app.state.coordinator.bell.ring()
+        app.state.context.notifier.notify()
         assert await asyncio.wait_for(following, 5) == change
 
     asyncio.run(follow())

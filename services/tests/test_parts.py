@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 from stickslip_schemas.format.selection import SELECTION_NAME, Selection
+from stickslip_services.app import make_app
 from stickslip_services.cli import app
 from stickslip_services.client.comparing import differences
 from stickslip_services.client.errors import ForeignFilesError, SelectionError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
-from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 from typer.testing import CliRunner, Result
 
 GAMMAS = (1.0, 2.0, 3.0, 4.0)
@@ -27,7 +27,7 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str,
     """URL and two datasets of a coordinator. Of the first, slot n of 0 to 7 has gamma n, two slots to a shard."""
     made = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
     with serving(made) as url, Client(url) as client:
-        worker = PretendWorker(made.state.coordinator, made.state.coordinator.store, whole=True).register()
+        worker = PretendWorker(DirectApi(made.state.context), made.state.context.store, whole=True).register()
         ids = []
         for gamma in (GAMMAS, GAMMAS[:2]):
             job = client.submit(rods(gamma=gamma, name=f"{len(gamma)}-rods"))

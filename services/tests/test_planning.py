@@ -8,19 +8,22 @@ import pytest
 from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents.responses import Progress
+from stickslip_services.app import make_app
 from stickslip_services.cli import wording
 from stickslip_services.cli.main import app
-from stickslip_services.coordinator import make_app
 from stickslip_services.database.tables import job_tasks, jobs, samples, task_dependencies, tasks
-from stickslip_services.queue import planner
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.plan import Terms
-from stickslip_services.queue.planning import expand
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.plan import Terms, expand
+from stickslip_services.queue.planner import Planner, release_claims
+from stickslip_services.queue.recompute import check_made_datasets
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import serving, start_server, wait_until
-from stickslip_testing.worker import BUILDS, PretendWorker, failure, rejection
+from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, failure, rejection
 from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases
@@ -35,20 +38,20 @@ def settings(settings: Settings) -> Settings:
     return settings.model_copy(update={"plan_samples": PIECE})
 
 
-def submit(coordinator: Coordinator, document: dict[str, Any] = GRID, **options: Any) -> str:
-    job = coordinator.submit(parsed(document), None, **options)
+def submit(context: Context, document: dict[str, Any] = GRID, **options: Any) -> str:
+    job = submit_job(context, parsed(document), None, **options)
     return job.id  # type: ignore[union-attr]
 
 
-def check(coordinator: Coordinator) -> None:
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
+def check(context: Context) -> None:
+    with context.database.read() as connection:
+        assert violations(connection) == []
 
 
-def written(coordinator: Coordinator, job_id: str) -> tuple[Any, ...]:
+def written(context: Context, job_id: str) -> tuple[Any, ...]:
     """Return the plan of a job as it is in the database, by keys: tasks, what they build on, and samples."""
     needed = tasks.alias()
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         job = connection.scalar(select(jobs.c.seq).where(jobs.c.id == job_id))
         names = dict(connection.execute(select(tasks.c.seq, tasks.c.key)).all())
         of_job = job_tasks.c.task == tasks.c.seq, job_tasks.c.job == job
@@ -100,39 +103,45 @@ GRIDS = {
 
 
 @pytest.fixture
-def worker(coordinator: Coordinator) -> PretendWorker:
-    return PretendWorker(coordinator, coordinator.store, kinds=("rod_hang", "cloth_drag")).register()
+def worker(context: Context) -> PretendWorker:
+    return PretendWorker(DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")).register()
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_a_plan_in_pieces_is_the_plan_made_at_once(coordinator: Coordinator, worker: PretendWorker, name: str) -> None:
-    job_id = submit(coordinator, GRIDS[name])
-    shown = show_job(coordinator, job_id)
+def test_a_plan_in_pieces_is_the_plan_made_at_once(
+    context: Context, worker: PretendWorker, name: str, planner: Planner
+) -> None:
+    job_id = submit(context, GRIDS[name])
+    shown = show_job(context, job_id)
     assert (shown.state, shown.progress.planned, shown.progress.total) == (JobState.planning, 0, 0)
     seen = []
-    while coordinator.planner.step():
-        check(coordinator)
-        seen.append(show_job(coordinator, job_id).progress.planned)
+    while planner.step():
+        check(context)
+        seen.append(show_job(context, job_id).progress.planned)
     assert seen[-1] == shown.sample_count
     assert len(seen) > 1
     assert seen == sorted(set(seen))
-    assert show_job(coordinator, job_id).state is JobState.queued
-    assert written(coordinator, job_id) == planned(GRIDS[name])
+    assert show_job(context, job_id).state is JobState.queued
+    assert written(context, job_id) == planned(GRIDS[name])
 
 
-def test_a_small_job_is_planned_while_the_request_waits(coordinator: Coordinator, worker: PretendWorker) -> None:
-    shown = show_job(coordinator, submit(coordinator, rods()))
+def test_a_small_job_is_planned_while_the_request_waits(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
+    shown = show_job(context, submit(context, rods()))
     assert (shown.state, shown.progress.planned, shown.progress.total) == (JobState.queued, 4, 11)
-    assert not coordinator.planner.step()
+    assert not planner.step()
 
 
-def test_what_is_planned_runs_meanwhile_and_so_do_other_jobs(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
-    other = submit(coordinator, rods(gamma=(9.0,)))
-    coordinator.planner.step()
+def test_what_is_planned_runs_meanwhile_and_so_do_other_jobs(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
+    job_id = submit(context)
+    other = submit(context, rods(gamma=(9.0,)))
+    planner.step()
     assert worker.work() == (4 + 4 + 2) + (2 + 2 + 1 + 1)
-    assert show_job(coordinator, other).state is JobState.succeeded
-    shown = show_job(coordinator, job_id)
+    assert show_job(context, other).state is JobState.succeeded
+    shown = show_job(context, job_id)
     assert (shown.state, shown.progress.done, shown.progress.total, shown.progress.planned) == (
         JobState.planning,
         10,
@@ -141,162 +150,166 @@ def test_what_is_planned_runs_meanwhile_and_so_do_other_jobs(coordinator: Coordi
     )
     assert shown.started_at is not None
     assert shown.progress.eta is None
-    coordinator.plan_large_jobs()
-    check(coordinator)
+    planner.run()
+    check(context)
     worker.work()
-    shown = show_job(coordinator, job_id)
+    shown = show_job(context, job_id)
     assert (shown.state, shown.progress.done, shown.progress.total) == (JobState.succeeded, 39, 39)
     assert shown.progress.stages[Stage.simulate].cached == 0
-    check(coordinator)
+    check(context)
 
 
-def test_a_large_job_that_was_made_before_runs_nothing(coordinator: Coordinator, worker: PretendWorker) -> None:
-    first = submit(coordinator)
-    coordinator.plan_large_jobs()
+def test_a_large_job_that_was_made_before_runs_nothing(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
+    first = submit(context)
+    planner.run()
     worker.work()
-    again = submit(coordinator)
-    coordinator.plan_large_jobs()
+    again = submit(context)
+    planner.run()
     assert worker.lease() == ()
-    coordinator.check_made_datasets()
-    shown = show_job(coordinator, again)
+    check_made_datasets(context)
+    shown = show_job(context, again)
     assert shown.state is JobState.succeeded
-    assert shown.dataset == show_job(coordinator, first).dataset
+    assert shown.dataset == show_job(context, first).dataset
     assert {
         stage: (counted.cached, sum(counted.counts.values())) for stage, counted in shown.progress.stages.items()
     } == {Stage.simulate: (15, 15), Stage.render: (15, 15), Stage.pack: (8, 8), Stage.publish: (1, 1)}
-    check(coordinator)
+    check(context)
 
 
-def test_rejections_of_earlier_pieces_reach_later_ones(coordinator: Coordinator, worker: PretendWorker) -> None:
+def test_rejections_of_earlier_pieces_reach_later_ones(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
     """A simulation that has slots in two pieces is rejected before the second one is planned."""
     worker.judge = lambda task: rejection() if task.stage == "simulate" else None
-    job_id = submit(coordinator, GRIDS["cloth"])
-    coordinator.planner.step()  # slots 0 to 5; slots 4 to 7 share a simulation
+    job_id = submit(context, GRIDS["cloth"])
+    planner.step()  # slots 0 to 5; slots 4 to 7 share a simulation
     worker.work()
-    coordinator.plan_large_jobs()
-    check(coordinator)
+    planner.run()
+    check(context)
     worker.work()
-    shown = show_job(coordinator, job_id)
+    shown = show_job(context, job_id)
     assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 12)
 
 
 def test_it_is_cancelled_half_planned_and_finished_by_another_job(
-    coordinator: Coordinator, worker: PretendWorker
+    context: Context, worker: PretendWorker, planner: Planner
 ) -> None:
-    job_id = submit(coordinator)
-    coordinator.planner.step()
-    coordinator.cancel(job_id)
-    check(coordinator)
-    assert not coordinator.planner.step()
-    shown = show_job(coordinator, job_id)
+    job_id = submit(context)
+    planner.step()
+    cancel_job(context, job_id)
+    check(context)
+    assert not planner.step()
+    shown = show_job(context, job_id)
     assert (shown.state, shown.progress.planned) == (JobState.cancelled, 4)
     assert worker.lease() == ()
-    again = submit(coordinator)
-    coordinator.plan_large_jobs()
-    check(coordinator)
+    again = submit(context)
+    planner.run()
+    check(context)
     worker.work()
-    assert show_job(coordinator, again).state is JobState.succeeded
-    check(coordinator)
+    assert show_job(context, again).state is JobState.succeeded
+    check(context)
 
 
-def test_a_pause_stops_the_planning_too(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
-    coordinator.planner.step()
-    coordinator.pause(job_id)
-    assert not coordinator.planner.step()
+def test_a_pause_stops_the_planning_too(context: Context, worker: PretendWorker, planner: Planner) -> None:
+    job_id = submit(context)
+    planner.step()
+    pause_job(context, job_id)
+    assert not planner.step()
     assert worker.lease() == ()
-    assert coordinator.resume(job_id).state is JobState.planning
-    coordinator.plan_large_jobs()
-    assert written(coordinator, job_id) == planned(GRID)
-    check(coordinator)
+    assert resume_job(context, job_id).state is JobState.planning
+    planner.run()
+    assert written(context, job_id) == planned(GRID)
+    check(context)
 
 
-def test_a_task_that_fails_ends_the_planning(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
-    coordinator.planner.step()
-    for _ in range(coordinator.settings.max_tries):
+def test_a_task_that_fails_ends_the_planning(context: Context, worker: PretendWorker, planner: Planner) -> None:
+    job_id = submit(context)
+    planner.step()
+    for _ in range(context.settings.max_tries):
         worker.report((worker.lease(simulate=1)[0], failure(Reason.internal_error)))
-        coordinator.clock.advance(10)  # type: ignore[attr-defined]
-        coordinator.sweep()
-    assert show_job(coordinator, job_id).state is JobState.failed
-    assert not coordinator.planner.step()
-    check(coordinator)
+        context.clock.advance(10)  # type: ignore[attr-defined]
+        sweep(context)
+    assert show_job(context, job_id).state is JobState.failed
+    assert not planner.step()
+    check(context)
 
 
-def test_tasks_that_were_set_aside_do_not_end_a_job_that_is_being_planned(
-    coordinator: Coordinator, worker: PretendWorker
+def test_quarantined_tasks_do_not_end_a_job_that_is_being_planned(
+    context: Context, worker: PretendWorker, planner: Planner
 ) -> None:
-    job_id = submit(coordinator)
-    coordinator.planner.step()
-    for _ in range(coordinator.settings.max_tries):
+    job_id = submit(context)
+    planner.step()
+    for _ in range(context.settings.max_tries):
         (bad, *others) = worker.lease(simulate=1)
         assert not others
         worker.report((bad, failure(Reason.renderer_crash)))
-        coordinator.clock.advance(10)  # type: ignore[attr-defined]
-        coordinator.sweep()
+        context.clock.advance(10)  # type: ignore[attr-defined]
+        sweep(context)
     worker.work()
-    assert show_job(coordinator, job_id).state is JobState.planning
-    coordinator.plan_large_jobs()
+    assert show_job(context, job_id).state is JobState.planning
+    planner.run()
     worker.work()
-    shown = show_job(coordinator, job_id)
+    shown = show_job(context, job_id)
     assert (shown.state, shown.reason) == (JobState.failed, Reason.quarantined)
-    check(coordinator)
+    check(context)
 
 
 def test_a_plan_that_cannot_be_made_fails_the_job_and_says_why(
-    coordinator: Coordinator, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
+    context: Context, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch, planner: Planner
 ) -> None:
-    job_id = submit(coordinator)
-    coordinator.planner.step()
+    job_id = submit(context)
+    planner.step()
 
     def broken(*_: Any, **__: Any) -> Any:
         raise ValueError("the axis bends")
 
-    monkeypatch.setattr(planner, "pieces", broken)
-    coordinator.planner = coordinator.new_planner()
-    with coordinator.database.write() as connection:
-        planner.release_claims(connection)
-    assert coordinator.planner.step()
-    shown = show_job(coordinator, job_id)
+    monkeypatch.setattr("stickslip_services.queue.planner.pieces", broken)
+    planner = Planner(context)
+    with context.database.write() as connection:
+        release_claims(connection)
+    assert planner.step()
+    shown = show_job(context, job_id)
     assert (shown.state, shown.reason) == (JobState.failed, Reason.internal_error)
     assert shown.message == "planning it failed after 4 of 15 samples: the axis bends"
     assert worker.lease() == ()
-    check(coordinator)
+    check(context)
 
 
 def test_another_coordinator_goes_on_when_the_first_one_has_died(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock, planner: Planner
 ) -> None:
-    job_id = submit(coordinator)
-    coordinator.planner.step()
-    other = coordinator.new_planner()
+    job_id = submit(context)
+    planner.step()
+    other = Planner(context)
     assert not other.step()  # the job is claimed
-    clock.advance(coordinator.settings.lease_seconds)
+    clock.advance(context.settings.lease_seconds)
     assert other.step()
-    coordinator.planner.step()  # back from the dead: it does not plan what is planned
+    planner.step()  # back from the dead: it does not plan what is planned
     while other.step():
-        check(coordinator)
-    assert written(coordinator, job_id) == planned(GRID)
+        check(context)
+    assert written(context, job_id) == planned(GRID)
 
 
-def test_jobs_wait_for_the_first_worker_and_are_planned_then(coordinator: Coordinator) -> None:
-    job_id = submit(coordinator)
-    shown = show_job(coordinator, job_id)
+def test_jobs_wait_for_the_first_worker_and_are_planned_then(context: Context, planner: Planner) -> None:
+    job_id = submit(context)
+    shown = show_job(context, job_id)
     assert (shown.state, shown.reason) == (JobState.queued, Reason.waiting_for_worker)
-    assert not coordinator.planner.step()
-    PretendWorker(coordinator, coordinator.store).register()
-    shown = show_job(coordinator, job_id)
+    assert not planner.step()
+    PretendWorker(DirectApi(context), context.store).register()
+    shown = show_job(context, job_id)
     assert (shown.state, shown.reason, shown.message) == (JobState.planning, None, "")
-    coordinator.plan_large_jobs()
-    assert written(coordinator, job_id) == planned(GRID)
-    check(coordinator)
+    planner.run()
+    assert written(context, job_id) == planned(GRID)
+    check(context)
 
 
-def test_urgent_jobs_are_planned_first(coordinator: Coordinator, worker: PretendWorker) -> None:
-    first = submit(coordinator)
-    urgent = submit(coordinator, GRID | {"seed": 1}, priority=5)
-    coordinator.planner.step()
-    assert [show_job(coordinator, job).progress.planned for job in (first, urgent)] == [0, 4]
+def test_urgent_jobs_are_planned_first(context: Context, worker: PretendWorker, planner: Planner) -> None:
+    first = submit(context)
+    urgent = submit(context, GRID | {"seed": 1}, priority=5)
+    planner.step()
+    assert [show_job(context, job).progress.planned for job in (first, urgent)] == [0, 4]
 
 
 def test_a_coordinator_that_is_killed_while_it_plans_goes_on_after_its_start(
@@ -322,12 +335,12 @@ def test_a_coordinator_that_is_killed_while_it_plans_goes_on_after_its_start(
         server.process.kill()
         server.stop()
     assert seen[-1] < 8000, "it was planned before it could be killed"
-    coordinator = Coordinator(Settings.chosen(data=data))
-    coordinator.start()
-    coordinator.plan_large_jobs()
-    check(coordinator)
-    assert written(coordinator, job_id) == planned(document)
-    coordinator.close()
+    context = Context.open(Settings.chosen(data=data))
+    start(context)
+    Planner(context).run()
+    check(context)
+    assert written(context, job_id) == planned(document)
+    context.close()
 
 
 def _planned(client: httpx.Client, job_id: str) -> int:
@@ -338,20 +351,21 @@ def _planned(client: httpx.Client, job_id: str) -> int:
 def test_people_see_how_far_the_plan_is(
     settings: Settings, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stickslip_services.coordinator.PLAN_SECONDS", 1e6)  # it plans when the test says so
+    monkeypatch.setattr("stickslip_services.app.PLAN_SECONDS", 1e6)  # it plans when the test says so
     made = make_app(settings, clock=clock)
-    coordinator: Coordinator = made.state.coordinator
+    context: Context = made.state.context
+    planner = Planner(context)
     with serving(made) as url, httpx.Client(base_url=url, trust_env=False) as client:
-        worker = PretendWorker(coordinator, coordinator.store).register()
+        worker = PretendWorker(DirectApi(context), context.store).register()
         answer = client.post("/v1/jobs", json=GRID)
         job = answer.raise_for_status().json()
         assert (answer.status_code, job["state"], job["progress"]["planned"]) == (202, "planning", 0)
         assert "0 of 15 samples are planned" in client.get(f"/jobs/{job['id']}").text
-        coordinator.planner.step()
+        planner.step()
         assert "4 of 15 samples are planned" in client.get(f"/jobs/{job['id']}").text
         assert "4/15" in client.get("/").text
         assert "4 of 15 samples are planned" in CliRunner().invoke(app, ["show", job["id"], "--url", url]).stdout
-        coordinator.plan_large_jobs()
+        planner.run()
         assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
         assert "samples are planned" not in client.get(f"/jobs/{job['id']}").text
         worker.work()

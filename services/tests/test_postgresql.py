@@ -20,18 +20,20 @@ from sqlalchemy.exc import OperationalError
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.app import main
 from stickslip_services.cli import app
-from stickslip_services.coordinator import main
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, connect, opened
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.servers import HttpApi, RunningServer, start_server, wait_until
-from stickslip_testing.worker import PretendWorker, failure
+from stickslip_testing.worker import DirectApi, PretendWorker, failure
 from typer.testing import CliRunner
 
 if TYPE_CHECKING:
@@ -110,7 +112,7 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
             thread.join()
     database = connect(pair.settings, Role.visitor)
     with database.read() as connection:
-        assert audit(connection) == []
+        assert violations(connection) == []
         count = connection.scalar(select(func.count()).select_from(tasks))
         attempts = set(connection.scalars(select(tasks.c.attempts)))
     database.close()
@@ -166,10 +168,10 @@ def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
 
 
 def test_leases_are_renewed_at_start_only_if_nobody_was_there(settings: Settings, clock: ManualClock) -> None:
-    first = Coordinator(settings, clock)
-    first.start()
-    worker = PretendWorker(first, first.store).register()
-    first.submit(parsed(rods()), None)
+    first = Context.open(settings, clock)
+    start(first)
+    worker = PretendWorker(DirectApi(first), first.store).register()
+    submit_job(first, parsed(rods()), None)
     (lease,) = worker.lease(simulate=1)
 
     def expires_at() -> float:
@@ -178,28 +180,28 @@ def test_leases_are_renewed_at_start_only_if_nobody_was_there(settings: Settings
 
     leased_until = expires_at()
     clock.advance(10.0)
-    second = Coordinator(one_more(settings, "second"), clock)
-    second.start()
+    second = Context.open(one_more(settings, "second"), clock)
+    start(second)
     assert expires_at() == leased_until
     first.close()
     second.close()
-    third = Coordinator(settings, clock)
-    third.start()
+    third = Context.open(settings, clock)
+    start(third)
     assert expires_at() == leased_until + 10.0
-    worker.api = third
+    worker.api = DirectApi(third)
     assert worker.finish(lease) == ["accepted"]
     first.close()
     third.close()
 
 
 def test_upkeep_has_the_database_for_itself(settings: Settings) -> None:
-    coordinator = Coordinator(settings)
-    coordinator.start()
+    context = Context.open(settings)
+    start(context)
     with pytest.raises(DatabaseRefusedError, match="is in use by a coordinator"), opened(settings, Role.upkeep):
         pass
     with opened(settings, Role.visitor):
         pass
-    coordinator.close()
+    context.close()
     with opened(settings, Role.upkeep):
         with pytest.raises(DatabaseRefusedError, match=r"is at work on the database postgresql.*wait until"):
             check(settings, Role.coordinator)
@@ -211,10 +213,10 @@ def test_upkeep_has_the_database_for_itself(settings: Settings) -> None:
 def test_a_coordinator_goes_on_after_the_server_has_closed_its_connections(
     settings: Settings, postgresql: "PostgresqlServer"
 ) -> None:
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.submit(parsed(rods()), None)
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit_job(context, parsed(rods()), None)
     postgresql.execute(
         "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
         "WHERE application_name = 'stickslip' AND backend_type = 'client backend'"
@@ -225,10 +227,10 @@ def test_a_coordinator_goes_on_after_the_server_has_closed_its_connections(
             break
         except OperationalError:
             pass
-    assert show_job(coordinator, job.id).state is JobState.succeeded  # type: ignore[union-attr]
+    assert show_job(context, job.id).state is JobState.succeeded  # type: ignore[union-attr]
     with pytest.raises(DatabaseRefusedError), opened(settings, Role.upkeep):  # it is known to be there again
         pass
-    coordinator.close()
+    context.close()
 
 
 def test_the_clock_is_that_of_the_database(settings: Settings) -> None:
@@ -264,16 +266,16 @@ def test_a_connection_that_is_in_use_is_closed_when_it_is_returned(settings: Set
 
 
 def test_reads_see_one_state(settings: Settings) -> None:
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    with coordinator.database.read() as connection:
+    context = Context.open(settings)
+    start(context)
+    with context.database.read() as connection:
         before = connection.scalar(text("SELECT count(*) FROM jobs"))
-        coordinator.submit(parsed(rods()), None)
+        submit_job(context, parsed(rods()), None)
         assert connection.scalar(text("SELECT count(*) FROM jobs")) == before
         with pytest.raises(Exception, match="read-only"):
             connection.execute(text("DELETE FROM jobs"))
-    assert len(list_jobs(coordinator)) == 1
-    coordinator.close()
+    assert len(list_jobs(context)) == 1
+    context.close()
 
 
 def test_what_was_rolled_back_is_not_announced(settings: Settings) -> None:
@@ -312,55 +314,55 @@ async def _until(condition: Callable[[], bool]) -> None:
 
 
 def test_numbers_may_have_64_bits(settings: Settings) -> None:
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    with coordinator.database.write() as connection:
+    context = Context.open(settings)
+    start(context)
+    with context.database.write() as connection:
         for table in ("jobs", "workers", "datasets", "certificates", "api_keys"):
             connection.execute(text(f"SELECT setval('{table}_seq_seq', 3000000000)"))
         connection.execute(text("SELECT setval('events_id_seq', 3000000000)"))
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.submit(parsed(rods()), None)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit_job(context, parsed(rods()), None)
     worker.work()
-    assert show_job(coordinator, job.id).state is JobState.succeeded  # type: ignore[union-attr]
-    with coordinator.database.write() as connection:
+    assert show_job(context, job.id).state is JobState.succeeded  # type: ignore[union-attr]
+    with context.database.write() as connection:
         connection.execute(text(f"UPDATE dataset_versions SET bytes = {2**40}"))
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         assert connection.scalar(select(dataset_versions.c.bytes)) == 2**40
-        assert audit(connection) == []
-    coordinator.close()
+        assert violations(connection) == []
+    context.close()
 
 
 def test_texts_may_have_any_character(settings: Settings) -> None:
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    coordinator.submit(parsed(rods()), None)
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    submit_job(context, parsed(rods()), None)
     (lease,) = worker.lease(simulate=1)
     assert worker.report((lease, failure(message="nul \0 and \N{SNOWMAN}"))) == ["accepted"]
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         assert (
             connection.scalar(select(tasks.c.message).where(tasks.c.tries == 1))
             == "nul \N{REPLACEMENT CHARACTER} and \N{SNOWMAN}"
         )
-    coordinator.close()
+    context.close()
 
 
 def test_a_lost_database_is_built_again(settings: Settings, postgresql: "PostgresqlServer") -> None:
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    PretendWorker(coordinator, coordinator.store).register()
-    coordinator.submit(parsed(rods()), None)
-    PretendWorker(coordinator, coordinator.store).register().work()
-    known = list_datasets(coordinator)
-    coordinator.close()
+    context = Context.open(settings)
+    start(context)
+    PretendWorker(DirectApi(context), context.store).register()
+    submit_job(context, parsed(rods()), None)
+    PretendWorker(DirectApi(context), context.store).register().work()
+    known = list_datasets(context)
+    context.close()
     empty = postgresql.empty()
     lost = Settings.chosen(data=settings.data, durable=False, database=empty)
     with pytest.raises(DatabaseRefusedError, match=r"is gone: run `stickslip reindex .*` with the same --database"):
         check(lost, Role.coordinator, with_store=True)
     found_again = CliRunner().invoke(app, ["reindex", "--data", str(settings.data), "--database", empty])
     assert found_again.exit_code == 0, found_again.output
-    again = Coordinator(lost)
-    again.start()
+    again = Context.open(lost)
+    start(again)
     (found,) = list_datasets(again)
     assert (found.id, found.versions[0].manifest) == (known[0].id, known[0].versions[0].manifest)
     again.close()

@@ -8,6 +8,7 @@ import httpx
 import pytest
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.manifest import Contents, Manifest, seal_text, with_manifest_digest
+from stickslip_services.app import make_app
 from stickslip_services.client.errors import (
     DamagedError,
     ForeignFilesError,
@@ -19,11 +20,10 @@ from stickslip_services.client.errors import (
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull, refuse_foreign_files
 from stickslip_services.client.verifying import safe_path, verify
-from stickslip_services.coordinator import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]
     """URL and dataset of a coordinator that has published something."""
     app = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
     with serving(app) as url, Client(url) as client:
-        worker = PretendWorker(app.state.coordinator, app.state.coordinator.store).register()
+        worker = PretendWorker(DirectApi(app.state.context), app.state.context.store).register()
         job = client.submit(rods(), idempotency_key="one")
         worker.work()
         reference = client.job(job.id).dataset

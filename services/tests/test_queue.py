@@ -13,61 +13,65 @@ from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
-from stickslip_services.queue.audit import audit
 from stickslip_services.queue.compose import AnyTask, find_task
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job
 from stickslip_services.queue.jobs import find_job, list_samples
+from stickslip_services.queue.lease import lease_tasks
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_jobs, parsed, rods, show_job
-from stickslip_testing.worker import BUILDS, PretendWorker, failure, rejection
+from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, failure, rejection
 
 pytestmark = pytest.mark.databases
 
 
-def submit(coordinator: Coordinator, **spec: Any) -> str:
-    job = coordinator.submit(parsed(rods(**spec)), None)
+def submit(context: Context, **spec: Any) -> str:
+    job = submit_job(context, parsed(rods(**spec)), None)
     assert not isinstance(job, tuple)
     return job.id  # type: ignore[union-attr]
 
 
-def show_dataset(coordinator: Coordinator, dataset: str) -> Dataset:
-    with coordinator.database.read() as connection:
+def show_dataset(context: Context, dataset: str) -> Dataset:
+    with context.database.read() as connection:
         return find_dataset(connection, dataset)
 
 
-def show_task(coordinator: Coordinator, name: str) -> AnyTask:
-    with coordinator.database.read() as connection:
-        return find_task(connection, name, coordinator.store.publish)
+def show_task(context: Context, name: str) -> AnyTask:
+    with context.database.read() as connection:
+        return find_task(connection, name, context.store.publish)
 
 
-def check(coordinator: Coordinator) -> None:
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
+def check(context: Context) -> None:
+    with context.database.read() as connection:
+        assert violations(connection) == []
 
 
-def counts(coordinator: Coordinator, job: str, stage: Stage) -> dict[TaskState, int]:
-    return show_job(coordinator, job).progress.stages[stage].counts
+def counts(context: Context, job: str, stage: Stage) -> dict[TaskState, int]:
+    return show_job(context, job).progress.stages[stage].counts
 
 
-def test_a_job_runs_from_grid_to_dataset(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator, name="first")
-    assert show_job(coordinator, job_id).state is JobState.queued
+def test_a_job_runs_from_grid_to_dataset(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context, name="first")
+    assert show_job(context, job_id).state is JobState.queued
     first = worker.lease(simulate=1)
-    assert show_job(coordinator, job_id).state is JobState.running
+    assert show_job(context, job_id).state is JobState.running
     worker.finish(*first)
     assert worker.work() == 4 + 4 + 2 + 1 - 1
-    job = show_job(coordinator, job_id)
+    job = show_job(context, job_id)
     assert (job.state, job.rejected_count, job.progress.done, job.progress.total) == (JobState.succeeded, 0, 11, 11)
     assert job.progress.stages[Stage.render].cpu_seconds == 8.0
     assert job.dataset is not None
-    dataset = show_dataset(coordinator, job.dataset.dataset)
+    dataset = show_dataset(context, job.dataset.dataset)
     assert (dataset.name, [version.version for version in dataset.versions]) == ("first", [1])
     assert dataset.versions[0].manifest == job.dataset.manifest
-    check(coordinator)
+    check(context)
 
 
-def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_tasks_are_composed_of_what_they_build_on(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     (simulate, *others) = worker.lease(simulate=100)
     worker.report((simulate, rejection("no equilibrium")), *((task, worker.result(task.task)) for task in others))
     renders = worker.lease(render=100)
@@ -87,95 +91,95 @@ def test_tasks_are_composed_of_what_they_build_on(coordinator: Coordinator, work
     (publish,) = worker.lease(publish=1)
     assert isinstance(publish.task, PublishTask)
     (digest,) = publish.task.sections
-    section = PublishSection.model_validate_json(coordinator.store.read(digest))
+    section = PublishSection.model_validate_json(context.store.read(digest))
     assert [file.path for file in section.files] == ["views/c/0/0", "views/c/1/0"]
     assert len(section.labels) == 2
     assert [entry.slot for entry in section.rejections] == [0]
     assert (section.first, len(section.sample_keys)) == (0, 4)
     assert section.sample_keys[1] == good.sample_key
     worker.finish(publish)
-    assert not coordinator.store.exists(digest)
-    check(coordinator)
+    assert not context.store.exists(digest)
+    check(context)
 
 
-def test_nothing_is_rendered_where_no_views_are_wanted(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator, views=None)
+def test_nothing_is_rendered_where_no_views_are_wanted(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context, views=None)
     assert worker.work() == 4 + 2 + 1
-    assert show_job(coordinator, job_id).state is JobState.succeeded
-    check(coordinator)
+    assert show_job(context, job_id).state is JobState.succeeded
+    check(context)
 
 
-def test_a_rejected_simulation_rejects_its_renders(coordinator: Coordinator, worker: PretendWorker) -> None:
+def test_a_rejected_simulation_rejects_its_renders(context: Context, worker: PretendWorker) -> None:
     worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
-    job_id = submit(coordinator)
+    job_id = submit(context)
     worker.work()
-    job = show_job(coordinator, job_id)
+    job = show_job(context, job_id)
     assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 2)
     assert "2 of 4 samples were rejected" in job.message
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         page = list_samples(connection, find_job(connection, job_id).seq, PageRequest(10, None), TaskState.rejected)
     assert [(item.slot, item.reason, item.message) for item in page.items] == [
         (0, Reason.solver_diverged, "it diverged"),
         (1, Reason.solver_diverged, "it diverged"),
     ]
     assert len([name for name in worker.ran if name.startswith("render")]) == 2
-    check(coordinator)
+    check(context)
 
 
-def test_all_samples_rejected_is_a_dataset_too(coordinator: Coordinator, worker: PretendWorker) -> None:
+def test_all_samples_rejected_is_a_dataset_too(context: Context, worker: PretendWorker) -> None:
     worker.judge = lambda task: rejection() if task.stage == "simulate" else None
-    job_id = submit(coordinator)
+    job_id = submit(context)
     worker.work()
-    job = show_job(coordinator, job_id)
+    job = show_job(context, job_id)
     assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 4)
     assert job.dataset is not None
-    assert show_dataset(coordinator, job.dataset.dataset).versions[0].valid_count == 0
+    assert show_dataset(context, job.dataset.dataset).versions[0].valid_count == 0
 
 
-def test_the_same_grid_again_runs_nothing(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_the_same_grid_again_runs_nothing(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     worker.work()
-    again = show_job(coordinator, submit(coordinator, name="again"))
+    again = show_job(context, submit(context, name="again"))
     assert again.state is JobState.succeeded
     assert again.dataset is not None
     assert again.dataset.version == 1
     assert [stage.cached for stage in again.progress.stages.values()] == [4, 4, 2, 1]
     assert worker.lease() == ()
-    check(coordinator)
+    check(context)
 
 
-def test_a_bigger_grid_runs_what_is_new(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_a_bigger_grid_runs_what_is_new(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     worker.work()
     ran = len(worker.ran)
-    bigger = submit(coordinator, gamma=(1.0, 2.0, 5.0))
+    bigger = submit(context, gamma=(1.0, 2.0, 5.0))
     worker.work()
-    job = show_job(coordinator, bigger)
+    job = show_job(context, bigger)
     assert job.state is JobState.succeeded
     assert len(worker.ran) - ran == 2 + 2 + 1 + 1  # two shards are those of the smaller grid
     assert job.progress.stages[Stage.simulate].cached == 4
     assert job.progress.stages[Stage.simulate].cpu_seconds == 4.0
-    check(coordinator)
+    check(context)
 
 
-def test_other_builds_make_another_version(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_other_builds_make_another_version(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     worker.work()
     other = PretendWorker(
-        coordinator, coordinator.store, name="new", builds=BUILDS.model_copy(update={"render": "e" * 64})
+        DirectApi(context), context.store, name="new", builds=BUILDS.model_copy(update={"render": "e" * 64})
     ).register()
-    job_id = submit(coordinator)
+    job_id = submit(context)
     other.work()
-    job = show_job(coordinator, job_id)
+    job = show_job(context, job_id)
     assert job.dataset is not None
     assert job.dataset.version == 2
     assert job.progress.stages[Stage.simulate].cached == 4  # the simulator is the same
-    assert len(show_dataset(coordinator, job.dataset.dataset).versions) == 2
-    check(coordinator)
+    assert len(show_dataset(context, job.dataset.dataset).versions) == 2
+    check(context)
 
 
-def test_a_stale_token_is_refused(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
-    submit(coordinator)
+def test_a_stale_token_is_refused(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context)
     (late,) = worker.lease(simulate=1)
     clock.advance(31)
     (again,) = worker.lease(simulate=1)
@@ -185,45 +189,45 @@ def test_a_stale_token_is_refused(coordinator: Coordinator, worker: PretendWorke
     assert worker.finish(again) == ["accepted"]
     assert worker.finish(again) == ["duplicate"]
     assert worker.finish(late) == ["stale"]
-    check(coordinator)
+    check(context)
 
 
-def test_another_worker_cannot_report(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_another_worker_cannot_report(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     (mine,) = worker.lease(simulate=1)
-    thief = PretendWorker(coordinator, coordinator.store, name="thief").register()
+    thief = PretendWorker(DirectApi(context), context.store, name="thief").register()
     assert thief.finish(mine) == ["stale"]
     assert thief.beat(mine) == (mine.task_id,)
     assert worker.finish(mine, mine) == ["accepted", "duplicate"]
-    check(coordinator)
+    check(context)
 
 
-def test_a_heartbeat_keeps_a_lease(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
-    submit(coordinator)
+def test_a_heartbeat_keeps_a_lease(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context)
     (mine,) = worker.lease(simulate=1)
     for _ in range(5):
         clock.advance(20)
         assert worker.start(mine) == ()
-        coordinator.sweep()
+        sweep(context)
     assert worker.finish(mine) == ["accepted"]
 
 
-def test_an_expired_lease_is_no_failed_try(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
-    job_id = submit(coordinator)
+def test_an_expired_lease_is_no_failed_try(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    job_id = submit(context)
     started, idle = worker.lease(simulate=2)
     worker.start(started)
     clock.advance(31)
-    coordinator.sweep()
-    assert counts(coordinator, job_id, Stage.simulate) == {TaskState.pending: 4}  # at once, without a wait
+    sweep(context)
+    assert counts(context, job_id, Stage.simulate) == {TaskState.pending: 4}  # at once, without a wait
     leases = {lease.task_id: lease for lease in worker.lease(simulate=10)}
     assert (leases[started.task_id].attempt, leases[idle.task_id].attempt) == (2, 1)
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         assert connection.execute(select(tasks.c.tries, tasks.c.losses).order_by(tasks.c.seq)).first() == (0, 1)
-    check(coordinator)
+    check(context)
 
 
-def test_three_failed_tries_fail_the_job(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
-    job_id = submit(coordinator)
+def test_three_failed_tries_fail_the_job(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    job_id = submit(context)
     poison, running, other, _ = worker.lease(simulate=4)
     worker.start(running)
     for tries in range(3):
@@ -234,7 +238,7 @@ def test_three_failed_tries_fail_the_job(coordinator: Coordinator, worker: Prete
         leases = worker.lease(simulate=1)
         assert len(leases) == (1 if tries < 2 else 0)
         poison = leases[0] if leases else poison
-    job = show_job(coordinator, job_id)
+    job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.failed_tasks)
     assert "failed 3 times" in job.message
     assert "crash 2" in job.message
@@ -244,54 +248,52 @@ def test_three_failed_tries_fail_the_job(coordinator: Coordinator, worker: Prete
     assert worker.beat(running, started=True) == ()  # what runs may finish
     assert worker.beat(other) == (other.task_id,)  # what has not been started is dropped
     assert worker.finish(running) == ["accepted"]
-    check(coordinator)
+    check(context)
 
 
-def test_submitting_a_failed_job_again_tries_again(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
-) -> None:
+def test_submitting_a_failed_job_again_tries_again(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
     worker.judge = lambda task: failure() if task.stage == "render" else None
-    first = submit(coordinator)
+    first = submit(context)
     for _ in range(4):
         worker.work()
         clock.advance(10)
-    assert show_job(coordinator, first).state is JobState.failed
+    assert show_job(context, first).state is JobState.failed
     worker.judge = lambda _task: None
-    second = submit(coordinator)
-    check(coordinator)
+    second = submit(context)
+    check(context)
     worker.work()
-    job = show_job(coordinator, second)
+    job = show_job(context, second)
     assert job.state is JobState.succeeded
     assert job.progress.stages[Stage.simulate].cached == 4
-    assert show_job(coordinator, first).state is JobState.failed
-    check(coordinator)
+    assert show_job(context, first).state is JobState.failed
+    check(context)
 
 
-def test_a_failure_with_a_deterministic_reason_is_a_failure(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
+def test_a_failure_with_a_deterministic_reason_is_a_failure(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context)
     (task,) = worker.lease(simulate=1)
     worker.report((task, failure(Reason.solver_diverged)))
-    assert counts(coordinator, job_id, Stage.simulate)[TaskState.soft_failed] == 1
+    assert counts(context, job_id, Stage.simulate)[TaskState.soft_failed] == 1
 
 
-def test_a_released_task_waits_again_without_a_count(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_a_released_task_waits_again_without_a_count(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     (task,) = worker.lease(simulate=1)
     assert worker.report((task, None)) == ["accepted"]
     (again,) = worker.lease(simulate=1)
     assert (again.task_id, again.attempt, again.token) == (task.task_id, 1, task.token + 1)
     assert worker.report((task, None)) == ["duplicate"]
     assert worker.finish(again) == ["accepted"]
-    check(coordinator)
+    check(context)
 
 
 def test_a_new_session_takes_the_leases_of_the_old_one(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    submit(coordinator)
+    submit(context)
     started, idle = worker.lease(simulate=2)
     worker.start(started)
-    successor = PretendWorker(coordinator, coordinator.store).register()
+    successor = PretendWorker(DirectApi(context), context.store).register()
     assert worker.finish(started) == ["stale"]
     assert worker.beat(idle) == (idle.task_id,)
     with pytest.raises(ConflictError, match="another session"):
@@ -299,96 +301,96 @@ def test_a_new_session_takes_the_leases_of_the_old_one(
     clock.advance(1)
     attempts = {lease.task_id: lease.attempt for lease in successor.lease(simulate=10)}
     assert (attempts[started.task_id], attempts[idle.task_id], len(attempts)) == (2, 1, 4)
-    check(coordinator)
+    check(context)
 
 
-def test_an_unknown_worker_is_told_to_register(coordinator: Coordinator) -> None:
+def test_an_unknown_worker_is_told_to_register(context: Context) -> None:
     with pytest.raises(UnknownWorkerError, match="register again"):
-        coordinator.lease(LeaseRequest(worker_id="worker-0", wanted={Stage.simulate: 1}))
+        lease_tasks(context, LeaseRequest(worker_id="worker-0", wanted={Stage.simulate: 1}))
 
 
-def test_jobs_share_tasks_and_one_can_be_cancelled(coordinator: Coordinator, worker: PretendWorker) -> None:
-    small = submit(coordinator, gamma=(1.0,))
-    big = submit(coordinator)
+def test_jobs_share_tasks_and_one_can_be_cancelled(context: Context, worker: PretendWorker) -> None:
+    small = submit(context, gamma=(1.0,))
+    big = submit(context)
     first = worker.lease(simulate=1)
-    assert show_job(coordinator, small).state is show_job(coordinator, big).state is JobState.running
-    check(coordinator)
-    assert coordinator.cancel(small).state is JobState.cancelled  # what is leased, the other job needs
-    check(coordinator)
+    assert show_job(context, small).state is show_job(context, big).state is JobState.running
+    check(context)
+    assert cancel_job(context, small).state is JobState.cancelled  # what is leased, the other job needs
+    check(context)
     assert worker.beat(*first, started=True) == ()
     worker.finish(*first)
     worker.work()
-    assert show_job(coordinator, big).state is JobState.succeeded
-    assert show_job(coordinator, small).state is JobState.cancelled
-    check(coordinator)
-    assert show_job(coordinator, submit(coordinator, gamma=(1.0,))).state is JobState.queued  # its own last task only
+    assert show_job(context, big).state is JobState.succeeded
+    assert show_job(context, small).state is JobState.cancelled
+    check(context)
+    assert show_job(context, submit(context, gamma=(1.0,))).state is JobState.queued  # its own last task only
 
 
-def test_cancelling_drops_what_runs(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
+def test_cancelling_drops_what_runs(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context)
     started, idle = worker.lease(simulate=2)
     worker.start(started)
-    assert coordinator.cancel(job_id).state is JobState.cancelling
-    assert coordinator.cancel(job_id).state is JobState.cancelling
-    check(coordinator)
+    assert cancel_job(context, job_id).state is JobState.cancelling
+    assert cancel_job(context, job_id).state is JobState.cancelling
+    check(context)
     assert worker.lease() == ()
     assert set(worker.beat(started, idle)) == {started.task_id, idle.task_id}
-    assert show_job(coordinator, job_id).state is JobState.cancelled
+    assert show_job(context, job_id).state is JobState.cancelled
     assert worker.finish(started) == ["stale"]
-    assert coordinator.cancel(job_id).state is JobState.cancelled
-    check(coordinator)
+    assert cancel_job(context, job_id).state is JobState.cancelled
+    check(context)
 
 
-def test_a_result_that_comes_before_the_drop_is_kept(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
+def test_a_result_that_comes_before_the_drop_is_kept(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context)
     (task,) = worker.lease(simulate=1)
-    coordinator.cancel(job_id)
+    cancel_job(context, job_id)
     assert worker.finish(task) == ["accepted"]
-    assert show_job(coordinator, job_id).state is JobState.cancelled
-    again = show_job(coordinator, submit(coordinator))
+    assert show_job(context, job_id).state is JobState.cancelled
+    again = show_job(context, submit(context))
     assert again.progress.stages[Stage.simulate].cached == 1
-    check(coordinator)
+    check(context)
 
 
 def test_cancelling_ends_although_the_worker_is_gone(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    job_id = submit(coordinator)
+    job_id = submit(context)
     worker.start(*worker.lease(simulate=2))
-    coordinator.cancel(job_id)
+    cancel_job(context, job_id)
     clock.advance(31)
-    coordinator.sweep()
-    assert show_job(coordinator, job_id).state is JobState.cancelled
-    check(coordinator)
+    sweep(context)
+    assert show_job(context, job_id).state is JobState.cancelled
+    check(context)
 
 
-def test_a_job_that_has_ended_cannot_be_cancelled(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
+def test_a_job_that_has_ended_cannot_be_cancelled(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context)
     worker.work()
     with pytest.raises(ConflictError, match="has ended"):
-        coordinator.cancel(job_id)
+        cancel_job(context, job_id)
     with pytest.raises(NotFoundError):
-        coordinator.cancel("job-0")
+        cancel_job(context, "job-0")
 
 
-def test_a_job_waits_for_the_first_worker(coordinator: Coordinator) -> None:
-    job_id = submit(coordinator)
-    job = show_job(coordinator, job_id)
+def test_a_job_waits_for_the_first_worker(context: Context) -> None:
+    job_id = submit(context)
+    job = show_job(context, job_id)
     assert (job.state, job.reason, job.progress.total) == (JobState.queued, Reason.waiting_for_worker, 0)
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = show_job(coordinator, job_id)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = show_job(context, job_id)
     assert (job.state, job.reason, job.message, job.progress.total) == (JobState.queued, None, "", 11)
     worker.work()
-    assert show_job(coordinator, job_id).state is JobState.succeeded
-    check(coordinator)
+    assert show_job(context, job_id).state is JobState.succeeded
+    check(context)
 
 
-def test_a_waiting_job_can_be_cancelled(coordinator: Coordinator) -> None:
-    job_id = submit(coordinator)
-    assert coordinator.cancel(job_id).state is JobState.cancelled
-    PretendWorker(coordinator, coordinator.store).register()
-    assert show_job(coordinator, job_id).progress.total == 0
-    check(coordinator)
+def test_a_waiting_job_can_be_cancelled(context: Context) -> None:
+    job_id = submit(context)
+    assert cancel_job(context, job_id).state is JobState.cancelled
+    PretendWorker(DirectApi(context), context.store).register()
+    assert show_job(context, job_id).progress.total == 0
+    check(context)
 
 
 CLOTH: dict[str, Any] = {
@@ -398,28 +400,28 @@ CLOTH: dict[str, Any] = {
 }
 
 
-def test_a_kind_that_no_worker_makes_is_refused(coordinator: Coordinator, worker: PretendWorker) -> None:
+def test_a_kind_that_no_worker_makes_is_refused(context: Context, worker: PretendWorker) -> None:
     with pytest.raises(KindNotAvailableError, match="rod_hang"):
-        coordinator.submit(parsed(CLOTH), None)
-    assert list_jobs(coordinator) == ()
+        submit_job(context, parsed(CLOTH), None)
+    assert list_jobs(context) == ()
     assert worker.lease() == ()
 
 
-def test_a_waiting_job_of_such_a_kind_fails(coordinator: Coordinator) -> None:
-    job = coordinator.submit(parsed(CLOTH), None)
-    PretendWorker(coordinator, coordinator.store).register()
-    shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
+def test_a_waiting_job_of_such_a_kind_fails(context: Context) -> None:
+    job = submit_job(context, parsed(CLOTH), None)
+    PretendWorker(DirectApi(context), context.store).register()
+    shown = show_job(context, job.id)  # type: ignore[union-attr]
     assert shown.state is JobState.failed
     assert "no worker makes 'cloth_drag'" in shown.message
 
 
-def test_one_simulation_serves_all_looks_and_those_that_come_later(coordinator: Coordinator) -> None:
-    worker = PretendWorker(coordinator, coordinator.store, kinds=("rod_hang", "cloth_drag")).register()
+def test_one_simulation_serves_all_looks_and_those_that_come_later(context: Context) -> None:
+    worker = PretendWorker(DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")).register()
 
     def work(**axes: Any) -> dict[str, dict[str, int]]:
-        job = coordinator.submit(parsed(CLOTH | {"axes": CLOTH["axes"] | axes}), None)
+        job = submit_job(context, parsed(CLOTH | {"axes": CLOTH["axes"] | axes}), None)
         worker.work()
-        stages = show_job(coordinator, job.id).progress.stages  # type: ignore[union-attr]
+        stages = show_job(context, job.id).progress.stages  # type: ignore[union-attr]
         return {
             stage: {"all": sum(stages[stage].counts.values()), "cached": stages[stage].cached}
             for stage in (Stage.simulate, Stage.render)
@@ -430,41 +432,41 @@ def test_one_simulation_serves_all_looks_and_those_that_come_later(coordinator: 
     more = work(texture=["dots", "plaid", "floral"], viewpoint=["left", "right"])
     assert more == {Stage.simulate: {"all": 1, "cached": 1}, Stage.render: {"all": 6, "cached": 4}}
     assert sum(name.startswith("simulate") for name in worker.ran) == 1
-    check(coordinator)
+    check(context)
 
 
-def test_many_renders_share_one_simulation(coordinator: Coordinator) -> None:
-    worker = PretendWorker(coordinator, coordinator.store, kinds=("rod_hang", "cloth_drag")).register()
-    job = coordinator.submit(parsed(CLOTH), None)
+def test_many_renders_share_one_simulation(context: Context) -> None:
+    worker = PretendWorker(DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")).register()
+    job = submit_job(context, parsed(CLOTH), None)
     (simulation,) = worker.lease(simulate=10)
     worker.report((simulation, rejection()))
     assert worker.lease(render=10) == ()
     worker.work()
-    shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
+    shown = show_job(context, job.id)  # type: ignore[union-attr]
     assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 2)
-    check(coordinator)
+    check(context)
 
 
-def test_a_stranded_job_says_so(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
-    job_id = submit(coordinator)
+def test_a_stranded_job_says_so(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    job_id = submit(context)
     clock.advance(31)
-    coordinator.sweep()
-    job = show_job(coordinator, job_id)
+    sweep(context)
+    job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.queued, Reason.waiting_for_worker)
     assert "no worker is connected" in job.message
     other = BUILDS.model_copy(update={"sim_core": "f" * 64})
-    PretendWorker(coordinator, coordinator.store, builds=other).register()
-    assert "no connected worker has the builds" in show_job(coordinator, job_id).message
-    PretendWorker(coordinator, coordinator.store, name="old").register()
-    job = show_job(coordinator, job_id)
+    PretendWorker(DirectApi(context), context.store, builds=other).register()
+    assert "no connected worker has the builds" in show_job(context, job_id).message
+    PretendWorker(DirectApi(context), context.store, name="old").register()
+    job = show_job(context, job_id)
     assert (job.reason, job.message) == (None, "")
-    check(coordinator)
+    check(context)
 
 
-def test_tasks_go_only_to_their_builds(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_tasks_go_only_to_their_builds(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     other = BUILDS.model_copy(update={"render": "f" * 64})
-    foreign = PretendWorker(coordinator, coordinator.store, name="foreign", builds=other).register()
+    foreign = PretendWorker(DirectApi(context), context.store, name="foreign", builds=other).register()
     leases = foreign.lease()
     assert {lease.task.stage for lease in leases} == {"simulate"}  # the simulator is the same
     foreign.finish(*leases)
@@ -472,29 +474,29 @@ def test_tasks_go_only_to_their_builds(coordinator: Coordinator, worker: Pretend
     assert {lease.task.stage for lease in worker.lease()} == {"render"}
 
 
-def test_a_small_job_does_not_wait_behind_a_big_one(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator, gamma={"type": "linspace", "start": 0, "stop": 50, "num": 50})
-    small = submit(coordinator, gamma=(77.0,))
+def test_a_small_job_does_not_wait_behind_a_big_one(context: Context, worker: PretendWorker) -> None:
+    submit(context, gamma={"type": "linspace", "start": 0, "stop": 50, "num": 50})
+    small = submit(context, gamma=(77.0,))
     held = worker.lease(simulate=4)
     gammas = sorted(lease.task.simulation.gamma for lease in held)  # type: ignore[union-attr]
     assert gammas[-2:] == [77.0, 77.0]
-    assert show_job(coordinator, small).state is JobState.running
-    check(coordinator)
+    assert show_job(context, small).state is JobState.running
+    check(context)
 
 
 def test_work_survives_a_restart(settings: Settings, clock: ManualClock) -> None:
-    before = Coordinator(settings, clock)
-    before.start()
-    worker = PretendWorker(before, before.store).register()
+    before = Context.open(settings, clock)
+    start(before)
+    worker = PretendWorker(DirectApi(before), before.store).register()
     job_id = submit(before)
     held = worker.lease(simulate=2)
     worker.start(*held)
     before.close()
     clock.advance(3600)  # the leases have expired, but nobody could have renewed them
-    after = Coordinator(settings, clock)
-    after.start()
-    worker.api = after
-    after.sweep()
+    after = Context.open(settings, clock)
+    start(after)
+    worker.api = DirectApi(after)
+    sweep(after)
     assert worker.start(*held) == ()
     assert worker.finish(*held) == ["accepted", "accepted"]
     worker.work()
@@ -504,52 +506,52 @@ def test_work_survives_a_restart(settings: Settings, clock: ManualClock) -> None
 
 
 def test_a_worker_that_publishes_what_is_not_there_is_not_believed(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    job_id = submit(coordinator)
+    job_id = submit(context)
     while not (publish := worker.lease(publish=1)):
         worker.finish(*worker.lease())
     good = worker.result(publish[0].task)
     assert good.output is not None
     lie = good.model_copy(update={"output": good.output.model_copy(update={"manifest": "0" * 64})})
     assert worker.report((publish[0], lie)) == ["accepted"]
-    assert counts(coordinator, job_id, Stage.publish) == {TaskState.soft_failed: 1}
+    assert counts(context, job_id, Stage.publish) == {TaskState.soft_failed: 1}
     clock.advance(5)
     (again,) = worker.lease(publish=1)
     assert again.task == publish[0].task  # the same version number
     assert worker.finish(again) == ["accepted"]
-    assert show_job(coordinator, job_id).state is JobState.succeeded
-    check(coordinator)
+    assert show_job(context, job_id).state is JobState.succeeded
+    check(context)
 
 
-def test_an_output_of_another_stage_is_no_answer(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator)
+def test_an_output_of_another_stage_is_no_answer(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context)
     (simulate, other) = worker.lease(simulate=2)
     worker.finish(other)
     (render,) = worker.lease(render=1)
     worker.report((simulate, worker.result(render.task)))
-    assert counts(coordinator, job_id, Stage.simulate)[TaskState.soft_failed] == 1
-    check(coordinator)
+    assert counts(context, job_id, Stage.simulate)[TaskState.soft_failed] == 1
+    check(context)
 
 
-def test_a_task_can_be_read_for_a_replay(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_a_task_can_be_read_for_a_replay(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     leases = worker.lease(simulate=4)
-    assert show_task(coordinator, leases[0].task_id) == leases[0].task
+    assert show_task(context, leases[0].task_id) == leases[0].task
     worker.finish(*leases)
     (render,) = worker.lease(render=1)
-    assert show_task(coordinator, render.task_id) == render.task
+    assert show_task(context, render.task_id) == render.task
     with pytest.raises(NotFoundError):
-        show_task(coordinator, "render-" + "0" * 64)
+        show_task(context, "render-" + "0" * 64)
     with pytest.raises(NotFoundError):
-        show_task(coordinator, render.task_id.replace("render", "simulate"))
+        show_task(context, render.task_id.replace("render", "simulate"))
 
 
-def test_versions_of_two_builds_at_once_do_not_share_a_number(coordinator: Coordinator, worker: PretendWorker) -> None:
-    submit(coordinator)
+def test_versions_of_two_builds_at_once_do_not_share_a_number(context: Context, worker: PretendWorker) -> None:
+    submit(context)
     builds = Builds(**{stage: str(n) * 64 for n, stage in enumerate(Builds.model_fields)})
-    other = PretendWorker(coordinator, coordinator.store, name="other", builds=builds).register()
-    submit(coordinator)
+    other = PretendWorker(DirectApi(context), context.store, name="other", builds=builds).register()
+    submit(context)
     publishes = []
     for one in (worker, other):
         while not (publish := one.lease(publish=1)):
@@ -558,23 +560,23 @@ def test_versions_of_two_builds_at_once_do_not_share_a_number(coordinator: Coord
     assert [lease.task.version for _, lease in publishes] == [1, 2]  # type: ignore[union-attr]
     for one, lease in reversed(publishes):
         assert one.finish(lease) == ["accepted"]
-    check(coordinator)
+    check(context)
 
 
-def test_the_time_left_is_measured(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job_id = submit(coordinator, gamma=(1.0, 2.0, 3.0))
-    assert show_job(coordinator, job_id).progress.eta is None
+def test_the_time_left_is_measured(context: Context, worker: PretendWorker) -> None:
+    job_id = submit(context, gamma=(1.0, 2.0, 3.0))
+    assert show_job(context, job_id).progress.eta is None
     worker.finish(*worker.lease(simulate=6))
-    assert show_job(coordinator, job_id).progress.eta is None  # no render has been measured
+    assert show_job(context, job_id).progress.eta is None  # no render has been measured
     worker.finish(*worker.lease(render=3))
-    eta = show_job(coordinator, job_id).progress.eta
+    eta = show_job(context, job_id).progress.eta
     assert eta is not None
     # 3 renders of 1 s, 3 packs and 1 publish taken as 1 s each, two at a time
     assert eta.seconds == pytest.approx((3 + 3 + 1) / 2)
     assert 0 <= eta.low < eta.seconds < eta.high
     worker.work()
-    assert show_job(coordinator, job_id).progress.eta is None
-    earlier = show_job(coordinator, submit(coordinator, gamma=(8.0,))).progress.eta
+    assert show_job(context, job_id).progress.eta is None
+    earlier = show_job(context, submit(context, gamma=(8.0,))).progress.eta
     assert earlier is not None  # from the job before
     assert earlier.seconds == pytest.approx(4.0)  # 6 tasks on 2 slots, but each stage waits for the one before
 
@@ -582,98 +584,94 @@ def test_the_time_left_is_measured(coordinator: Coordinator, worker: PretendWork
 class TestPausing:
     """Pausing: nothing more is leased, what runs finishes, and resuming goes on."""
 
-    def test_running_tasks_finish_and_nothing_more_is_leased(
-        self, coordinator: Coordinator, worker: PretendWorker
-    ) -> None:
-        job = submit(coordinator)
+    def test_running_tasks_finish_and_nothing_more_is_leased(self, context: Context, worker: PretendWorker) -> None:
+        job = submit(context)
         running, waiting = worker.lease(simulate=2)
         worker.start(running)
-        assert coordinator.pause(job).state is JobState.pausing
-        assert coordinator.pause(job).state is JobState.pausing  # asked twice, it is one pause
+        assert pause_job(context, job).state is JobState.pausing
+        assert pause_job(context, job).state is JobState.pausing  # asked twice, it is one pause
         assert worker.lease() == ()
         assert worker.start(running) == ()
         assert worker.beat(waiting) == (waiting.task_id,)  # it had not been started: given back
-        assert counts(coordinator, job, Stage.simulate) == {TaskState.pending: 3, TaskState.running: 1}
+        assert counts(context, job, Stage.simulate) == {TaskState.pending: 3, TaskState.running: 1}
         assert worker.finish(running) == ["accepted"]
-        shown = show_job(coordinator, job)
+        shown = show_job(context, job)
         assert (shown.state, shown.progress.eta) == (JobState.paused, None)
         assert worker.lease() == ()
-        check(coordinator)
-        assert coordinator.resume(job).state is JobState.running
-        assert coordinator.resume(job).state is JobState.running
+        check(context)
+        assert resume_job(context, job).state is JobState.running
+        assert resume_job(context, job).state is JobState.running
         worker.work()
-        assert show_job(coordinator, job).state is JobState.succeeded
+        assert show_job(context, job).state is JobState.succeeded
         assert len(worker.ran) == len(set(worker.ran)) == 11
-        check(coordinator)
+        check(context)
 
     def test_it_survives_a_restart(self, settings: Settings, clock: ManualClock) -> None:
-        before = Coordinator(settings, clock)
-        before.start()
-        worker = PretendWorker(before, before.store).register()
+        before = Context.open(settings, clock)
+        start(before)
+        worker = PretendWorker(DirectApi(before), before.store).register()
         job = submit(before)
-        assert before.pause(job).state is JobState.paused
+        assert pause_job(before, job).state is JobState.paused
         before.close()
-        after = Coordinator(settings, clock)
-        after.start()
-        worker = PretendWorker(after, after.store).register()
-        after.sweep()
+        after = Context.open(settings, clock)
+        start(after)
+        worker = PretendWorker(DirectApi(after), after.store).register()
+        sweep(after)
         assert worker.lease() == ()
         assert show_job(after, job).state is JobState.paused
-        assert after.resume(job).state is JobState.queued
+        assert resume_job(after, job).state is JobState.queued
         worker.work()
         assert show_job(after, job).state is JobState.succeeded
         after.close()
 
-    def test_others_run_what_a_paused_job_shares(self, coordinator: Coordinator, worker: PretendWorker) -> None:
-        first = submit(coordinator)
-        coordinator.pause(first)
-        second = submit(coordinator, gamma=(1.0, 2.0), name="second")  # the same tasks
-        third = submit(coordinator, gamma=(1.0,))
-        coordinator.pause(second)
-        check(coordinator)
+    def test_others_run_what_a_paused_job_shares(self, context: Context, worker: PretendWorker) -> None:
+        first = submit(context)
+        pause_job(context, first)
+        second = submit(context, gamma=(1.0, 2.0), name="second")  # the same tasks
+        third = submit(context, gamma=(1.0,))
+        pause_job(context, second)
+        check(context)
         assert [len(worker.lease(simulate=10))] == [2]  # those of the third
-        coordinator.resume(second)
-        check(coordinator)
+        resume_job(context, second)
+        check(context)
         for lease in worker.lease(simulate=10):
             worker.finish(lease)
-        coordinator.cancel(third)
+        cancel_job(context, third)
         worker.register()
         worker.work()
-        assert show_job(coordinator, second).state is JobState.succeeded
-        assert show_job(coordinator, first).state is JobState.succeeded  # its dataset was made for another
-        check(coordinator)
+        assert show_job(context, second).state is JobState.succeeded
+        assert show_job(context, first).state is JobState.succeeded  # its dataset was made for another
+        check(context)
 
-    def test_a_job_that_waits_for_the_first_worker(self, coordinator: Coordinator) -> None:
-        job = submit(coordinator)
-        assert coordinator.pause(job).state is JobState.paused
-        worker = PretendWorker(coordinator, coordinator.store).register()
-        assert show_job(coordinator, job).progress.total == 0
-        assert coordinator.resume(job).state is JobState.queued
+    def test_a_job_that_waits_for_the_first_worker(self, context: Context) -> None:
+        job = submit(context)
+        assert pause_job(context, job).state is JobState.paused
+        worker = PretendWorker(DirectApi(context), context.store).register()
+        assert show_job(context, job).progress.total == 0
+        assert resume_job(context, job).state is JobState.queued
         worker.work()
-        assert show_job(coordinator, job).state is JobState.succeeded
+        assert show_job(context, job).state is JobState.succeeded
 
-    def test_ended_jobs_refuse(self, coordinator: Coordinator, worker: PretendWorker) -> None:
-        done, dropped = submit(coordinator), submit(coordinator, gamma=(5.0,))
-        coordinator.pause(dropped)
-        assert coordinator.cancel(dropped).state is JobState.cancelled
+    def test_ended_jobs_refuse(self, context: Context, worker: PretendWorker) -> None:
+        done, dropped = submit(context), submit(context, gamma=(5.0,))
+        pause_job(context, dropped)
+        assert cancel_job(context, dropped).state is JobState.cancelled
         worker.work()
         for job in (done, dropped):
             with pytest.raises(ConflictError, match="can be paused"):
-                coordinator.pause(job)
+                pause_job(context, job)
             with pytest.raises(ConflictError, match="can be resumed"):
-                coordinator.resume(job)
+                resume_job(context, job)
 
-    def test_a_lost_worker_does_not_undo_it(
-        self, coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
-    ) -> None:
-        job = submit(coordinator)
+    def test_a_lost_worker_does_not_undo_it(self, context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+        job = submit(context)
         worker.start(*worker.lease(simulate=1))
-        coordinator.pause(job)
+        pause_job(context, job)
         clock.advance(31)
-        coordinator.sweep()
+        sweep(context)
         clock.advance(5)
-        coordinator.sweep()
-        assert show_job(coordinator, job).state is JobState.paused
-        assert counts(coordinator, job, Stage.simulate) == {TaskState.pending: 4}
+        sweep(context)
+        assert show_job(context, job).state is JobState.paused
+        assert counts(context, job, Stage.simulate) == {TaskState.pending: 4}
         assert worker.lease() == ()
-        check(coordinator)
+        check(context)

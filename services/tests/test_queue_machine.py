@@ -15,12 +15,16 @@ from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.documents.worker_api import Lease
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job
 from stickslip_services.queue.ledger import runnable_tasks
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
-from stickslip_testing.worker import PretendWorker, failure, rejection
+from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 
 if TYPE_CHECKING:
     from stickslip_testing.postgresql import PostgresqlServer
@@ -64,8 +68,9 @@ class QueueMachine(RuleBasedStateMachine):
             plan_samples=PLAN_SAMPLES,
             database=None if self.server is None else self.server.clean(),
         )
-        self.coordinator = Coordinator(self.settings, self.clock)
-        self.coordinator.start()
+        self.context = Context.open(self.settings, self.clock)
+        start(self.context)
+        self.planner = Planner(self.context)
         self.workers: dict[str, PretendWorker] = {}
         self.holders: dict[str, tuple[str, int, float]] = {}  # task -> worker id, token, expiry
         self.tokens: dict[str, int] = {}
@@ -78,17 +83,17 @@ class QueueMachine(RuleBasedStateMachine):
 
     @rule(target=jobs, which=st.integers(0, len(SPECS) - 1))
     def submit(self, which: int) -> str:
-        job = self.coordinator.submit(parsed(SPECS[which]), None)
+        job = submit_job(self.context, parsed(SPECS[which]), None)
         return job.id  # type: ignore[union-attr]
 
     @rule()
     def plan(self) -> None:
         """Plan a piece of a job."""
-        waiting = {job.id: job for job in list_jobs(self.coordinator) if job.state is JobState.planning}
-        assert self.coordinator.planner.step() == bool(waiting)
+        waiting = {job.id: job for job in list_jobs(self.context) if job.state is JobState.planning}
+        assert self.planner.step() == bool(waiting)
         grown = [
             job.progress.planned - waiting[job.id].progress.planned
-            for job in list_jobs(self.coordinator)
+            for job in list_jobs(self.context)
             if job.id in waiting
         ]
         assert sorted(grown)[:-1] == [0] * (len(grown) - 1), "one piece of one job"
@@ -97,7 +102,7 @@ class QueueMachine(RuleBasedStateMachine):
     @rule(name=st.sampled_from(("a", "b")))
     def register(self, name: str) -> None:
         old = self.workers.get(name)
-        worker = PretendWorker(self.coordinator, self.coordinator.store, name=name, judge=_judge).register()
+        worker = PretendWorker(DirectApi(self.context), self.context.store, name=name, judge=_judge).register()
         if old is not None:
             self.holders = {task: held for task, held in self.holders.items() if held[0] != old.id}
         self.workers[name] = worker
@@ -160,7 +165,7 @@ class QueueMachine(RuleBasedStateMachine):
     @rule(job=jobs)
     def cancel(self, job: str) -> None:
         try:
-            shown = self.coordinator.cancel(job)
+            shown = cancel_job(self.context, job)
         except ConflictError:
             assert self.ended[job] is not JobState.cancelled
         else:
@@ -169,25 +174,25 @@ class QueueMachine(RuleBasedStateMachine):
     @rule(job=jobs)
     def pause(self, job: str) -> None:
         try:
-            shown = self.coordinator.pause(job)
+            shown = pause_job(self.context, job)
         except ConflictError:
-            assert job in self.ended or show_job(self.coordinator, job).state is JobState.cancelling
+            assert job in self.ended or show_job(self.context, job).state is JobState.cancelling
         else:
             assert shown.state in (JobState.pausing, JobState.paused)
 
     @rule(job=jobs)
     def resume(self, job: str) -> None:
         try:
-            shown = self.coordinator.resume(job)
+            shown = resume_job(self.context, job)
         except ConflictError:
-            assert job in self.ended or show_job(self.coordinator, job).state is JobState.cancelling
+            assert job in self.ended or show_job(self.context, job).state is JobState.cancelling
         else:
             assert shown.state in (JobState.planning, JobState.queued, JobState.running)
 
     @rule(job=jobs, priority=st.integers(-2, 2))
     def prioritise(self, job: str, priority: int) -> None:
         try:
-            assert self.coordinator.prioritise(job, priority).priority == priority
+            assert prioritise_job(self.context, job, priority).priority == priority
         except ConflictError:
             assert job in self.ended
 
@@ -197,16 +202,17 @@ class QueueMachine(RuleBasedStateMachine):
 
     @rule()
     def sweep(self) -> None:
-        self.coordinator.sweep()
+        sweep(self.context)
         self._forget_expired()
 
     @rule()
     def restart(self) -> None:
-        self.coordinator.close()
-        self.coordinator = Coordinator(self.settings, self.clock)
-        self.coordinator.start()
+        self.context.close()
+        self.context = Context.open(self.settings, self.clock)
+        start(self.context)
+        self.planner = Planner(self.context)
         for worker in self.workers.values():
-            worker.api = self.coordinator
+            worker.api = DirectApi(self.context)
         expiry = self.clock() + self.settings.lease_seconds
         self.holders = {task: (worker, token, expiry) for task, (worker, token, _) in self.holders.items()}
 
@@ -214,17 +220,17 @@ class QueueMachine(RuleBasedStateMachine):
 
     @invariant()
     def ledger_is_right(self) -> None:
-        with self.coordinator.database.read() as connection:
-            assert audit(connection) == []
+        with self.context.database.read() as connection:
+            assert violations(connection) == []
 
     @invariant()
     def what_has_ended_stays_so(self) -> None:
-        for job in list_jobs(self.coordinator):
+        for job in list_jobs(self.context):
             if not job.state.is_open:
                 assert self.ended.setdefault(job.id, job.state) is job.state
             else:
                 assert job.id not in self.ended
-        for dataset in list_datasets(self.coordinator):
+        for dataset in list_datasets(self.context):
             for version in dataset.versions:
                 key = (dataset.id, version.version)
                 assert self.manifests.setdefault(key, version.manifest) == version.manifest
@@ -233,18 +239,18 @@ class QueueMachine(RuleBasedStateMachine):
         if not hasattr(self, "coordinator"):
             return
         # However it went: once no job is paused, a worker that does its work brings every job to its end.
-        for job in list_jobs(self.coordinator):
+        for job in list_jobs(self.context):
             if job.state in (JobState.pausing, JobState.paused):
-                self.coordinator.resume(job.id)
-        worker = PretendWorker(self.coordinator, self.coordinator.store, name="last", judge=_judge).register()
+                resume_job(self.context, job.id)
+        worker = PretendWorker(DirectApi(self.context), self.context.store, name="last", judge=_judge).register()
         for _ in range(10):
             self.clock.advance(60)
-            self.coordinator.plan_large_jobs()
+            self.planner.run()
             worker.work()
-        for job in list_jobs(self.coordinator):
+        for job in list_jobs(self.context):
             assert not job.state.is_open, f"{job.id} is {job.state}"
         self.ledger_is_right()
-        self.coordinator.close()
+        self.context.close()
         self.directory.cleanup()
 
     def _is_held(self, worker: PretendWorker, lease: Lease) -> bool:
@@ -253,7 +259,7 @@ class QueueMachine(RuleBasedStateMachine):
 
     def _is_asked_for(self, task: str) -> bool:
         """Tell whether a job that may run needs the task."""
-        with self.coordinator.database.read() as connection:
+        with self.context.database.read() as connection:
             seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
             return seq is not None and bool(runnable_tasks(connection, [seq]))
 

@@ -10,35 +10,37 @@ from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import DirectoryStore
+from stickslip_services.app import main
 from stickslip_services.cli import app
-from stickslip_services.coordinator import main
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
 from stickslip_services.local.process import locked
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.reindexing import reindex
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.reindex import reindex
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.servers import served
-from stickslip_testing.worker import PretendWorker, rejection
+from stickslip_testing.worker import DirectApi, PretendWorker, rejection
 from typer.testing import CliRunner, Result
 
 
 @pytest.fixture
 def made(settings: Settings) -> dict[str, object]:
     """Two datasets, one with a rejected sample; then the database is lost. Return what was known of them."""
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
     worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
     for spec in (rods(name="first"), rods(gamma=(9.0, 1.0))):
-        coordinator.submit(parsed(spec), None)
+        submit_job(context, parsed(spec), None)
         worker.work()
-    known = {dataset.id: dataset for dataset in list_datasets(coordinator)}
-    coordinator.close()
+    known = {dataset.id: dataset for dataset in list_datasets(context)}
+    context.close()
     for path in settings.data.glob("coordinator.sqlite3*"):
         path.unlink()
     return dict(known)
@@ -49,7 +51,7 @@ def run(settings: Settings) -> Result:
 
 
 def test_a_lost_database_is_not_taken_for_a_new_one(settings: Settings, made: dict[str, object]) -> None:
-    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(settings.data), "--port", "0"]
+    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(settings.data), "--port", "0"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2
     (sentence,) = ended.stderr.splitlines()
@@ -79,37 +81,37 @@ def test_datasets_are_found_again(settings: Settings, made: dict[str, object], t
             pulled = CliRunner().invoke(app, ["pull", dataset, str(tmp_path / dataset), "--url", server.url])
             assert pulled.exit_code == 0, pulled.output
             assert CliRunner().invoke(app, ["verify", str(tmp_path / dataset)]).exit_code == 0
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    found = {dataset.id: dataset for dataset in list_datasets(coordinator)}
+    context = Context.open(settings)
+    start(context)
+    found = {dataset.id: dataset for dataset in list_datasets(context)}
     assert found.keys() == made.keys()
     for dataset, before in made.items():
         (old,), (new,) = before.versions, found[dataset].versions  # type: ignore[attr-defined]
         same = ("version", "manifest", "group", "sample_count", "valid_count", "bytes")
         assert [getattr(new, name) for name in same[:-1]] == [getattr(old, name) for name in same[:-1]]
         assert found[dataset].name == before.name  # type: ignore[attr-defined]
-    assert {job.state for job in list_jobs(coordinator)} == {JobState.succeeded, JobState.succeeded_with_rejects}
-    assert all(job.message.startswith("found again in the store") for job in list_jobs(coordinator))
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
-    coordinator.close()
+    assert {job.state for job in list_jobs(context)} == {JobState.succeeded, JobState.succeeded_with_rejects}
+    assert all(job.message.startswith("found again in the store") for job in list_jobs(context))
+    with context.database.read() as connection:
+        assert violations(connection) == []
+    context.close()
 
 
 def test_a_spec_that_is_submitted_again_finds_its_dataset(settings: Settings, made: dict[str, object]) -> None:
     run(settings)
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.submit(parsed(rods(name="first")), None)
-    shown = show_job(coordinator, job.id)  # type: ignore[union-attr]
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit_job(context, parsed(rods(name="first")), None)
+    shown = show_job(context, job.id)  # type: ignore[union-attr]
     assert shown.state is JobState.succeeded
     assert worker.work() == 0
-    bigger = coordinator.submit(parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
+    bigger = submit_job(context, parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
     worker.work()
-    assert show_job(coordinator, bigger.id).state is JobState.succeeded  # type: ignore[union-attr]
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
-    coordinator.close()
+    assert show_job(context, bigger.id).state is JobState.succeeded  # type: ignore[union-attr]
+    with context.database.read() as connection:
+        assert violations(connection) == []
+    context.close()
 
 
 def test_a_dataset_that_rots_afterwards_is_made_again(settings: Settings, made: dict[str, object]) -> None:
@@ -118,16 +120,16 @@ def test_a_dataset_that_rots_afterwards_is_made_again(settings: Settings, made: 
     (path,) = store.dataset_path(next(iter(made)), 1).glob("views/c/0/0")
     store.path(sha256(path.read_bytes())).unlink()
     path.write_bytes(b"rotten")
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
     worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
     spec = rods(gamma=(9.0, 1.0)) if path.parts[-6] == next(iter(made)) else rods(name="first")
-    job = coordinator.submit(parsed(spec), None)
+    job = submit_job(context, parsed(spec), None)
     assert worker.work() > 0
-    assert not show_job(coordinator, job.id).state.is_open  # type: ignore[union-attr]
-    assert show_job(coordinator, job.id).dataset is not None  # type: ignore[union-attr]
-    coordinator.close()
+    assert not show_job(context, job.id).state.is_open  # type: ignore[union-attr]
+    assert show_job(context, job.id).dataset is not None  # type: ignore[union-attr]
+    context.close()
 
 
 @pytest.mark.parametrize("damage", ["manifest", "file", "moved"])
@@ -170,7 +172,7 @@ def one_sentence(settings: Settings) -> str:
     with pytest.raises(DatabaseRefusedError) as raised:
         check(settings, Role.coordinator, with_store=True)
     assert "\n" not in str(raised.value)
-    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(settings.data), "--port", "0"]
+    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(settings.data), "--port", "0"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (ended.returncode, ended.stderr) == (2, f"error: {raised.value}\n")
     return str(raised.value)

@@ -11,16 +11,19 @@ from stickslip_schemas.documents.tasks import PackOutput, RecordRef, RenderOutpu
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.client.verifying import verify
 from stickslip_services.database.tables import dataset_versions, tasks
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import CHECKED_AT_ONCE, Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import sweep
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.worker import PretendWorker
 
 pytestmark = pytest.mark.databases(slow=True)
 
 
-def submit(coordinator: Coordinator, **spec: Any) -> str:
-    return coordinator.submit(parsed(rods(**spec)), None).id  # type: ignore[union-attr]
+def submit(context: Context, **spec: Any) -> str:
+    return submit_job(context, parsed(rods(**spec)), None).id  # type: ignore[union-attr]
 
 
 def rot(path: Path, rng: random.Random) -> None:
@@ -44,75 +47,71 @@ def artifacts(store: DirectoryStore) -> list[Path]:
     return sorted(path for path in (store.root / "artifacts").rglob("*") if path.is_file())
 
 
-def check(coordinator: Coordinator) -> None:
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
+def check(context: Context) -> None:
+    with context.database.read() as connection:
+        assert violations(connection) == []
 
 
-def finish(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, job: str) -> None:
+def finish(context: Context, worker: PretendWorker, clock: ManualClock, job: str) -> None:
     """Work until the job has ended well, and check its dataset."""
     for _ in range(12):
         worker.work()
         clock.advance(10)
-        coordinator.sweep()
-    shown = show_job(coordinator, job)
+        sweep(context)
+    shown = show_job(context, job)
     assert shown.state is JobState.succeeded, shown.message
     assert shown.dataset is not None
     assert verify(directory(worker).dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
-    check(coordinator)
+    check(context)
 
 
-def test_200_rotten_artifacts_are_mended(coordinator: Coordinator, worker: PretendWorker, clock: ManualClock) -> None:
+def test_200_rotten_artifacts_are_mended(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
     rng = random.Random(3)
     gammas = [1.0, 2.0, 3.0]
-    finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
+    finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
     for round_ in range(20):
         for path in rng.sample(artifacts(directory(worker)), 10):
             rot(path, rng)
-        finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
+        finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
         if round_ % 5 == 4:  # the grid grows: what was made for the smaller one is read again
             gammas = [*gammas, 4.0 + round_]
-            finish(coordinator, worker, clock, submit(coordinator, gamma=gammas, samples_per_shard=4))
+            finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
 
 
-def test_only_what_is_damaged_is_made_again(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
-) -> None:
-    finish(coordinator, worker, clock, submit(coordinator))
-    with coordinator.database.read() as connection:
+def test_only_what_is_damaged_is_made_again(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    finish(context, worker, clock, submit(context))
+    with context.database.read() as connection:
         output = connection.scalar(select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1))
     directory(worker).path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(b"x")
     worker.ran.clear()
-    job = submit(coordinator)
-    assert "1 of its files were damaged or lost" in show_job(coordinator, job).message
-    finish(coordinator, worker, clock, job)
+    job = submit(context)
+    assert "1 of its files were damaged or lost" in show_job(context, job).message
+    finish(context, worker, clock, job)
     assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
 
 
-def test_a_rotten_trajectory_is_simulated_again(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
-) -> None:
+def test_a_rotten_trajectory_is_simulated_again(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
     """It is two stages away from the pack task that needs it, and needed by a render that comes later."""
-    job = submit(coordinator)
+    job = submit(context)
     worker.finish(*worker.lease(simulate=10))
     (render, *others) = worker.lease(render=10)
     worker.finish(*others)
     directory(worker).path(render.task.record.digest).unlink()  # type: ignore[union-attr]
     assert worker.finish(render) == ["accepted"]
-    counts = show_job(coordinator, job).progress.stages
+    counts = show_job(context, job).progress.stages
     assert counts[Stage.simulate].counts == {TaskState.succeeded: 3, TaskState.pending: 1}
     assert counts[Stage.render].counts[TaskState.soft_failed] == 1
-    check(coordinator)
+    check(context)
     clock.advance(5)
-    coordinator.sweep()
+    sweep(context)
     assert worker.lease(render=10) == ()  # it waits for its simulation
-    finish(coordinator, worker, clock, job)
+    finish(context, worker, clock, job)
 
 
 def test_a_pack_task_names_what_was_made_two_stages_before(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    job = submit(coordinator)
+    job = submit(context)
     worker.finish(*worker.lease(simulate=10))
     worker.finish(*worker.lease(render=10))
     packs = worker.lease(pack=10)
@@ -120,17 +119,17 @@ def test_a_pack_task_names_what_was_made_two_stages_before(
         directory(worker).path(slot.record.digest).write_bytes(b"")  # type: ignore[union-attr]
         directory(worker).path(slot.chunks["views"].digest).unlink()
     worker.finish(*packs)
-    counts = show_job(coordinator, job).progress.stages
+    counts = show_job(context, job).progress.stages
     assert counts[Stage.simulate].counts[TaskState.pending] == 2
     assert counts[Stage.render].counts[TaskState.pending] == 2
-    check(coordinator)
-    finish(coordinator, worker, clock, job)
+    check(context)
+    finish(context, worker, clock, job)
 
 
 def test_a_disk_that_keeps_rotting_fails_the_job_and_a_resubmission_mends_it(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    job = submit(coordinator, gamma=(1.0,), phi1=(1.0,))
+    job = submit(context, gamma=(1.0,), phi1=(1.0,))
     for _ in range(10):
         for lease in worker.lease(simulate=10):
             worker.finish(lease)
@@ -138,33 +137,33 @@ def test_a_disk_that_keeps_rotting_fails_the_job_and_a_resubmission_mends_it(
             directory(worker).path(lease.task.record.digest).unlink(missing_ok=True)  # type: ignore[union-attr]
             worker.finish(lease)
         clock.advance(10)
-        coordinator.sweep()
-    assert show_job(coordinator, job).state is JobState.failed
-    check(coordinator)
-    finish(coordinator, worker, clock, submit(coordinator, gamma=(1.0,), phi1=(1.0,)))
+        sweep(context)
+    assert show_job(context, job).state is JobState.failed
+    check(context)
+    finish(context, worker, clock, submit(context, gamma=(1.0,), phi1=(1.0,)))
 
 
 def test_big_datasets_are_checked_by_the_coordinator_itself(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    finish(coordinator, worker, clock, submit(coordinator))
-    with coordinator.database.write() as connection:
+    finish(context, worker, clock, submit(context))
+    with context.database.write() as connection:
         connection.execute(update(dataset_versions).values(bytes=CHECKED_AT_ONCE + 1))
-    job = submit(coordinator)
-    shown = show_job(coordinator, job)
+    job = submit(context)
+    shown = show_job(context, job)
     assert (shown.state, shown.message) == (JobState.queued, "all of it was made before: checking it")
-    coordinator.sweep()
-    assert show_job(coordinator, job).state is JobState.queued
-    coordinator.check_made_datasets()
-    assert show_job(coordinator, job).state is JobState.succeeded
-    check(coordinator)
+    sweep(context)
+    assert show_job(context, job).state is JobState.queued
+    check_made_datasets(context)
+    assert show_job(context, job).state is JobState.succeeded
+    check(context)
 
 
 @pytest.mark.parametrize("stage", ["simulate", "render", "pack"])
 def test_a_result_that_is_not_in_the_store_is_refused(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, stage: str
+    context: Context, worker: PretendWorker, clock: ManualClock, stage: str
 ) -> None:
-    job = submit(coordinator)
+    job = submit(context)
     if stage != "simulate":
         worker.finish(*worker.lease(simulate=10))
     if stage == "pack":
@@ -181,12 +180,12 @@ def test_a_result_that_is_not_in_the_store_is_refused(
         directory(worker).path(output.labels).unlink()  # type: ignore[union-attr]
     lie = TaskResult(outcome="succeeded", output=output)
     assert worker.report((lease, lie)) == ["accepted"]  # as a failure
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         query = "SELECT state, reason, message FROM tasks WHERE state = 'soft_failed'"
         ((state, reason, message),) = connection.exec_driver_sql(query)
     assert (state, reason) == (TaskState.soft_failed, Reason.storage_error)
     assert "must be in the store" in message
-    finish(coordinator, worker, clock, job)
+    finish(context, worker, clock, job)
 
 
 def test_publishing_again_mends_an_artifact(tmp_path: Path) -> None:

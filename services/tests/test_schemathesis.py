@@ -9,13 +9,15 @@ import threading
 from pathlib import Path
 
 import pytest
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.errors import StickslipError
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import list_jobs, parsed, rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker, rejection
+from stickslip_testing.worker import DirectApi, PretendWorker, rejection
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = 3
@@ -28,11 +30,11 @@ def test_every_check_of_schemathesis_passes(state: str, tmp_path: Path) -> None:
     app = make_app(Settings(data=tmp_path, durable=False))
     command = Path(sys.executable).with_name("schemathesis")
     with serving(app) as url:
-        coordinator: Coordinator = app.state.coordinator
+        context: Context = app.state.context
         if state == "used":
-            make_datasets(coordinator)
+            make_datasets(context)
         stop = threading.Event()
-        canceller = threading.Thread(target=cancel_jobs, args=(coordinator, stop))
+        canceller = threading.Thread(target=cancel_jobs, args=(context, stop))
         canceller.start()
         try:
             run = subprocess.run(
@@ -68,26 +70,26 @@ def test_every_check_of_schemathesis_passes(state: str, tmp_path: Path) -> None:
     assert " passed" in run.stdout
 
 
-def make_datasets(coordinator: Coordinator) -> None:
+def make_datasets(context: Context) -> None:
     """Make a dataset with rejected samples, and leave another job half done."""
     worker = PretendWorker(
-        coordinator,
-        coordinator.store,
+        DirectApi(context),
+        context.store,
         whole=True,
         judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None,
     ).register()
-    coordinator.submit(parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
+    submit_job(context, parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
     worker.work()
-    coordinator.submit(parsed(rods(gamma=(7.0, 8.0))), None)
+    submit_job(context, parsed(rods(gamma=(7.0, 8.0))), None)
     worker.finish(*worker.lease(simulate=1))
 
 
-def cancel_jobs(coordinator: Coordinator, stop: threading.Event) -> None:
+def cancel_jobs(context: Context, stop: threading.Event) -> None:
     """End the jobs that are made: the event stream of one that waits for a worker would go on for ever."""
     while not stop.wait(0.1):
-        for job in list_jobs(coordinator):
+        for job in list_jobs(context):
             if job.state.is_open:
                 try:
-                    coordinator.cancel(job.id)
+                    cancel_job(context, job.id)
                 except StickslipError:
                     continue  # it has ended in between

@@ -12,20 +12,22 @@ from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
+from stickslip_services.app import make_app
 from stickslip_services.cli import app
 from stickslip_services.client.errors import ForeignFilesError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
-from stickslip_services.coordinator import make_app
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.reindexing import reindex
-from stickslip_services.queue.unused import unused
+from stickslip_services.queue.cleanup import unused
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.reindex import reindex
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker, rejection
+from stickslip_testing.worker import DirectApi, PretendWorker, rejection
 from typer.testing import CliRunner
 
 GAMMAS = (1.0, 2.0, 3.0, 4.0)
@@ -48,8 +50,8 @@ def made(settings: Settings) -> FastAPI:
 def origin(made: FastAPI) -> Iterator[tuple[str, str, PretendWorker]]:
     """URL, dataset and worker of a coordinator that has made a version with four sections."""
     with serving(made) as url, Client(url) as client:
-        coordinator: Coordinator = made.state.coordinator
-        worker = PretendWorker(coordinator, coordinator.store, whole=True).register()
+        context: Context = made.state.context
+        worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
         worker.judge = lambda task: (
             rejection()
             if task.stage == "simulate" and (task.simulation.gamma, task.simulation.phi1) == (3.0, 3.0)
@@ -151,10 +153,10 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
     origin: tuple[str, str, PretendWorker], made: FastAPI
 ) -> None:
     url, dataset, worker = origin
-    coordinator: Coordinator = made.state.coordinator
+    context: Context = made.state.context
     with Client(url) as client:
         entry = client.manifest(dataset, 1)[0].sections[2]
-        coordinator.store.path(entry.sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
+        context.store.path(entry.sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
         job = client.submit(rods(gamma=GAMMAS))
         shown = client.job(job.id)
         assert "its manifest was damaged or lost" in shown.message
@@ -162,50 +164,50 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
         worker.work()
         assert client.job(job.id).state is JobState.succeeded_with_rejects
         assert [name.partition("-")[0] for name in worker.ran] == ["publish"]
-        assert coordinator.store.holds(entry.sha256)
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
+        assert context.store.holds(entry.sha256)
+    with context.database.read() as connection:
+        assert violations(connection) == []
 
 
 def test_nothing_of_it_is_unused_and_it_is_found_again(
     origin: tuple[str, str, PretendWorker], made: FastAPI, settings: Settings, tmp_path: Path, clock: ManualClock
 ) -> None:
     _, dataset, _ = origin
-    coordinator: Coordinator = made.state.coordinator
-    (known,) = list_datasets(coordinator)
-    shown = coordinator.store.read(known.versions[0].manifest)
+    context: Context = made.state.context
+    (known,) = list_datasets(context)
+    shown = context.store.read(known.versions[0].manifest)
     needed = {
         file.sha256
-        for file in Contents(
-            Manifest.model_validate_json(shown), lambda file: coordinator.store.read(file.sha256)
-        ).files()
+        for file in Contents(Manifest.model_validate_json(shown), lambda file: context.store.read(file.sha256)).files()
     }
-    free = {file.name for file in unused(coordinator.database, coordinator.store, older_than=-1)}
+    free = {file.name for file in unused(context.database, context.store, older_than=-1)}
     assert not needed & free
-    fresh = Coordinator(settings.model_copy(update={"data": tmp_path / "fresh", "store": str(settings.data / "store")}))
-    fresh.start()
+    fresh = Context.open(
+        settings.model_copy(update={"data": tmp_path / "fresh", "store": str(settings.data / "store")})
+    )
+    start(fresh)
     first = next(iter(needed - {known.versions[0].manifest}))
-    coordinator.store.delete(first)
+    context.store.delete(first)
     (found,) = reindex(fresh.database, fresh.store)
     assert (found.fault, found.samples) == ("", 8)
-    assert coordinator.store.exists(first)  # from what the version shows
+    assert context.store.exists(first)  # from what the version shows
     assert [(each.id, each.versions[0].manifest) for each in list_datasets(fresh)] == [
         (dataset, known.versions[0].manifest)
     ]
     with fresh.database.read() as connection:
-        assert audit(connection) == []
+        assert violations(connection) == []
     fresh.close()
 
 
-def test_a_version_with_a_damaged_section_is_not_believed(coordinator: Coordinator, worker: PretendWorker) -> None:
-    coordinator.submit(parsed(rods(gamma=GAMMAS)), None)
+def test_a_version_with_a_damaged_section_is_not_believed(context: Context, worker: PretendWorker) -> None:
+    submit_job(context, parsed(rods(gamma=GAMMAS)), None)
     while not (publish := worker.lease(publish=1)):
         worker.finish(*worker.lease(simulate=9, render=9, pack=9))
     result = worker.result(publish[0].task)
-    document = Manifest.model_validate_json(coordinator.store.read(result.output.manifest))  # type: ignore[union-attr]
-    coordinator.store.path(document.sections[1].sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
+    document = Manifest.model_validate_json(context.store.read(result.output.manifest))  # type: ignore[union-attr]
+    context.store.path(document.sections[1].sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
     assert worker.report((publish[0], result)) == ["accepted"]  # as a failure
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         ((reason, message),) = connection.exec_driver_sql("SELECT reason, message FROM tasks WHERE state='soft_failed'")
     assert reason == Reason.storage_error
     assert "the result does not hold" in message

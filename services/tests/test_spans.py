@@ -10,11 +10,14 @@ from typing import Any
 import httpx
 import pytest
 from stickslip_schemas import tracing
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, parsed, rods
 from stickslip_testing.servers import start_server
-from stickslip_testing.worker import PretendWorker, failure
+from stickslip_testing.worker import DirectApi, PretendWorker, failure
 
 pytest.importorskip("opentelemetry.exporter.otlp.proto.http", reason="needs pip install 'stickslip-schemas[tracing]'")
 
@@ -34,18 +37,18 @@ def spans() -> Iterator[Any]:
 
 
 def test_a_job_is_one_tree(settings: Settings, clock: ManualClock, spans: Any) -> None:
-    coordinator = Coordinator(settings.model_copy(update={"plan_samples": 2}), clock)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.submit(parsed(rods()), None, traceparent=HOST)
-    coordinator.plan_large_jobs()
+    context = Context.open(settings.model_copy(update={"plan_samples": 2}), clock)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit_job(context, parsed(rods()), None, traceparent=HOST)
+    Planner(context).run()
     (bad,) = worker.lease(simulate=1)
     tracing.record_task(bad, failure(), 2.5, worker="pretend")
     worker.report((bad, failure()))
     clock.advance(10)
-    coordinator.sweep()
+    sweep(context)
     worker.work()
-    coordinator.close()
+    context.close()
     found = spans.get_finished_spans()
     (root,) = [span for span in found if span.name == "submit"]
     assert f"{root.parent.span_id:016x}" == HOST.split("-")[2]
@@ -63,8 +66,8 @@ def test_a_job_is_one_tree(settings: Settings, clock: ManualClock, spans: Any) -
 
 
 @pytest.mark.parametrize("sent", ["", "nonsense", "00-0-0-00", HOST + "-more"])
-def test_a_traceparent_that_is_none_counts_as_none(coordinator: Coordinator, spans: Any, sent: str) -> None:
-    coordinator.submit(parsed(rods()), None, traceparent=sent)
+def test_a_traceparent_that_is_none_counts_as_none(context: Context, spans: Any, sent: str) -> None:
+    submit_job(context, parsed(rods()), None, traceparent=sent)
     (root,) = spans.get_finished_spans()
     assert root.parent is None
 

@@ -9,17 +9,19 @@ import zarr
 import zarr.storage
 from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
-from stickslip_services import coordinator as program
+from stickslip_services import app as program
+from stickslip_services.app import make_app
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
-from stickslip_services.coordinator import make_app
 from stickslip_services.errors import SettingsError
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.store_watch import PROBE_SECONDS
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods, show_job
 from stickslip_testing.servers import serving
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 from typer.testing import CliRunner, Result
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
@@ -68,8 +70,8 @@ def objects(bucket: str) -> dict[str, float]:
     return {item["path"]: item["last_modified"].timestamp() for page in obstore.list(root) for item in page}
 
 
-def submitted(coordinator: Coordinator, gamma: tuple[float, ...]) -> JobDetail:
-    job = coordinator.submit(parsed(rods(gamma=gamma)), None)
+def submitted(context: Context, gamma: tuple[float, ...]) -> JobDetail:
+    job = submit_job(context, parsed(rods(gamma=gamma)), None)
     assert isinstance(job, JobDetail)
     return job
 
@@ -78,18 +80,18 @@ def test_a_bucket_is_a_store_like_any_other(
     in_bucket: Settings, bucket: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Make two datasets, read one, remove one, collect, lose the database, and find the other one again."""
-    coordinator = Coordinator(in_bucket)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
+    context = Context.open(in_bucket)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
     names = []
     for gamma in ((1.0, 2.0), (2.0, 3.0)):
-        job = submitted(coordinator, gamma)
+        job = submitted(context, gamma)
         worker.work()
-        dataset = show_job(coordinator, job.id).dataset
+        dataset = show_job(context, job.id).dataset
         assert dataset is not None
         names.append(dataset.dataset)
-    stray = coordinator.store.publish(b"nobody refers to this")
-    coordinator.close()
+    stray = context.store.publish(b"nobody refers to this")
+    context.close()
     assert not (tmp_path / "data" / "store").exists()
 
     with serving(make_app(in_bucket)) as url:
@@ -117,27 +119,27 @@ def test_a_bucket_is_a_store_like_any_other(
     assert f"{bucket} holds datasets, and the database" in said
     assert "run `stickslip reindex" in said
     assert f"{names[0]}:v1  4 samples" in stickslip("reindex", *place_options).output
-    coordinator = Coordinator(in_bucket)
-    coordinator.start()
-    (found,) = list_datasets(coordinator)
+    context = Context.open(in_bucket)
+    start(context)
+    (found,) = list_datasets(context)
     (version,) = found.versions
     assert found.id == names[0]
-    assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
-    coordinator.close()
+    assert damaged_files(context.store, version.manifest, version.group) == frozenset()
+    context.close()
 
 
 def test_what_a_version_shows_is_kept_though_no_database_knows_it(in_bucket: Settings, bucket: str) -> None:
     """A database from an old backup knows less than the bucket."""
-    coordinator = Coordinator(in_bucket)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    submitted(coordinator, (1.0, 2.0))
+    context = Context.open(in_bucket)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    submitted(context, (1.0, 2.0))
     worker.work()
-    coordinator.close()
+    context.close()
     in_bucket.database_path.unlink()
-    fresh = Coordinator(in_bucket)
-    fresh.start()
-    PretendWorker(fresh, fresh.store).register()
+    fresh = Context.open(in_bucket)
+    start(fresh)
+    PretendWorker(DirectApi(fresh), fresh.store).register()
     submitted(fresh, (5.0,))  # it is in use, and knows nothing of what was made before
     fresh.close()
     before = {name for name in objects(bucket) if "/datasets/" in name}
@@ -152,28 +154,28 @@ def test_what_a_version_shows_is_kept_though_no_database_knows_it(in_bucket: Set
 def test_jobs_wait_while_the_bucket_is_away(in_bucket: Settings, s3: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stickslip_schemas.store.bucket.PROBE_PATIENCE", 0.5)
     clock = ManualClock()
-    coordinator = Coordinator(in_bucket, clock)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = submitted(coordinator, (1.0,)).id
-    coordinator.sweep()
+    context = Context.open(in_bucket, clock)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submitted(context, (1.0,)).id
+    sweep(context)
     asked = s3.counts["PUT"]
-    coordinator.sweep()
+    sweep(context)
     assert s3.counts["PUT"] == asked  # a look costs money
 
     s3.fault = lambda method, path: "503"
     clock.advance(PROBE_SECONDS)
-    coordinator.sweep()
-    shown = show_job(coordinator, job)
+    sweep(context)
+    shown = show_job(context, job)
     assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
     assert in_bucket.store_place in shown.message
     assert worker.lease() == ()
 
     s3.fault = no_fault
-    coordinator.sweep()
+    sweep(context)
     worker.work()
-    assert show_job(coordinator, job).state is JobState.succeeded
-    coordinator.close()
+    assert show_job(context, job).state is JobState.succeeded
+    context.close()
 
 
 def test_a_new_coordinator_wants_an_answer_of_its_bucket(

@@ -12,12 +12,15 @@ import httpx
 import pytest
 from stickslip_schemas.base.states import JobState, Reason
 from stickslip_services.errors import ConflictError
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import pause_job, resume_job
 from stickslip_services.queue.store_watch import HOLD_SECONDS
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import RunningServer, start_server, wait_until
-from stickslip_testing.worker import PretendWorker, failure
+from stickslip_testing.worker import DirectApi, PretendWorker, failure
 
 pytestmark = pytest.mark.databases(slow=True)
 
@@ -84,10 +87,10 @@ def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
 
 def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
     settings = Settings(data=tmp_path / "data", store=str(disk / "store"), durable=False, min_free_bytes=0)
-    coordinator = Coordinator(settings, ManualClock())
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
+    context = Context.open(settings, ManualClock())
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
     (lease,) = worker.lease(simulate=1)
     subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
     with pytest.raises(OSError, match="Read-only") as raised:  # what a worker meets
@@ -95,63 +98,63 @@ def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
     assert raised.value.errno == errno.EROFS
     worker.report((lease, failure(Reason.store_unavailable, str(raised.value))))
     assert worker.lease() == ()
-    coordinator.sweep()
-    shown = show_job(coordinator, job)
+    sweep(context)
+    shown = show_job(context, job)
     assert shown.reason is Reason.store_unavailable
     assert "Read-only file system" in shown.message
     subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
-    coordinator.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
-    coordinator.sweep()
+    context.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
+    sweep(context)
     worker.work()
-    assert show_job(coordinator, job).state is JobState.succeeded
-    coordinator.close()
+    assert show_job(context, job).state is JobState.succeeded
+    context.close()
 
 
-def test_a_store_that_is_a_file_pauses_the_job(coordinator: Coordinator, worker: PretendWorker) -> None:
+def test_a_store_that_is_a_file_pauses_the_job(context: Context, worker: PretendWorker) -> None:
     """Works without root: whatever keeps the store from being written is told with its reason."""
-    root = Path(coordinator.settings.store_place)
+    root = Path(context.settings.store_place)
     if root.exists():
         root.rmdir()
     root.write_text("in the way")
-    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
-    coordinator.sweep()
-    shown = show_job(coordinator, job)
+    job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
+    sweep(context)
+    shown = show_job(context, job)
     assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
     assert "File exists" in shown.message
     root.unlink()
-    coordinator.sweep()
-    assert show_job(coordinator, job).state is JobState.queued
-    assert show_job(coordinator, job).message == ""
+    sweep(context)
+    assert show_job(context, job).state is JobState.queued
+    assert show_job(context, job).message == ""
 
 
 def test_a_store_that_only_a_worker_cannot_use_costs_no_try(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock
+    context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    job = coordinator.submit(parsed(rods(gamma=(1.0,), phi1=(1.0,))), None).id  # type: ignore[union-attr]
-    for _ in range(2 * coordinator.settings.max_tries):
+    job = submit_job(context, parsed(rods(gamma=(1.0,), phi1=(1.0,))), None).id  # type: ignore[union-attr]
+    for _ in range(2 * context.settings.max_tries):
         (lease,) = worker.lease()
         worker.start(lease)
         worker.report((lease, failure(Reason.store_unavailable, "Permission denied")))
         assert worker.lease() == ()
-        coordinator.sweep()
-        shown = show_job(coordinator, job)
+        sweep(context)
+        shown = show_job(context, job)
         assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
         assert "worker pretend cannot use the store: Permission denied" in shown.message
         with pytest.raises(ConflictError, match="goes on by itself"):
-            coordinator.resume(job)
+            resume_job(context, job)
         clock.advance(HOLD_SECONDS + 1)
-        coordinator.sweep()
-        assert show_job(coordinator, job).state is JobState.running
+        sweep(context)
+        assert show_job(context, job).state is JobState.running
     worker.work()
-    assert show_job(coordinator, job).state is JobState.succeeded
+    assert show_job(context, job).state is JobState.succeeded
 
 
-def test_who_pauses_a_waiting_job_keeps_it_paused(coordinator: Coordinator, worker: PretendWorker) -> None:
-    job = coordinator.submit(parsed(rods()), None).id  # type: ignore[union-attr]
-    coordinator.store_watch.note("it is full")
-    coordinator.sweep()
-    assert show_job(coordinator, job).reason is Reason.store_unavailable
-    assert coordinator.pause(job).reason is None
-    coordinator.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
-    coordinator.sweep()
-    assert show_job(coordinator, job).state is JobState.paused
+def test_who_pauses_a_waiting_job_keeps_it_paused(context: Context, worker: PretendWorker) -> None:
+    job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
+    context.store_watch.note("it is full")
+    sweep(context)
+    assert show_job(context, job).reason is Reason.store_unavailable
+    assert pause_job(context, job).reason is None
+    context.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
+    sweep(context)
+    assert show_job(context, job).state is JobState.paused

@@ -50,7 +50,7 @@ class Up:
         return [int(line.split()[0]) for line in self.log.read_text().splitlines()] if self.log.exists() else []
 
     def coordinator(self) -> int:
-        needle = f"stickslip_services.coordinator\0--data\0{self.data}\0".encode()
+        needle = f"stickslip_services.app\0--data\0{self.data}\0".encode()
         for entry in Path("/proc").iterdir():
             try:
                 if entry.name.isdecimal() and needle in (entry / "cmdline").read_bytes():

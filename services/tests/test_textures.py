@@ -16,11 +16,12 @@ from stickslip_services.cli import app
 from stickslip_services.client import Client
 from stickslip_services.client.errors import ProblemError
 from stickslip_services.errors import UnknownTextureError
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.unused import unused
+from stickslip_services.queue.cleanup import unused
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import parsed
 from stickslip_testing.servers import RunningServer
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 from typer.testing import CliRunner
 
 KINDS = ("rod_hang", "cloth_drag")
@@ -111,9 +112,9 @@ def test_the_command_line_uploads_and_says_what_to_write(
         assert (failed.exit_code, rule in failed.stderr) == (1, True), failed.output
 
 
-def test_renders_of_one_trace_name_their_pictures(coordinator: Coordinator) -> None:
-    worker = PretendWorker(coordinator, coordinator.store, kinds=KINDS).register()
-    digest = coordinator.store.publish(_png())
+def test_renders_of_one_trace_name_their_pictures(context: Context) -> None:
+    worker = PretendWorker(DirectApi(context), context.store, kinds=KINDS).register()
+    digest = context.store.publish(_png())
     seen: list[str] = []
 
     def look(task: Any) -> None:
@@ -121,17 +122,17 @@ def test_renders_of_one_trace_name_their_pictures(coordinator: Coordinator) -> N
             seen.append(task.render.variant)
 
     worker.judge = look
-    job = coordinator.submit(parsed(_spec(f"sha256:{digest}")), None)
+    job = submit_job(context, parsed(_spec(f"sha256:{digest}")), None)
     assert isinstance(job, JobDetail)
     worker.work()
     assert sorted(seen) == ["dots", f"sha256:{digest}"]
 
 
-def test_a_texture_that_a_job_names_is_kept(coordinator: Coordinator) -> None:
+def test_a_texture_that_a_job_names_is_kept(context: Context) -> None:
     """Also of a job that waits for the first worker, and so has no tasks yet."""
-    kept, other = (coordinator.store.publish(_png(seed=seed)) for seed in (3, 4))
-    coordinator.submit(parsed(_spec(f"sha256:{kept}")), None)
+    kept, other = (context.store.publish(_png(seed=seed)) for seed in (3, 4))
+    submit_job(context, parsed(_spec(f"sha256:{kept}")), None)
     with pytest.raises(UnknownTextureError, match="/textures/logo: must name a texture that was uploaded"):
-        coordinator.submit(parsed(_spec(f"sha256:{'1' * 64}")), None)
-    found = [file.name for file in unused(coordinator.database, coordinator.store, older_than=-1)]
+        submit_job(context, parsed(_spec(f"sha256:{'1' * 64}")), None)
+    found = [file.name for file in unused(context.database, context.store, older_than=-1)]
     assert found == [other]

@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 
 from stickslip_schemas import tracing
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import parsed, rods
 from stickslip_testing.worker import PretendWorker
 
@@ -13,8 +14,8 @@ HOST = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 """A traceparent as a program sends it that submits jobs [W3C Trace Context, 3.2]."""
 
 
-def test_without_a_collector_nothing_is_traced(coordinator: Coordinator, worker: PretendWorker) -> None:
-    coordinator.submit(parsed(rods()), None, traceparent=HOST)
+def test_without_a_collector_nothing_is_traced(context: Context, worker: PretendWorker) -> None:
+    submit_job(context, parsed(rods()), None, traceparent=HOST)
     assert not tracing.is_on()
     assert {lease.traceparent for lease in worker.lease()} == {None}
     with tracing.span("nothing", parent=HOST):
@@ -25,7 +26,7 @@ def test_without_a_collector_nothing_is_traced(coordinator: Coordinator, worker:
 def test_a_collector_without_the_packages_is_refused(tmp_path: Path) -> None:
     """The packages are hidden, so that it is tested where they are installed, too."""
     code = (
-        "import sys; sys.modules['opentelemetry.sdk'] = None; from stickslip_services.coordinator import main;"
+        "import sys; sys.modules['opentelemetry.sdk'] = None; from stickslip_services.app import main;"
         "sys.exit(main(sys.argv[1:]))"
     )
     ended = subprocess.run(

@@ -15,13 +15,15 @@ from stickslip_services.cli import app
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
 from stickslip_services.local.process import locked
-from stickslip_services.queue.audit import audit
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.reindexing import reindex
-from stickslip_services.queue.unused import unused
+from stickslip_services.queue.cleanup import unused
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.reindex import reindex
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
-from stickslip_testing.worker import PretendWorker
+from stickslip_testing.worker import DirectApi, PretendWorker
 from typer.testing import CliRunner, Result
 
 pytestmark = pytest.mark.databases(slow=True)
@@ -29,9 +31,9 @@ pytestmark = pytest.mark.databases(slow=True)
 DAY = 24 * 3600.0
 
 
-def submitted(coordinator: Coordinator, gamma: tuple[float, ...]) -> JobDetail:
+def submitted(context: Context, gamma: tuple[float, ...]) -> JobDetail:
     """Submit rods, and return the job."""
-    job = coordinator.submit(parsed(rods(gamma=gamma)), None)
+    job = submit_job(context, parsed(rods(gamma=gamma)), None)
     assert isinstance(job, JobDetail)
     return job
 
@@ -39,19 +41,19 @@ def submitted(coordinator: Coordinator, gamma: tuple[float, ...]) -> JobDetail:
 @pytest.fixture
 def made(settings: Settings) -> list[str]:
     """Two datasets that share two of their four simulations each; return their ids. The coordinator has ended."""
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    worker = PretendWorker(coordinator, coordinator.store).register()
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
     ids = []
     for gamma in ((1.0, 2.0), (2.0, 3.0)):
-        job = submitted(coordinator, gamma)
+        job = submitted(context, gamma)
         worker.work()
-        dataset = show_job(coordinator, job.id).dataset
+        dataset = show_job(context, job.id).dataset
         assert dataset is not None
         ids.append(dataset.dataset)
-    for file in unused(coordinator.database, coordinator.store, older_than=-1):
-        coordinator.store.delete(file.name)  # a pretended worker leaves something behind
-    coordinator.close()
+    for file in unused(context.database, context.store, older_than=-1):
+        context.store.delete(file.name)  # a pretended worker leaves something behind
+    context.close()
     return ids
 
 
@@ -70,20 +72,20 @@ def age(settings: Settings, seconds: float) -> None:
             os.utime(path, (time.time() - seconds,) * 2)
 
 
-def look(settings: Settings) -> tuple[list[str], list[Any], Coordinator]:
-    coordinator = Coordinator(settings)
-    coordinator.start()
-    with coordinator.database.read() as connection:
-        return audit(connection), list(list_datasets(coordinator)), coordinator
+def look(settings: Settings) -> tuple[list[str], list[Any], Context]:
+    context = Context.open(settings)
+    start(context)
+    with context.database.read() as connection:
+        return violations(connection), list(list_datasets(context)), context
 
 
 def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -> None:
     before = artifacts(settings)
-    _, datasets, coordinator = look(settings)
+    _, datasets, context = look(settings)
     for dataset in datasets:
         (version,) = dataset.versions
-        assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
-    coordinator.close()
+        assert damaged_files(context.store, version.manifest, version.group) == frozenset()
+    context.close()
     age(settings, 30 * DAY)
     result = run(settings, "gc", "--delete", "--older-than", 0)
     assert result.exit_code == 0, result.stderr
@@ -106,13 +108,13 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
     after = artifacts(settings)
     assert 0 < len(after) < len(before)
     assert sum(after.values()) < sum(before.values())
-    faults, datasets, coordinator = look(settings)
+    faults, datasets, context = look(settings)
     assert faults == []
     assert [dataset.id for dataset in datasets] == [second]
     (version,) = datasets[0].versions
-    assert damaged_files(coordinator.store, version.manifest, version.group) == frozenset()
-    assert len(list_jobs(coordinator)) == 1
-    coordinator.close()
+    assert damaged_files(context.store, version.manifest, version.group) == frozenset()
+    assert len(list_jobs(context)) == 1
+    context.close()
 
 
 def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) -> None:
@@ -120,17 +122,17 @@ def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) ->
     content = manifest.read_bytes()
     run(settings, "rm", f"{made[0]}:v1")
     run(settings, "gc", "--delete", "--older-than", 0)
-    _, _, coordinator = look(settings)
-    worker = PretendWorker(coordinator, coordinator.store).register()
-    job = submitted(coordinator, (1.0, 2.0))
+    _, _, context = look(settings)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submitted(context, (1.0, 2.0))
     worker.work()
-    assert show_job(coordinator, job.id).state == JobState.succeeded
+    assert show_job(context, job.id).state == JobState.succeeded
     simulated = [task for task in worker.ran if task.startswith("simulate")]
     assert len(simulated) == 2  # the two that the other dataset does not share
     assert manifest.read_bytes() == content
-    with coordinator.database.read() as connection:
-        assert audit(connection) == []
-    coordinator.close()
+    with context.database.read() as connection:
+        assert violations(connection) == []
+    context.close()
 
 
 def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
@@ -165,9 +167,9 @@ def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(setting
 
 
 def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[str]) -> None:
-    _, datasets, coordinator = look(settings)
-    coordinator.close()
-    coordinator.store.delete(datasets[0].versions[0].manifest)
+    _, datasets, context = look(settings)
+    context.close()
+    context.store.delete(datasets[0].versions[0].manifest)
     before = artifacts(settings)
     result = run(settings, "gc", "--delete", "--older-than", 0)
     assert result.exit_code == 1
@@ -176,12 +178,12 @@ def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[
 
 
 def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: list[str]) -> None:
-    _, datasets, coordinator = look(settings)
-    PretendWorker(coordinator, coordinator.store).register()
+    _, datasets, context = look(settings)
+    PretendWorker(DirectApi(context), context.store).register()
     (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
-    coordinator.store.delete(version.manifest)  # so that a job makes it once more
-    again = submitted(coordinator, (1.0, 2.0))
-    coordinator.close()
+    context.store.delete(version.manifest)  # so that a job makes it once more
+    again = submitted(context, (1.0, 2.0))
+    context.close()
     result = run(settings, "rm", f"{made[0]}:v1")
     assert result.exit_code == 1
     assert f"the job {again.id} is" in result.stderr

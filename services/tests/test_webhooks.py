@@ -15,14 +15,15 @@ from stickslip_services.access.webhooks import (
     CLAIM_SECONDS,
     GIVE_UP_SECONDS,
     WAITS,
-    Messenger,
+    WebhookDelivery,
     create_webhook,
     list_webhooks,
     retry_webhook,
 )
 from stickslip_services.cli import app
 from stickslip_services.errors import SettingsError
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import ManualClock, parsed, rods
 from stickslip_testing.servers import RunningServer, wait_until
 from stickslip_testing.worker import PretendWorker
@@ -72,19 +73,19 @@ def receiver() -> Iterator[Receiver]:
 
 
 @pytest.fixture
-def messenger(coordinator: Coordinator) -> Messenger:
-    return Messenger(coordinator.database, coordinator.clock)
+def messenger(context: Context) -> WebhookDelivery:
+    return WebhookDelivery(context.database, context.clock)
 
 
-def made(coordinator: Coordinator, url: str) -> tuple[str, str]:
+def made(context: Context, url: str) -> tuple[str, str]:
     """Make a webhook; return its id and its secret."""
-    with coordinator.database.write() as connection:
-        webhook, secret = create_webhook(connection, url, coordinator.clock())
+    with context.database.write() as connection:
+        webhook, secret = create_webhook(connection, url, context.clock())
     return webhook.id, secret
 
 
-def run_job(coordinator: Coordinator, worker: PretendWorker, gamma: float) -> None:
-    coordinator.submit(parsed(rods(gamma=(gamma,), name="of-a-test")), None)
+def run_job(context: Context, worker: PretendWorker, gamma: float) -> None:
+    submit_job(context, parsed(rods(gamma=(gamma,), name="of-a-test")), None)
     worker.work()
 
 
@@ -92,15 +93,15 @@ ONE_JOB = [("job.state", "running"), ("dataset.published", "v1"), ("job.state", 
 
 
 def test_what_happens_is_told_in_order_and_signed(
-    coordinator: Coordinator, worker: PretendWorker, messenger: Messenger, receiver: Receiver
+    context: Context, worker: PretendWorker, messenger: WebhookDelivery, receiver: Receiver
 ) -> None:
-    run_job(coordinator, worker, 1.0)  # before anybody wanted to know
-    name, secret = made(coordinator, receiver.url)
-    messenger.deliver()
+    run_job(context, worker, 1.0)  # before anybody wanted to know
+    name, secret = made(context, receiver.url)
+    messenger.run()
     assert receiver.told == []
-    run_job(coordinator, worker, 2.0)
-    messenger.deliver()
-    messenger.deliver()
+    run_job(context, worker, 2.0)
+    messenger.run()
+    messenger.run()
     assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
     ids = [headers["webhook-id"] for headers, _ in receiver.received]
     assert len(set(ids)) == len(ids)
@@ -116,67 +117,67 @@ def test_what_happens_is_told_in_order_and_signed(
 
 
 def test_a_message_that_fails_holds_up_the_others_and_is_sent_again(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
 ) -> None:
-    made(coordinator, receiver.url)
+    made(context, receiver.url)
     receiver.status = 500
-    run_job(coordinator, worker, 1.0)
+    run_job(context, worker, 1.0)
     for wait in (*WAITS, WAITS[-1]):
         before = len(receiver.received)
-        messenger.deliver()
-        messenger.deliver()
+        messenger.run()
+        messenger.run()
         assert len(receiver.received) == before + 1
         clock.advance(wait - 1)
-        messenger.deliver()
+        messenger.run()
         assert len(receiver.received) == before + 1
         clock.advance(1)
     assert len({headers["webhook-id"] for headers, _ in receiver.received}) == 1
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         (shown,) = list_webhooks(connection, clock())
     assert (shown.failures, shown.is_given_up) == (len(WAITS) + 1, False)
     assert shown.fault == "the receiver answered 500, and 2xx was expected"
     receiver.status = 200
     receiver.received.clear()
-    messenger.deliver()
+    messenger.run()
     assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         (shown,) = list_webhooks(connection, clock())
     assert (shown.failures, shown.failing_since, shown.fault) == (0, None, "")
 
 
 def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherwise(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
 ) -> None:
-    name, _ = made(coordinator, receiver.url)
+    name, _ = made(context, receiver.url)
     receiver.status = 503
-    run_job(coordinator, worker, 1.0)
+    run_job(context, worker, 1.0)
     end = clock() + GIVE_UP_SECONDS
     while clock() <= end:
-        messenger.deliver()
+        messenger.run()
         clock.advance(WAITS[-1])
     receiver.status = 200
     receiver.received.clear()
-    messenger.deliver()
+    messenger.run()
     assert receiver.received == []
-    with coordinator.database.write() as connection:
+    with context.database.write() as connection:
         assert list_webhooks(connection, clock())[0].is_given_up
         retry_webhook(connection, name, clock())
-    messenger.deliver()
+    messenger.run()
     assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
 
 
 def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one_dies(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
 ) -> None:
-    made(coordinator, receiver.url)
-    run_job(coordinator, worker, 1.0)
-    other = Messenger(coordinator.database, coordinator.clock)
+    made(context, receiver.url)
+    run_job(context, worker, 1.0)
+    other = WebhookDelivery(context.database, context.clock)
     with messenger._claimed(1) as is_ours:  # and here it is killed
         assert is_ours
-    other.deliver()
+    other.run()
     assert receiver.received == []
     clock.advance(CLAIM_SECONDS)
-    threads = [threading.Thread(target=one.deliver) for one in (messenger, other)]
+    threads = [threading.Thread(target=one.run) for one in (messenger, other)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -185,21 +186,21 @@ def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one
 
 
 def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
-    coordinator: Coordinator, worker: PretendWorker, clock: ManualClock, messenger: Messenger, receiver: Receiver
+    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
 ) -> None:
     receiver.close()
-    made(coordinator, receiver.url)
-    run_job(coordinator, worker, 1.0)
-    messenger.deliver()
-    with coordinator.database.read() as connection:
+    made(context, receiver.url)
+    run_job(context, worker, 1.0)
+    messenger.run()
+    with context.database.read() as connection:
         (shown,) = list_webhooks(connection, clock())
     assert "ConnectError" in shown.fault
 
 
 @pytest.mark.parametrize("url", ["http://example.org/hook", "ftp://127.0.0.1/", "https://", "hook", "http://[", ""])
-def test_urls_that_anybody_could_read_are_refused(coordinator: Coordinator, url: str) -> None:
+def test_urls_that_anybody_could_read_are_refused(context: Context, url: str) -> None:
     with pytest.raises(SettingsError, match="url must be https"):
-        made(coordinator, url)
+        made(context, url)
 
 
 def test_the_command_line_makes_and_a_coordinator_delivers(

@@ -38,7 +38,7 @@ class Services:
         self.store = directory / "store"
         self._directory = directory
         self._processes: list[subprocess.Popen[bytes]] = []
-        self._start("coordinator", "stickslip_services.coordinator", "--data", directory, "--port", "0")
+        self._start("coordinator", "stickslip_services.app", "--data", directory, "--port", "0")
         found = self._wait_for_line("coordinator", r"listening on (http://\S+)")
         self.url = found[1]
 

@@ -45,9 +45,9 @@ class Settings(BaseSettings):
     max_tries: int = Field(default=3, ge=1)
     """Failed tries after which a task fails."""
     max_losses: int = Field(default=20, ge=1)
-    """Lost workers after which a task is set aside: such a loss is no failed try, but so many are no accident."""
+    """Lost workers after which a task is quarantined. A single loss does not count as a failed try."""
     max_quarantined: int = Field(default=10, ge=0)
-    """Tasks of a job that may be set aside; with one more the job fails at once."""
+    """Quarantined tasks of a job beyond which the job fails."""
     limit_floor_seconds: float = Field(default=60.0, gt=0)
     """No call is ended for its cost before this time [s], however little it was expected to take."""
     retry_seconds: float = Field(default=1.0, ge=0)

@@ -7,7 +7,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_services.catalog import datasets
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.queue import jobs
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import find_job
 
 
@@ -37,19 +37,19 @@ def parsed(spec: dict[str, Any]) -> Any:
     return job_spec_adapter.validate_python(spec)
 
 
-def show_job(coordinator: Coordinator, job_id: str) -> JobDetail:
+def show_job(context: Context, job_id: str) -> JobDetail:
     """Return a job."""
-    with coordinator.database.read() as connection:
-        return coordinator.show(connection, find_job(connection, job_id).seq)
+    with context.database.read() as connection:
+        return jobs.show_job(context, connection, find_job(connection, job_id).seq)
 
 
-def list_jobs(coordinator: Coordinator) -> tuple[Job, ...]:
+def list_jobs(context: Context) -> tuple[Job, ...]:
     """Return all jobs, newest first."""
-    with coordinator.database.read() as connection:
-        return jobs.list_jobs(connection, PageRequest(1000, None), ()).items
+    with context.database.read() as connection:
+        return jobs.list_jobs(context, connection, PageRequest(1000, None)).items
 
 
-def list_datasets(coordinator: Coordinator) -> tuple[Dataset, ...]:
+def list_datasets(context: Context) -> tuple[Dataset, ...]:
     """Return all datasets, newest first."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return datasets.list_datasets(connection, PageRequest(1000, None)).items

@@ -27,7 +27,7 @@ from stickslip_schemas.documents.worker_api import (
 )
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.api.connections import PatientProtocol
-from stickslip_services.coordinator import make_app
+from stickslip_services.app import make_app
 from stickslip_services.local.process import listen
 from stickslip_services.settings import Settings
 
@@ -127,7 +127,7 @@ def served(data: Path) -> Iterator[RunningServer]:
 
 def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> ServerProcess:
     """Start a coordinator in a separate process, which takes 2 s, and wait until it answers."""
-    command = [sys.executable, "-m", "stickslip_services.coordinator", "--data", str(data), "--port", str(port)]
+    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(data), "--port", str(port)]
     command += options
     log = (data.parent / f"{data.name}.log").open("ab")
     with log:

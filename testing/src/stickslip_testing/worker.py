@@ -4,6 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import prod
 from typing import Any
 
@@ -50,6 +51,9 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.lease import heartbeat, lease_tasks, register_worker
+from stickslip_services.queue.report import report_results
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
@@ -67,11 +71,21 @@ def rejection(message: str = "it diverged") -> TaskResult:
     return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
 
 
+class DirectApi:
+    """The four verbs of the worker API, as calls within this process."""
+
+    def __init__(self, context: Context) -> None:
+        self.register = partial(register_worker, context)
+        self.lease = partial(lease_tasks, context)
+        self.heartbeat = partial(heartbeat, context)
+        self.report = partial(report_results, context)
+
+
 @dataclass
 class PretendWorker:
     """Does what a dispatcher does, at once and with made-up data that the store really holds."""
 
-    api: Any  # a Coordinator, or what has its four verbs
+    api: Any  # DirectApi or HttpApi
     store: Store
     name: str = "pretend"
     builds: Builds = BUILDS

@@ -88,7 +88,7 @@ class Reason(StrEnum):
 
     @property
     def ends_a_process(self) -> bool:
-        """True where a task took its process with it; one that does so again and again is set aside."""
+        """True where a task took its process with it; one that does so again and again is quarantined."""
         return self in _ENDING
 
     @property

@@ -1,8 +1,8 @@
-"""Webhooks: the coordinator tells other programs, by HTTP, that a job has another state or that a dataset is there.
+"""Webhooks: URLs that receive job events, i.e. changes of a job's state and published datasets.
 
-Messages are signed as Standard Webhooks says [standardwebhooks.com, 1.0.0]. A webhook has a position among the events,
-so nothing that has happened is forgotten, whoever is killed, and what happened first is told first. A message may come
-twice; `webhook-id` is then the same.
+Messages are signed according to Standard Webhooks 1.0.0 [standardwebhooks.com]. A webhook stores its position in the
+sequence of events, so events arrive in order, and none is lost when a process is killed. A message may arrive twice,
+with the same `webhook-id`.
 """
 
 import json
@@ -30,19 +30,19 @@ from stickslip_services.errors import NotFoundError, SettingsError
 logger = logging.getLogger(__name__)
 
 ANSWER_SECONDS = 15.0
-"""How long a receiver may take to answer [s]."""
+"""Timeout of the receiver's answer [s]."""
 
 CLAIM_SECONDS = 60.0
-"""For how long the other coordinators leave a webhook to the one that is at it [s]."""
+"""Duration of a coordinator's claim on a webhook [s]."""
 
 WAITS = (5.0, 60.0, 300.0, 1800.0, 7200.0, 21600.0)
-"""Waits between the tries of a message [s]; the last one again and again."""
+"""Waits between the tries of a message [s]; the last one repeats."""
 
 GIVE_UP_SECONDS = 5 * 24 * 3600.0
-"""A webhook that has failed for so long, again and again, is told nothing any more [s]."""
+"""A webhook that has failed for this long receives no further messages [s]."""
 
 TOLD = (EventName.job_state, EventName.dataset_published)
-"""Which events are told."""
+"""Events that are delivered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Webhook:
 
 
 def create_webhook(connection: Connection, url: str, now: float) -> tuple[Webhook, str]:
-    """Make a webhook for what happens from now on; return it and its secret. Raise SettingsError for a bad URL."""
+    """Make a webhook for events from now on; return it and its secret. Raise SettingsError for a bad URL."""
     _check(url)
     secret = f"whsec_{b64encode(secrets.token_bytes(32)).decode()}"
     name = f"hook-{secrets.token_hex(8)}"
@@ -90,7 +90,7 @@ def list_webhooks(connection: Connection, now: float) -> list[Webhook]:
 
 
 def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
-    """Try again at once, also where the webhook was given up; raise NotFoundError."""
+    """Retry a webhook at once, even if it was given up; raise NotFoundError."""
     _find(connection, webhook_id)
     values = {"next_at": now, "failures": 0, "failing_since": None}
     connection.execute(update(webhooks).where(webhooks.c.id == webhook_id).values(values))
@@ -98,13 +98,13 @@ def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
 
 
 def delete_webhook(connection: Connection, webhook_id: str, now: float) -> None:
-    """Forget a webhook; raise NotFoundError."""
+    """Delete a webhook; raise NotFoundError."""
     _find(connection, webhook_id)
     connection.execute(delete(webhooks).where(webhooks.c.id == webhook_id))
     note(connection, "webhook.delete", webhook_id, now)
 
 
-class Messenger:
+class WebhookDelivery:
     """Delivers messages; several coordinators may do so on one database."""
 
     def __init__(self, database: Database, clock: Clock) -> None:
@@ -113,11 +113,11 @@ class Messenger:
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """Let `deliver` end after the message that it is at."""
+        """Let `run` end after the current message."""
         self._stopping.set()
 
-    def deliver(self) -> None:
-        """Deliver to every webhook whose time has come all that it has not been told."""
+    def run(self) -> None:
+        """Deliver all events that webhooks have not received, unless they wait for a retry."""
         with self._database.read() as connection:
             due = connection.scalars(select(webhooks.c.seq).where(_is_due(self._clock()))).all()
             behind = [seq for seq in due if _next_message(connection, seq) is not None]
@@ -128,7 +128,7 @@ class Messenger:
 
     @contextmanager
     def _claimed(self, seq: int) -> Iterator[bool]:
-        """Keep the other coordinators off a webhook."""
+        """Claim a webhook for this coordinator; yield False where another one has it."""
         until = self._clock() + CLAIM_SECONDS
         with self._database.write() as connection:
             due = and_(webhooks.c.seq == seq, _is_due(self._clock()))
@@ -174,7 +174,7 @@ def _is_due(now: float) -> ColumnElement[bool]:
 
 
 def _next_message(connection: Connection, seq: int) -> _Message | None:
-    """Return the first message that a webhook has not been told; None where it has been told everything."""
+    """Return the first message that a webhook has not received; None where it has received all."""
     position = select(webhooks.c.position).where(webhooks.c.seq == seq).scalar_subquery()
     found = connection.execute(
         select(events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name)
@@ -195,7 +195,7 @@ def _next_message(connection: Connection, seq: int) -> _Message | None:
 
 
 def _send(url: str, secret: str, message_id: str, body: str, now: float) -> str:
-    """Send a message; return what went wrong, or nothing."""
+    """Send a message; return the fault, or an empty string."""
     headers = {
         "Content-Type": "application/json",
         "webhook-id": message_id,

@@ -1,29 +1,22 @@
 """Metrics for Prometheus: the queue and the store, read when somebody asks, and what went by since the start."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
-from sqlalchemy import Connection, func, select
+from sqlalchemy import func, select
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
-from stickslip_schemas.store import Store
 
 from stickslip_services import __version__
-from stickslip_services.database.database import Database
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
-from stickslip_services.queue.workers import RegisteredWorker, leased_counts
-
-EtaHeld = Mapping[tuple[str, bool], int]
-AliveWorkers = Callable[[Connection], list[RegisteredWorker]]
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.workers import alive_workers, leased_counts
 
 
 class _QueueCollector(Collector):
-    def __init__(self, database: Database, store: Store, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
-        self._database = database
-        self._store = store
-        self._alive_workers = alive_workers
-        self._eta_held = eta_held
+    def __init__(self, context: Context) -> None:
+        self._context = context
 
     def collect(self) -> Iterable[Metric]:
         tasks = GaugeMetricFamily("stickslip_tasks", "Tasks by stage and state", labels=["stage", "state"])
@@ -31,8 +24,8 @@ class _QueueCollector(Collector):
         leases = GaugeMetricFamily("stickslip_leases", "Tasks on lease by worker", labels=["worker"])
         workers = GaugeMetricFamily("stickslip_workers", "Workers that were heard of lately")
         slots = GaugeMetricFamily("stickslip_worker_slots", "Slots of the workers that were heard of lately")
-        with self._database.read() as connection:
-            alive = self._alive_workers(connection)
+        with self._context.database.read() as connection:
+            alive = alive_workers(self._context, connection)
             for stage, state, count in connection.execute(select(task_counts)):
                 tasks.add_metric([stage, state], count)
             for state, count in connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)):
@@ -43,7 +36,7 @@ class _QueueCollector(Collector):
         versions = GaugeMetricFamily("stickslip_dataset_versions", "Dataset versions", value=count)
         bytes_ = GaugeMetricFamily("stickslip_dataset_bytes", "Size of the files of all dataset versions", value=size)
         disk = GaugeMetricFamily("stickslip_store_disk_bytes", "Disk of the store", labels=["state"])
-        if (room := self._store.room()) is not None:
+        if (room := self._context.store.room()) is not None:
             disk.add_metric(["free"], room.free)
             disk.add_metric(["used"], room.used)
         for worker in alive:
@@ -55,7 +48,7 @@ class _QueueCollector(Collector):
             "Intervals of the time left that were noted every 5 s, by whether the job ended within; 80 % should hold",
             labels=["kind", "held"],
         )
-        for (kind, held_true), count in self._eta_held.items():
+        for (kind, held_true), count in self._context.eta_watch.held.items():
             etas.add_metric([kind, str(held_true).lower()], count)
         return [tasks, by_state, leases, workers, slots, versions, bytes_, disk, etas]
 
@@ -63,9 +56,9 @@ class _QueueCollector(Collector):
 class Metrics:
     """The metrics of one coordinator."""
 
-    def __init__(self, database: Database, store: Store, alive_workers: AliveWorkers, eta_held: EtaHeld) -> None:
+    def __init__(self, context: Context) -> None:
         self._registry = CollectorRegistry()
-        self._registry.register(_QueueCollector(database, store, alive_workers, eta_held))
+        self._registry.register(_QueueCollector(context))
         Info("stickslip", "The coordinator", registry=self._registry).info({"version": __version__})
         self._task_seconds = Histogram(
             "stickslip_task_seconds",

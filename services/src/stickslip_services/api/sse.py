@@ -1,23 +1,22 @@
-"""Event streams: what was written of a job since some event, then what happens, until the job ends.
+"""Event streams: the stored events of a job after a given one, then new events until the job ends.
 
-All watchers of a job share one feed, which alone looks into the database: a thousand watchers cost it no more than one.
-A feed holds no database connection while it waits, and it waits for the bell, not in a loop. Progress is a picture of
-the present, so it is not stored and does not have an id of its own: it carries that of the event before it.
+All watchers of a job share one feed, which alone reads the database, so a thousand watchers cost no more than one. A
+feed holds no database connection while it waits for the notifier. Progress is not stored and has no id of its own: it
+carries that of the event before it.
 """
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
 from fastapi.responses import StreamingResponse
-from sqlalchemy import Connection
 from starlette.concurrency import run_in_threadpool
-from stickslip_schemas.documents.responses import EventName, JobDetail, JobProgressEvent
+from stickslip_schemas.documents.responses import EventName, JobProgressEvent
 
-from stickslip_services.database.database import Database
-from stickslip_services.queue.bell import Bell
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import StoredEvent, read_events
+from stickslip_services.queue.jobs import show_job
 
 RECONNECT_MILLISECONDS = 1000
 KEEP_ALIVE_SECONDS = 15.0
@@ -42,17 +41,12 @@ OPENAPI = {
     }
 }
 
-Show = Callable[[Connection, int], JobDetail]
-"""Returns a job as a transaction sees it."""
-
 
 class Feeds:
     """The feeds of the jobs that are being watched. For one event loop."""
 
-    def __init__(self, database: Database, bell: Bell, show: Show) -> None:
-        self._database = database
-        self._bell = bell
-        self._show = show
+    def __init__(self, context: Context) -> None:
+        self._context = context
         self._feeds: dict[int, _Feed] = {}
 
     def stream(self, job: int, *, after: int) -> StreamingResponse:
@@ -63,7 +57,7 @@ class Feeds:
     async def _watch(self, job: int, cursor: int) -> AsyncIterator[bytes]:
         feed = self._feeds.get(job)
         if feed is None:
-            feed = self._feeds[job] = _Feed(self._database, self._bell, self._show, job, cursor)
+            feed = self._feeds[job] = _Feed(self._context, job, cursor)
         feed.watchers += 1
         try:
             async for message in feed.messages(cursor):
@@ -86,10 +80,8 @@ class _News:
 class _Feed:
     """What is known of a job, kept up to date while somebody watches."""
 
-    def __init__(self, database: Database, bell: Bell, show: Show, job: int, after: int) -> None:
-        self._database = database
-        self._bell = bell
-        self._show = show
+    def __init__(self, context: Context, job: int, after: int) -> None:
+        self._context = context
         self._job = job
         self._after = after
         """The events after this one, up to the last that there is, are in `_events`."""
@@ -145,15 +137,14 @@ class _Feed:
         return [event for event in older if event.id <= self._newest]  # what is newer comes with its progress
 
     def _read(self, after: int) -> list[StoredEvent]:
-        with self._database.read() as connection:
+        with self._context.database.read() as connection:
             return read_events(connection, self._job, after=after, limit=BATCH)
 
     def _look(self, *, with_progress: bool) -> _News:
-        with self._database.read() as connection:
+        with self._context.database.read() as connection:
             events = read_events(connection, self._job, after=self._newest, limit=BATCH)
-            shown = (
-                self._show(connection, self._job) if with_progress or any(event.is_last for event in events) else None
-            )
+            is_shown = with_progress or any(event.is_last for event in events)
+            shown = show_job(self._context, connection, self._job) if is_shown else None
         ended = shown is not None and not shown.state.is_open and len(events) < BATCH
         progress = None if shown is None else JobProgressEvent(progress=shown.progress).model_dump_json()
         return _News(events, progress, ended)
@@ -163,7 +154,7 @@ class _Feed:
         looked_at = -PROGRESS_SECONDS
         try:
             while not self._is_complete:
-                rung = self._bell.rung
+                seen = self._context.notifier.count
                 now = time.monotonic()
                 is_progress_due = now - looked_at >= PROGRESS_SECONDS
                 news = await run_in_threadpool(self._look, with_progress=is_progress_due)
@@ -172,10 +163,10 @@ class _Feed:
                 self._take(news)
                 if len(news.events) == BATCH or self._is_complete:
                     continue
-                # A busy queue rings all the time; a few looks a second are enough for people.
+                # A busy queue notifies all the time; a few looks a second are enough for people.
                 await asyncio.sleep(LOOK_SECONDS)
                 due_in = KEEP_ALIVE_SECONDS if is_progress_due else looked_at + PROGRESS_SECONDS - time.monotonic()
-                await self._bell.wait(rung, max(0.0, due_in))
+                await self._context.notifier.wait(seen, max(0.0, due_in))
         finally:
             self._tell()
 

@@ -1,4 +1,4 @@
-"""Certificates: taking them in and finding them."""
+"""Certificates: registering and finding them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,9 @@ from stickslip_schemas.documents.certificate import CertificateUpload
 from stickslip_schemas.documents.responses import CertificateEntry, Page
 from stickslip_schemas.store import Store
 
+from stickslip_services.access.audit_log import note
 from stickslip_services.clock import as_datetime
+from stickslip_services.database.database import Database
 from stickslip_services.database.paging import PageRequest, make_page
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import NotFoundError
@@ -26,15 +28,15 @@ class StoredCertificate:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """The full certificate of a preset and a build that was registered last, where it passed."""
+    """The newest full certificate of a preset and a build, if it passed."""
 
     digest: Sha256
     protocols: frozenset[str]
-    """Names of those that it has."""
+    """Names of its protocols."""
 
 
 def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Standing | None:
-    """Return the full certificate of a preset and a build that was registered last if it passed."""
+    """Return the newest full certificate of a preset and a build, if it passed."""
     columns = certificates.c
     row = connection.execute(
         select(columns.digest, columns.passed, columns.protocols)
@@ -45,20 +47,23 @@ def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) 
     return Standing(row.digest, frozenset(row.protocols.split())) if row is not None and row.passed else None
 
 
-def store_certificate(store: Store, upload: CertificateUpload) -> StoredCertificate:
-    """Write a certificate and its page into the store."""
+def register_certificate(database: Database, store: Store, upload: CertificateUpload, now: float) -> CertificateEntry:
+    """Store a certificate with its page, and register it; a known one becomes the newest again."""
     certificate = upload.certificate
-    return StoredCertificate(
+    stored = StoredCertificate(
         digest=certificate.digest,
         artifact=store.publish(certificate.canonical()),
         page=store.publish(upload.page.encode()),
     )
+    with database.write() as connection:
+        entry = _insert(connection, upload, stored, now)
+        note(connection, "certificate.register", entry.digest, now, preset=entry.preset, passed=entry.passed)
+        return entry
 
 
-def insert_certificate(
+def _insert(
     connection: Connection, upload: CertificateUpload, stored: StoredCertificate, now: float
 ) -> CertificateEntry:
-    """Register a certificate. One that is there already stays as it is, but it was measured last again."""
     protocols = " ".join(report.protocol for report in upload.certificate.protocols)
     if _find(connection, stored.digest) is not None:
         known = certificates.c.digest == stored.digest
@@ -90,7 +95,7 @@ def list_certificates(connection: Connection, page: PageRequest) -> Page[Certifi
 
 
 def find_certificate(connection: Connection, digest: str) -> StoredCertificate:
-    """Return where a certificate lies; raise NotFoundError."""
+    """Return the artifacts of a certificate; raise NotFoundError."""
     row = _found(connection, digest)
     return StoredCertificate(digest=row.digest, artifact=row.artifact, page=row.page)
 

@@ -69,7 +69,7 @@ def rm(
     if parts is None:
         raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {version!r}")
     with _owned(data, store, database) as (opened, files):
-        from stickslip_services.queue.removing import remove
+        from stickslip_services.queue.cleanup import remove
 
         removed = remove(opened, files, parts[1], int(parts[2]))
     typer.echo(f"{version} is removed, with {removed.jobs} jobs and {removed.tasks} results that no other job needs")
@@ -87,7 +87,7 @@ def gc(
     """Find the files of the store that nothing refers to, and delete them with --delete."""
     count = size = 0
     with _owned(data, store, database) as (opened, files):
-        from stickslip_services.queue.unused import unused
+        from stickslip_services.queue.cleanup import unused
 
         for file in unused(opened, files, older_than=3600 * older_than):
             count += 1
@@ -103,7 +103,7 @@ def reindex(data: StoppedDataOption = DEFAULT_DATA, store: StoreOption = None, d
     """Recover the datasets in the store after the database was lost. Known datasets stay as they are."""
     counts = Counter[str]()
     with _owned(data, store, database, is_new=True) as (opened, files):
-        from stickslip_services.queue.reindexing import reindex
+        from stickslip_services.queue.reindex import reindex
 
         for found in reindex(opened, files):
             if found.fault:

@@ -184,7 +184,7 @@ def print_line(stream: IO[str], message: str) -> None:
 
 
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:
-    module = "stickslip_services.coordinator"
+    module = "stickslip_services.app"
     place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
     place += [] if settings.store is None else ["--store", settings.store]
     auth = [f"--allow-host={host}" for host in settings.allowed_hosts]

@@ -1,7 +1,7 @@
 """Closing a ledger: counters follow the tasks, and jobs follow the counters.
 
-queued -> running at the first lease; cancelling -> cancelled, and pausing -> paused, when nothing of theirs runs any
-more; a job for which only tasks that were set aside are left -> failed; the endings that were noted come true.
+queued -> running at the first lease; cancelling -> cancelled, and pausing -> paused, when none of their tasks runs any
+more; a job of which only quarantined tasks are left -> failed; then the noted endings are applied.
 """
 
 from collections import Counter
@@ -13,8 +13,7 @@ from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks
-from stickslip_services.queue.costs import add_costs
-from stickslip_services.queue.eta import Run
+from stickslip_services.queue.eta import Run, add_costs
 from stickslip_services.queue.events import append_published, append_task_state, set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
@@ -67,13 +66,13 @@ def ledger(connection: Connection, now: float) -> Iterator[Ledger]:
 
 
 def close(book: Ledger) -> None:
-    """Bring counters and jobs up to date with what the ledger has noted."""
+    """Update counters and jobs from the moves and endings of the ledger."""
     given_up = _settle(book, frozenset())
     open_jobs = _OPEN_JOBS.tuples(book.connection)
     for job in _blocked_jobs(
         book.connection, [seq for seq, state, failed in open_jobs if state in _PLANNED and failed]
     ):
-        book.end_job(job, _set_aside(book.connection, job))
+        book.end_job(job, _quarantined(book.connection, job))
     _settle(book, given_up)
     _tell(book)
     for job, ending in book.endings.items():
@@ -84,7 +83,7 @@ def close(book: Ledger) -> None:
 
 
 def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
-    """Give up the tasks of jobs that end, and let the counters follow; return the jobs whose tasks are given up."""
+    """Give up the tasks of ending jobs, and update the counters; return the jobs whose tasks are given up."""
     for job in book.endings.keys() - given_up:
         give_up_tasks(book, job, ending=book.endings.keys())
     moves, book.moves = book.moves, []
@@ -100,15 +99,15 @@ def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
     return frozenset(book.endings)
 
 
-def _blocked_jobs(connection: Connection, set_aside: list[int]) -> list[int]:
-    """Return those of the planned jobs with tasks set aside for which nothing runs, and nothing can."""
-    if not set_aside:
+def _blocked_jobs(connection: Connection, quarantined: list[int]) -> list[int]:
+    """Return the planned jobs with quarantined tasks for which nothing runs, and nothing can be leased."""
+    if not quarantined:
         return []
     counts = job_counts.c
     busy = (TaskState.leased, TaskState.running, TaskState.soft_failed)
     idle = connection.scalars(
         select(counts.job)
-        .where(counts.job.in_(set_aside))
+        .where(counts.job.in_(quarantined))
         .group_by(counts.job)
         .having(func.sum(counts.count).filter(counts.state.in_(busy)) == 0)
     ).all()
@@ -116,8 +115,8 @@ def _blocked_jobs(connection: Connection, set_aside: list[int]) -> list[int]:
     return [job for job in idle if connection.scalar(ready.where(job_tasks.c.job == job).limit(1)) is None]
 
 
-def _set_aside(connection: Connection, job: int) -> Ending:
-    """Return how a job ends that has nothing left but tasks that were set aside, and what needs them."""
+def _quarantined(connection: Connection, job: int) -> Ending:
+    """Return the ending of a job of which only quarantined tasks, and their dependents, are left."""
     failed = (
         select(tasks.c.key, tasks.c.stage, tasks.c.message)
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)
@@ -127,7 +126,7 @@ def _set_aside(connection: Connection, job: int) -> Ending:
     rows = connection.execute(failed).all()
     first = rows[0]
     message = (
-        f"everything else is done, but {len(rows)} of its tasks were set aside; the first is "
+        f"everything else is done, but {len(rows)} of its tasks were quarantined; the first is "
         f"{task_id(first.stage, first.key)}: {first.message}. What is done is kept; submit the job again to try again"
     )
     return Ending(JobState.failed, Reason.quarantined, message)
@@ -229,7 +228,7 @@ def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, Ta
 
 
 def _finish_cancelling(connection: Connection, now: float) -> None:
-    """Let jobs that were being cancelled be so when no task that only they had is on lease any more."""
+    """Cancel the `cancelling` jobs of which no task is on lease any more, unless another live job needs it."""
     for job in _jobs_in(connection, JobState.cancelling):
         held = _held_tasks(connection, job)
         if not set(held) - live_jobs(connection, held).keys():
@@ -238,7 +237,7 @@ def _finish_cancelling(connection: Connection, now: float) -> None:
 
 
 def _finish_pausing(connection: Connection, now: float) -> None:
-    """Let jobs that were being paused be so when no task runs for them alone any more."""
+    """Pause the `pausing` jobs of which no task is on lease any more, unless a runnable job needs it."""
     for job in _jobs_in(connection, JobState.pausing):
         held = _held_tasks(connection, job)
         if not set(held) - runnable_tasks(connection, held):

@@ -3,33 +3,55 @@
 With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over k_g measured tasks,
 and p slots to run them on,
 
-    T     = sum_g n_g m_g / p,  but no less than  sum_s M_s  (over the stages that are left: one waits for the other)
+    T     = sum_g n_g m_g / p,  but no less than  sum_s M_s  (over the stages left, which run one after the other)
     var T = sum_g (n_g d_g^2 + n_g^2 d_g^2 / k_g + n_g^2 m_g^2 f^2) / p^2
 
-where M_s is the mean duration of what is left of stage s. A task that runs and tells counts as what is left of it.
+where M_s is the mean duration of the tasks left of stage s. A running task that reports its progress counts as the
+fraction that is left of it.
 
-The three terms: the spread of what is to come, the error of a mean of few, and a relative error f for what the model
-leaves out (slots that idle, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 % of a normal distribution.
+The three terms: the spread of the durations, the standard error of the mean, and a relative error f for what the model
+leaves out (idle slots, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 % of a normal distribution.
+
+The cost of a task is its share of the wall time of the call that made it; the call is what can hang.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-from stickslip_schemas.base.states import Stage
-from stickslip_schemas.documents.responses import Eta
+from sqlalchemy import Connection, select
+from stickslip_schemas.base.states import JobState, Stage
+from stickslip_schemas.documents.responses import Eta, Job
+
+from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.tables import cost_groups
 
 QUANTILE_80 = 1.2816
 MODEL_ERROR = 0.15  # f
 PACK_GUESS = 5.0
-"""How long a pack or publish task takes before one was measured [s]."""
-
+"""Assumed duration of a pack or publish task before one has been measured [s]."""
 
 MEASURED = 3
-"""Tasks of a group that must have been measured before their cost is gone by."""
+"""Measured tasks of a group that make its cost known."""
 
 LONG_CALL = 60.0
-"""Of calls that take longer [s] one is enough to go by."""
+"""One call that takes longer than this [s] makes a cost known."""
+
+KEPT_RUNS = 200
+"""The sums of a group are halved beyond this number of tasks, so that old measurements fade."""
+
+TIMES = 3.0
+"""Timeout of a call, as a multiple of its expected duration."""
+
+EVERY_SECONDS = 5.0
+"""Time between two records of the ETA of a job [s]."""
+
+MOST_NOTES = 2000
+"""Records of one job; beyond this, every other one is dropped."""
+
+_DONE = (JobState.succeeded, JobState.succeeded_with_rejects)
+_GOING_ON = (JobState.queued, JobState.running)
 
 Group = tuple[Stage, str, str]
 """Stage, kind and cost group."""
@@ -50,7 +72,7 @@ class StageTimings:
 
     @property
     def variance(self) -> float:
-        """Variance of a duration [s^2]; of a single one nothing is known, so it is taken as the mean squared."""
+        """Variance of a duration [s^2]; of a single one, the mean squared."""
         if self.count < 2:
             return self.mean**2
         return max(0.0, (self.squares - self.total * self.mean) / (self.count - 1))
@@ -58,7 +80,7 @@ class StageTimings:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A task that was really run: what it cost."""
+    """The measured cost of one task."""
 
     task: int
     stage: Stage
@@ -68,7 +90,7 @@ class Run:
     wall_seconds: float
     """Its share of the call that made it."""
     call_seconds: float | None
-    """The whole call; None where it is not to be gone by."""
+    """The whole call; None where it is not representative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,30 +102,30 @@ class Cost:
 
     @property
     def is_known(self) -> bool:
-        """True where there is enough to go by."""
+        """True where enough tasks have been measured."""
         return self.share.count >= MEASURED or (self.share.count > 0 and self.call.mean > LONG_CALL)
 
     @property
     def expected_call(self) -> float:
-        """How long a call may well take [s]: the mean and two standard deviations."""
+        """Expected duration of a slow call [s]: mean plus two standard deviations."""
         spread = self.call.variance if self.call.count > 1 else 0.0
         return float(self.call.mean + 2 * spread**0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class StageWork:
-    """Tasks that are left of a cost group, and how long such tasks took so far (None: it is not known)."""
+    """Tasks left of a cost group, and the durations of such tasks so far (None: unknown)."""
 
     left: float
     timings: StageTimings | None
 
 
 def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | None:
-    """Return the time that is left, or None where there is nothing to go by, or nothing left.
+    """Return the time left, or None where it is unknown or nothing is left.
 
-    Packing and publishing are a few short tasks at the end. Before the first of them has been measured they are taken
-    to last `PACK_GUESS`, or as long as the longest task that has been where that is less, give or take all of it;
-    simulations and renders are not guessed.
+    Packing and publishing are a few short tasks at the end. Until one has been measured they are assumed to take
+    `PACK_GUESS`, or the mean of the slowest measured group where that is less, with an error of 100 %. Simulations and
+    renders are not guessed.
     """
     left = {stage: rest for stage, items in work.items() if (rest := [item for item in items if item.left > 0])}
     if not left or slots < 1:
@@ -141,3 +163,105 @@ def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings
         return None
     mean = sum(share.total for share in found) / sum(share.count for share in found)
     return StageTimings(1, mean, mean**2)
+
+
+_ALL_COSTS = Prepared(select(cost_groups))
+
+
+def read_costs(connection: Connection) -> dict[Group, Cost]:
+    """Return the measured costs by group."""
+    return {
+        (Stage(stage), kind, group): Cost(
+            StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)
+        )
+        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in _ALL_COSTS.tuples(connection)
+    }
+
+
+def limit_seconds(cost: Cost | None, tries: int, *, floor: float) -> float | None:
+    """Return the timeout of a call [s], at least `floor`; each failed try doubles it. None: the cost is unknown."""
+    if cost is None or not cost.is_known:
+        return None
+    return float(max(floor, TIMES * cost.expected_call) * 2**tries)
+
+
+def long_groups(costs: Mapping[Group, Cost], stage: Stage, kind: str, at_most: float | None) -> list[str]:
+    """Return the cost groups of a stage and kind whose calls take longer than `at_most` seconds."""
+    if at_most is None:
+        return []
+    return [
+        group
+        for (of_stage, of_kind, group), cost in costs.items()
+        if (of_stage, of_kind) == (stage, kind) and cost.is_known and cost.call.mean > at_most
+    ]
+
+
+def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
+    """Add the costs of tasks; calls that are not representative are skipped."""
+    by_group: dict[Group, list[tuple[float, float]]] = {}
+    for run in runs:
+        if run.call_seconds is not None:
+            by_group.setdefault((run.stage, run.kind, run.cost_group), []).append((run.wall_seconds, run.call_seconds))
+    for (stage, kind, group), costs in by_group.items():
+        _ADD_TO_COST_GROUPS.run(
+            connection,
+            {
+                "stage": stage,
+                "kind": kind,
+                "cost_group": group,
+                "n": len(costs),
+                "wall": sum(wall for wall, _ in costs),
+                "wall2": sum(wall**2 for wall, _ in costs),
+                "call": sum(call for _, call in costs),
+                "call2": sum(call**2 for _, call in costs),
+            },
+        )
+
+
+_SUMS = ("wall_sum", "wall_squares", "call_sum", "call_squares")
+
+
+def _faded(column: str) -> str:
+    keep = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"
+    return f"{column} = cost_groups.{column} / ({keep}) + excluded.{column}"
+
+
+_ADD_TO_COST_GROUPS = Prepared(
+    "INSERT INTO cost_groups (stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, call_squares) "
+    "VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
+    "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET " + ", ".join(_faded(column) for column in ("count", *_SUMS))
+)
+
+
+class EtaWatch:
+    """Records the ETA of each running job every few seconds, and counts how often it held."""
+
+    def __init__(self) -> None:
+        self._notes: dict[str, list[tuple[float, float]]] = {}
+        self._next = float("-inf")
+        self.held: Counter[tuple[str, bool]] = Counter()
+        """Intervals by kind, and by whether the job ended within them."""
+
+    def is_due(self, now: float) -> bool:
+        """Return whether it is time for a record."""
+        return now >= self._next
+
+    @property
+    def watched(self) -> frozenset[str]:
+        """The jobs that have not ended."""
+        return frozenset(self._notes)
+
+    def look(self, jobs: Mapping[str, Job], now: float) -> None:
+        """Record the ETAs of jobs by id, and judge those of jobs that have ended."""
+        self._next = now + EVERY_SECONDS
+        for job in jobs.values():
+            if job.state in _GOING_ON and job.progress.eta is not None:
+                notes = self._notes.setdefault(job.id, [])
+                notes.append((now + job.progress.eta.low, now + job.progress.eta.high))
+                if len(notes) > MOST_NOTES:
+                    del notes[::2]
+            elif job.state not in _GOING_ON:  # what was paused, cancelled or has failed says nothing of durations
+                notes = self._notes.pop(job.id, [])
+                if job.state in _DONE and job.finished_at is not None:
+                    end = job.finished_at.timestamp()
+                    self.held.update((job.kind, low <= end <= high) for low, high in notes)

@@ -1,20 +1,55 @@
-"""What a plan is: the tasks and samples of a job, or of a piece of it, and what it is made with."""
+"""The plan of a job: its tasks simulate -> render -> pack -> publish, each keyed by what its result depends on.
 
+Planning is pure and slow, and runs outside any transaction. `planner` plans a job of many samples piece by piece.
+"""
+
+import gc
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from itertools import islice
+from typing import Any, NamedTuple
 
+from sqlalchemy import Connection
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Stage
+from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.points import Shard, publish_key, shards
 from stickslip_schemas.spec.jobs import JobSpec
+
+from stickslip_services.catalog.certificates import standing_certificate
+from stickslip_services.errors import PresetNotCertifiedError
+from stickslip_services.queue.workers import builds_for
+
+_SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
 
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """What a job is made with: the builds of the workers, and the certificate that vouches for them, if any does."""
+    """The builds of the workers that make a job, and the certificate of their physics, if there is one."""
 
     builds: Builds
     certificate: Sha256 | None
+
+
+def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
+    """Return builds and certificate for a job of `spec`, None where no worker has ever registered.
+
+    Raises KindNotAvailableError where no worker makes the kind, UnknownKindError where its class is not registered,
+    and PresetNotCertifiedError where the spec needs a certificate and its preset has none that passed for the workers'
+    build with all protocols that the spec needs.
+    """
+    builds = builds_for(connection, registered(spec).kind)
+    if builds is None:
+        return None
+    standing = standing_certificate(connection, spec.certified_preset, builds.sim_core)
+    missing = [] if standing is None else [name for name in spec.certified_protocols if name not in standing.protocols]
+    certificate = None if standing is None or missing else standing.digest
+    if certificate is None and spec.needs_certificate:
+        raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core, missing)
+    return Terms(builds, certificate)
 
 
 class PlannedTask(NamedTuple):
@@ -41,7 +76,7 @@ class PlannedSample(NamedTuple):
 
 @dataclass(slots=True)
 class Plan:
-    """Tasks of a job by content key, in the order in which they should run, and samples: all, or those of a piece."""
+    """Tasks by content key, in the order of execution, and samples: of a whole job, or of one piece."""
 
     spec: JobSpec
     first: int
@@ -68,3 +103,90 @@ class Plan:
     def simulation_count(self) -> int:
         """Number of different simulations."""
         return sum(task.stage == Stage.simulate.value for task in self.tasks.values())
+
+
+@contextmanager
+def collector_at_rest() -> Iterator[None]:
+    """Disable the garbage collector while a plan grows.
+
+    A plan has a million small objects and no cycles; the search for cycles takes a fifth of the time.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def preview_slots(sample_count: int, previews: int) -> set[int]:
+    """Return the slots that are rendered with a preview: the first one, and the others evenly spread."""
+    count = min(sample_count, previews)
+    return {position * sample_count // count for position in range(count)}
+
+
+def expand(spec: JobSpec, terms: Terms, *, previews: int = 0) -> Plan:
+    """Return the whole plan of `spec` as one piece."""
+    return next(pieces(spec, terms, size=spec.sample_count, previews=previews))
+
+
+def pieces(
+    spec: JobSpec, terms: Terms, *, size: int, previews: int = 0, first: int = 0, packed: Sequence[str] = ()
+) -> Iterator[Plan]:
+    """Yield the plan of `spec` in pieces of whole shards, of about `size` samples each.
+
+    Together the pieces are the plan that `expand` returns, for any `size`. To continue from slot `first`, pass the keys
+    of the pack tasks before it as `packed`, in order.
+    """
+    per_shard = spec.samples_per_shard
+    previewed = preview_slots(spec.sample_count, previews)
+    pack_keys = list(packed)
+    waiting = shards(spec, terms.builds, first=first // per_shard)
+    while some := list(islice(waiting, -(-size // per_shard))):
+        yield _piece(spec, terms, some, previewed, pack_keys)
+
+
+def _piece(
+    spec: JobSpec,
+    terms: Terms,
+    some: Sequence[Shard],
+    previewed: set[int],
+    pack_keys: list[str],
+) -> Plan:
+    """Return the plan of some shards; add the keys of their pack tasks to `pack_keys`."""
+    builds = terms.builds
+    plan = Plan(spec, some[0].points[0].slot)
+    tasks_by_key = plan.tasks
+    packs: dict[bytes, PlannedTask] = {}
+    renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by shading: those that can be made together
+    for shard in some:
+        last: dict[bytes, None] = {}  # an ordered set: a grid may have one sample in two slots
+        for point in shard.points:
+            key = simulate = bytes.fromhex(point.simulation_key)
+            render: bytes | None = None
+            if simulate not in tasks_by_key:
+                cost = spec.cost_group(Stage.simulate, point.labels)
+                tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.simulate, point.simulation_text, cost_group=cost)
+            if point.render_key is not None and point.render_text is not None:
+                key = render = bytes.fromhex(point.render_key)
+                shared = (value for axis, value in point.labels.items() if axis != spec.variant_axis)
+                group = renders.setdefault((simulate, *shared), {})
+                if render not in group:
+                    preview = point.slot in previewed
+                    cost = spec.cost_group(Stage.render, point.labels)
+                    group[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview, cost)
+            last[key] = None
+            plan.samples.append(PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text))
+        pack_keys.append(shard.pack_key)
+        payload = json.dumps({"shard": shard.number})
+        packs[bytes.fromhex(shard.pack_key)] = PlannedTask(_PACK, builds.pack, payload, tuple(last))
+    for group in renders.values():
+        tasks_by_key.update(group)
+    tasks_by_key.update(packs)
+    if plan.is_last:
+        publish = bytes.fromhex(publish_key(spec, pack_keys, builds, terms.certificate))
+        payload = json.dumps({} if terms.certificate is None else {"certificate": terms.certificate})
+        depends_on = tuple(map(bytes.fromhex, pack_keys))
+        tasks_by_key[publish] = PlannedTask(_PUBLISH, builds.digest, payload, depends_on)
+    return plan

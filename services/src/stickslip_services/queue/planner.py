@@ -1,28 +1,32 @@
-"""Planning jobs of many samples in the background, piece by piece, each in a transaction of its own.
+"""Planning in the background: jobs that waited for the first worker, and jobs of many samples.
 
-Of several coordinators one plans a job at a time: it has claimed the job, and renews the claim with each piece. When it
-dies, another one, or its successor, goes on after the last piece that was written.
+A job of many samples is planned piece by piece, each piece in a transaction of its own. Of several coordinators one
+plans a job at a time: it claims the job, and renews the claim with each piece. When it dies, another coordinator, or
+its successor, continues after the last piece that was written.
 """
 
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas import tracing
-from stickslip_schemas.base.states import JobState, Stage
+from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 
-from stickslip_services.clock import Clock
-from stickslip_services.database.database import Database
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.plan import Plan, Terms
-from stickslip_services.queue.planning import collector_at_rest, pieces
-from stickslip_services.settings import Settings
+from stickslip_services.queue.jobs import unplanned_jobs
+from stickslip_services.queue.ledger import Ending
+from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, pieces, terms_for
+from stickslip_services.queue.write_plan import begin_planning, write_plan
 
 logger = logging.getLogger(__name__)
 
@@ -30,40 +34,66 @@ _WAITING = Prepared(select(jobs.c.seq).where(jobs.c.state == JobState.planning).
 
 
 def release_claims(connection: Connection) -> None:
-    """Let every job be planned by whoever comes first: for a coordinator that is alone, and so its own successor."""
+    """Release the claims of all planners; only for a coordinator that is alone on its database."""
     connection.execute(update(jobs).where(jobs.c.planner.is_not(None)).values(planner=None, planner_until=None))
+
+
+def plan_waiting_jobs(context: Context) -> None:
+    """Plan the jobs that were submitted before the first worker registered, or fail those that cannot be planned."""
+    with context.database.read() as connection:
+        waiting = unplanned_jobs(connection)
+    for row in waiting:
+        spec = job_spec_adapter.validate_json(row.spec)
+        terms: Terms | None = None
+        refusal, reason = "", Reason.waiting_for_worker
+        try:
+            with context.database.read() as connection:
+                terms = terms_for(connection, spec)
+            if terms is None:
+                return
+        except KindNotAvailableError as error:
+            refusal = str(error)
+        except PresetNotCertifiedError as error:
+            refusal, reason = str(error), Reason.preset_not_certified
+        at_once = spec.sample_count <= context.settings.plan_samples
+        plan = expand(spec, terms, previews=context.settings.previews_per_job) if terms and at_once else None
+        with context.database.write() as connection:
+            if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
+                continue  # cancelled, or planned by another coordinator
+            now = context.clock()
+            if terms is None:
+                set_job_state(connection, row.seq, JobState.failed, now, reason=reason, message=refusal)
+                continue
+            with ledger(connection, now) as book:
+                begin_planning(book, row.seq, terms)
+                if plan is not None:
+                    write_plan(book, row.seq, plan)
+                else:
+                    set_job_state(connection, row.seq, JobState.planning, now)
+        context.notifier.notify()
 
 
 class Planner:
     """Plans the jobs that are `planning`: those of the highest priority first, and of these the oldest."""
 
-    def __init__(
-        self,
-        database: Database,
-        clock: Clock,
-        settings: Settings,
-        ring: Callable[[], None],
-        *,
-        write: Callable[[Connection, int, Plan], None],
-        fail: Callable[[Connection, int, str], None],
-    ) -> None:
-        """`write` adds the tasks of a piece to a job, `fail` ends a job with a message, both within a transaction."""
-        self._database = database
-        self._clock = clock
-        self._settings = settings
-        self._ring = ring
-        self._write_piece, self._end_job = write, fail
+    def __init__(self, context: Context) -> None:
+        self._context = context
         self._name = new_id("planner")
         self._job: int | None = None
         self._end = 0
         self._pieces: Iterator[Plan] = iter(())
 
+    def run(self) -> None:
+        """Plan until no job is `planning`, or the coordinator closes."""
+        while not self._context.is_closing and self.step():
+            pass
+
     def step(self) -> bool:
         """Plan a piece of a job; return whether there was any to plan."""
-        with self._database.read() as connection:
+        with self._context.database.read() as connection:
             if _WAITING.scalar(connection) is None:
                 return False
-        with self._database.write() as connection:
+        with self._context.database.write() as connection:
             row = self._claim(connection)
             packed = [] if row is None or self._goes_on(row) else _pack_keys(connection, row.seq)
         if row is None:
@@ -79,15 +109,15 @@ class Planner:
         except Exception as error:
             self._job = None
             if isinstance(error, OSError | SQLAlchemyError):
-                raise  # the disk or the database: the next time it may go
+                raise  # the disk or the database: it may work the next time
             logger.exception("job %s cannot be planned", row.id)
             self._fail(row, error)
-        self._ring()
+        self._context.notifier.notify()
         return True
 
     def _claim(self, connection: Connection) -> Row[tuple[object, ...]] | None:
         """Claim a job that nobody plans, or whose claim is over, and return its row."""
-        now = self._clock()
+        now = self._context.clock()
         free = or_(jobs.c.planner.is_(None), jobs.c.planner == self._name, jobs.c.planner_until <= now)
         row = connection.execute(
             select(jobs)
@@ -96,7 +126,7 @@ class Planner:
             .limit(1)
         ).one_or_none()
         if row is not None:
-            until = now + self._settings.lease_seconds
+            until = now + self._context.settings.lease_seconds
             connection.execute(
                 update(jobs).where(jobs.c.seq == row.seq).values(planner=self._name, planner_until=until)
             )
@@ -111,26 +141,28 @@ class Planner:
         return pieces(
             job_spec_adapter.validate_json(row.spec),
             terms,
-            size=self._settings.plan_samples,
-            previews=self._settings.previews_per_job,
+            size=self._context.settings.plan_samples,
+            previews=self._context.settings.previews_per_job,
             first=row.planned,
             packed=packed,
         )
 
     def _write(self, job: int, piece: Plan) -> None:
-        with self._database.write() as connection:
+        with self._context.database.write() as connection:
             still = (jobs.c.seq == job, jobs.c.state == JobState.planning, jobs.c.planner == self._name)
             if connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
                 self._job = None  # paused, cancelled or failed meanwhile, or another coordinator goes on with it
                 return
-            self._write_piece(connection, job, piece)
+            with ledger(connection, self._context.clock()) as book:
+                write_plan(book, job, piece)
         self._end = piece.end
 
     def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
-        with self._database.write() as connection:
+        with self._context.database.write() as connection:
             if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                self._end_job(connection, row.seq, message)
+                with ledger(connection, self._context.clock()) as book:
+                    book.end_job(row.seq, Ending(JobState.failed, Reason.internal_error, message))
 
 
 def _pack_keys(connection: Connection, job: int) -> list[str]:

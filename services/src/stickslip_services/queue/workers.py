@@ -1,4 +1,4 @@
-"""Workers: dispatchers that have registered, and what they can run."""
+"""Workers: registered dispatchers, what they can run, and jobs that no connected worker can run."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, func, insert, select, text, update
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
@@ -17,13 +17,16 @@ from stickslip_services.clock import as_datetime
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id, task_id
+from stickslip_services.queue.ledger import RUNNABLE
 
 NO_WORKER = "no worker has registered yet; the job is planned when one does"
 
 
 def stage_builds(builds: Builds) -> dict[Stage, str]:
-    """Return what a worker must have, to the bit, to run a task of each stage."""
+    """Return the build that a worker needs to run a task, by stage."""
     return {
         Stage.simulate: builds.simulate,
         Stage.render: builds.render,
@@ -39,7 +42,7 @@ class RegisteredWorker:
     id: str
     name: str
     builds: Mapping[str, Builds]
-    """Of each kind that it makes."""
+    """Builds by kind."""
     slots: int
     versions: dict[str, str]
     registered_at: float
@@ -57,7 +60,7 @@ class RegisteredWorker:
 
 
 def insert_worker(connection: Connection, registration: WorkerRegistration, now: float) -> RegisteredWorker:
-    """Write a registration down; other sessions of the name are superseded."""
+    """Insert a registration; earlier sessions of the name are superseded."""
     connection.execute(update(workers).where(workers.c.name == registration.name).values(superseded=True))
     worker_id = new_id("worker")
     connection.execute(
@@ -94,7 +97,7 @@ _PRESENT_WORKERS = Prepared(
 
 
 def present_workers(connection: Connection, *, seen_since: float | None = None) -> list[RegisteredWorker]:
-    """Return the newest session of every name, newest first; with `seen_since`, those heard of since then."""
+    """Return the newest session of every name, newest first; with `seen_since`, those alive since then."""
     since = float("-inf") if seen_since is None else seen_since
     return [_worker(row) for row in _PRESENT_WORKERS.rows(connection, {"b_since": since})]
 
@@ -120,8 +123,13 @@ def other_sessions(connection: Connection, name: str) -> list[str]:
 
 
 def note_seen(connection: Connection, worker_id: str, now: float) -> None:
-    """Write down that a worker was heard of."""
+    """Store the time of a worker's last message."""
     connection.execute(update(workers).where(workers.c.id == worker_id).values(last_seen_at=now))
+
+
+def is_silent(context: Context, worker: RegisteredWorker) -> bool:
+    """Return whether a worker's last message is older than a quarter of a lease."""
+    return context.clock() - worker.last_seen_at > context.settings.lease_seconds / 4
 
 
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:
@@ -141,7 +149,7 @@ def leased_counts(connection: Connection) -> dict[str, int]:
 def running_tasks(
     connection: Connection, frames: Mapping[str, tuple[int, int]]
 ) -> dict[str, list[responses.RunningTask]]:
-    """Return the tasks on lease by worker, those that run longest first; `frames` are what simulations tell."""
+    """Return the tasks on lease by worker, the longest-running first; `frames` is the progress of simulations."""
     rows = connection.execute(
         select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
@@ -159,11 +167,14 @@ def running_tasks(
     return found
 
 
-def show_workers(
-    connection: Connection, *, alive_since: float, frames: Mapping[str, tuple[int, int]]
-) -> list[responses.WorkerEntry]:
+def alive_workers(context: Context, connection: Connection) -> list[RegisteredWorker]:
+    """Return the workers that have sent a message within the duration of a lease."""
+    return present_workers(connection, seen_since=context.alive_since)
+
+
+def show_workers(context: Context, connection: Connection) -> list[responses.WorkerEntry]:
     """Return the newest session of every worker as the API shows it."""
-    held = running_tasks(connection, frames)
+    alive_since, held = context.alive_since, running_tasks(connection, context.frames)
     return [
         responses.WorkerEntry(
             id=worker.id,
@@ -197,3 +208,52 @@ def _worker(row: Any) -> RegisteredWorker:
         last_seen_at=row.last_seen_at,
         superseded=bool(row.superseded),
     )
+
+
+_PLANNED_JOBS = Prepared(
+    select(jobs.c.seq, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
+        jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None)
+    )
+)
+
+
+def note_stranded(context: Context) -> None:
+    """Set reason and message of the jobs that no connected worker can run, and clear those of the others."""
+    with context.database.read() as connection:
+        if not _find_stranded(context, connection):
+            return
+    with context.database.write() as connection:
+        for job, message in _find_stranded(context, connection).items():
+            reason = Reason.waiting_for_worker if message else None
+            state = JobState(connection.execute(select(jobs.c.state).where(jobs.c.seq == job)).scalar_one())
+            set_job_state(connection, job, state, context.clock(), reason=reason, message=message)
+    context.notifier.notify()
+
+
+def _find_stranded(context: Context, connection: Connection) -> dict[int, str]:
+    """Return the planned jobs whose message must change, with the new message; empty for jobs that are served."""
+    alive = alive_workers(context, connection)
+    found = {}
+    for row in _PLANNED_JOBS.rows(connection):
+        message = _stranded_message(row.kind, Builds.model_validate_json(row.builds), alive)
+        if message != row.message and (message or row.reason == Reason.waiting_for_worker):
+            found[row.seq] = message
+    return found
+
+
+def _stranded_message(kind: str, builds: Builds, alive: list[RegisteredWorker]) -> str:
+    if not alive:
+        return "no worker is connected; the job goes on when one is"
+    makers = [worker for worker in alive if kind in worker.kinds]
+    if not makers:
+        return f"no connected worker makes {kind!r}; the job goes on when one does"
+    needed = stage_builds(builds)
+    missing = [
+        stage for stage, build in needed.items() if all(worker.stage_builds(kind)[stage] != build for worker in makers)
+    ]
+    if missing:
+        return (
+            f"no connected worker has the builds that this job was planned for (stages: {', '.join(missing)}); it goes "
+            "on when one has. To use the builds of today, cancel the job and submit it again."
+        )
+    return ""

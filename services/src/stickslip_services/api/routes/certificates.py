@@ -7,14 +7,11 @@ from stickslip_schemas.documents.certificate import CertificateUpload
 from stickslip_schemas.documents.responses import CertificateEntry, Page
 
 from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.files import OPENAPI_HEADERS, serve
-from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
-from stickslip_services.catalog.certificates import find_certificate, list_certificates
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.api.files import serve
+from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, PageDep, file_responses, problem_responses
+from stickslip_services.catalog.certificates import find_certificate, list_certificates, register_certificate
 
 router = APIRouter(tags=["certificates"])
-
-CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
 _CERTIFICATE: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Certificate"}}}
 _PAGE: dict[str, Any] = {"text/html": {"schema": {"type": "string"}}}
@@ -26,15 +23,6 @@ _INERT = {
 }
 
 
-def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
-    return {
-        200: {"description": "The file", "headers": OPENAPI_HEADERS, "content": content},
-        206: {"description": "The range that was asked for", "headers": OPENAPI_HEADERS, "content": content},
-        304: {"description": "The client has it already", "headers": OPENAPI_HEADERS},
-        **problem_responses(404, 416),
-    }
-
-
 @router.post(
     "/v1/certificates",
     status_code=201,
@@ -43,35 +31,35 @@ def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
 )
 def post_certificate(
     upload: Annotated[CertificateUpload, Depends(JsonBody(CertificateUpload))],
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     response: Response,
 ) -> CertificateEntry:
     """Register a certificate; it may be sent twice. Of a preset and build the full one that came last stands."""
-    entry = coordinator.add_certificate(upload)
+    entry = register_certificate(context.database, context.store, upload, context.clock())
     response.headers["Location"] = entry.href
     return entry
 
 
 @router.get("/v1/certificates", responses=problem_responses(422))
-def get_certificates(page: PageDep, coordinator: CoordinatorDep) -> Page[CertificateEntry]:
+def get_certificates(page: PageDep, context: ContextDep) -> Page[CertificateEntry]:
     """List certificates, newest first."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return list_certificates(connection, page)
 
 
-@router.get("/v1/certificates/{digest}", response_class=Response, responses=_file_responses(_CERTIFICATE))
-def get_certificate(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+@router.get("/v1/certificates/{digest}", response_class=Response, responses=file_responses(_CERTIFICATE))
+def get_certificate(digest: str, request: Request, context: ContextDep) -> Response:
     """Return a certificate."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         artifact = find_certificate(connection, digest).artifact
-    return serve(request, coordinator.store, artifact, name="certificate.json")
+    return serve(request, context.store, artifact, name="certificate.json")
 
 
-@router.get("/v1/certificates/{digest}/page", response_class=Response, responses=_file_responses(_PAGE))
-def get_certificate_page(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+@router.get("/v1/certificates/{digest}/page", response_class=Response, responses=file_responses(_PAGE))
+def get_certificate_page(digest: str, request: Request, context: ContextDep) -> Response:
     """Return the page of a certificate."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         artifact = find_certificate(connection, digest).page
-    response = serve(request, coordinator.store, artifact, name="certificate.html")
+    response = serve(request, context.store, artifact, name="certificate.html")
     response.headers.update(_INERT)
     return response

@@ -1,16 +1,21 @@
-"""What routes share: the coordinator, pages of lists, and what OpenAPI says of problems."""
+"""Shared by routes: the context, pages of lists, and the OpenAPI responses of files and problems."""
 
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 from stickslip_schemas.documents.problems import MEDIA_TYPE
 
+from stickslip_services.api.files import OPENAPI_HEADERS
 from stickslip_services.database.paging import MAX_PAGE_SIZE, TOKEN_PATTERN, PageRequest
+from stickslip_services.queue.context import Context
 
 
-def coordinator_of(request: Request) -> Any:
-    """Return the application's coordinator; routes declare it as `Annotated[Coordinator, Depends(coordinator_of)]`."""
-    return request.app.state.coordinator
+def _context(request: Request) -> Context:
+    context: Context = request.app.state.context
+    return context
+
+
+ContextDep = Annotated[Context, Depends(_context)]
 
 
 def _page(
@@ -43,13 +48,23 @@ _TITLES = {
 BODY_PROBLEMS = (400, 413, 415, 422)
 
 KEYED: dict[str, Any] = {"security": [{"key": []}]}
-"""What OpenAPI says of a route that needs a key, also on loopback."""
+"""OpenAPI attributes of a route that needs a key, also on loopback."""
 
 
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return what OpenAPI says of the problems that a route may answer with."""
+    """Return the OpenAPI responses of the problems that a route may answer with."""
     schema = {"$ref": "#/components/schemas/Problem"}
     return {
         status: {"description": _TITLES[status], "content": {MEDIA_TYPE: {"schema": schema}}}
         for status in sorted({*statuses, 401, 403, 500, 503})
+    }
+
+
+def file_responses(content: dict[str, Any], *problems: int) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI responses of a route that serves an artifact."""
+    return {
+        200: {"description": "The file", "headers": OPENAPI_HEADERS, "content": content},
+        206: {"description": "The range that was asked for", "headers": OPENAPI_HEADERS, "content": content},
+        304: {"description": "The client has it already", "headers": OPENAPI_HEADERS},
+        **problem_responses(404, 416, *problems),
     }

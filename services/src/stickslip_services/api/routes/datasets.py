@@ -5,22 +5,20 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
 
-from stickslip_services.api.files import OPENAPI_HEADERS, picture_format, serve
-from stickslip_services.api.routes.common import PageDep, coordinator_of, problem_responses
+from stickslip_services.api.files import picture_format, serve
+from stickslip_services.api.routes.common import ContextDep, PageDep, file_responses, problem_responses
 from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets, read_contents
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.dataset_page import dataset_page
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import is_preview
 
 router = APIRouter(tags=["datasets"])
-
-CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
 Version = Annotated[int, Path(ge=1, lt=2**31)]
 
@@ -31,33 +29,24 @@ _BINARY = {"application/octet-stream": _BINARY_SCHEMA}
 _PICTURE = {"image/png": _BINARY_SCHEMA, "image/webp": _BINARY_SCHEMA}
 
 
-def _file_responses(content: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
-    return {
-        200: {"description": "The file", "headers": OPENAPI_HEADERS, "content": content},
-        206: {"description": "The range that was asked for", "headers": OPENAPI_HEADERS, "content": content},
-        304: {"description": "The client has it already", "headers": OPENAPI_HEADERS},
-        **problem_responses(404, 416, 422),
-    }
-
-
 @router.get("/v1/datasets", responses=problem_responses(422))
-def get_datasets(page: PageDep, coordinator: CoordinatorDep) -> Page[Dataset]:
+def get_datasets(page: PageDep, context: ContextDep) -> Page[Dataset]:
     """List datasets, newest first."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return list_datasets(connection, page)
 
 
 @router.get("/v1/datasets/{dataset}", responses=problem_responses(404))
-def get_dataset(dataset: str, coordinator: CoordinatorDep) -> Dataset:
+def get_dataset(dataset: str, context: ContextDep) -> Dataset:
     """Return a dataset with its versions."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return find_dataset(connection, dataset)
 
 
 @router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404, 422))
-def get_version(dataset: str, version: Version, coordinator: CoordinatorDep) -> DatasetVersion:
+def get_version(dataset: str, version: Version, context: ContextDep) -> DatasetVersion:
     """Return a version."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return find_version(connection, dataset, version)
 
 
@@ -67,53 +56,53 @@ _MANIFEST_CONTENT: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/
 @router.get(
     "/v1/datasets/{dataset}/versions/{version}/manifest",
     response_class=Response,
-    responses=_file_responses(_MANIFEST_CONTENT),
+    responses=file_responses(_MANIFEST_CONTENT, 422),
 )
 @router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
-def get_manifest(dataset: str, version: Version, request: Request, coordinator: CoordinatorDep) -> Response:
+def get_manifest(dataset: str, version: Version, request: Request, context: ContextDep) -> Response:
     """Return the manifest: every file of the version with its digest, and what it was made from."""
-    return _serve(request, coordinator, dataset, version, MANIFEST_NAME)
+    return _serve(request, context, dataset, version, MANIFEST_NAME)
 
 
 @router.get("/v1/datasets/{dataset}/versions/{version}/page", include_in_schema=False)
-def get_page(dataset: str, version: Version, coordinator: CoordinatorDep) -> Response:
+def get_page(dataset: str, version: Version, context: ContextDep) -> Response:
     """Return the version's page for people: its acceptance rate, and where in the grid samples were lost."""
-    file = _find(coordinator, dataset, version, MANIFEST_NAME)
-    return Response(dataset_page(read_contents(coordinator.store, file.sha256)), media_type="text/html", headers=_INERT)
+    file = _find(context, dataset, version, MANIFEST_NAME)
+    return Response(dataset_page(read_contents(context.store, file.sha256)), media_type="text/html", headers=_INERT)
 
 
 @router.get(
     "/v1/datasets/{dataset}/versions/{version}/files/{path:path}",
     response_class=Response,
-    responses=_file_responses(_BINARY),
+    responses=file_responses(_BINARY, 422),
 )
 @router.head("/v1/datasets/{dataset}/versions/{version}/files/{path:path}", include_in_schema=False)
-def get_file(dataset: str, version: Version, path: str, request: Request, coordinator: CoordinatorDep) -> Response:
+def get_file(dataset: str, version: Version, path: str, request: Request, context: ContextDep) -> Response:
     """Return a file of the version, or a range of it."""
-    return _serve(request, coordinator, dataset, version, path)
+    return _serve(request, context, dataset, version, path)
 
 
 @router.get(
     "/v1/previews/{digest}",
     response_class=Response,
-    responses=_file_responses(_PICTURE),
+    responses=file_responses(_PICTURE, 422),
     tags=["jobs"],
 )
-def get_preview(digest: str, request: Request, coordinator: CoordinatorDep) -> Response:
+def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
     """Return the picture of a sample."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         if not (is_sha256(digest) and is_preview(connection, digest)):
             raise NotFoundError(f"there is no preview {digest[:100]!r}")
-    name = f"preview.{picture_format(coordinator.store, digest)}"
-    return serve(request, coordinator.store, digest, name=name)
+    name = f"preview.{picture_format(context.store, digest)}"
+    return serve(request, context.store, digest, name=name)
 
 
-def _find(coordinator: Coordinator, dataset: str, version: int, path: str) -> FileEntry:
-    with coordinator.database.read() as connection:
+def _find(context: Context, dataset: str, version: int, path: str) -> FileEntry:
+    with context.database.read() as connection:
         found = find_version(connection, dataset, version)
-    return find_file(coordinator.store, found, path)
+    return find_file(context.store, found, path)
 
 
-def _serve(request: Request, coordinator: CoordinatorDep, dataset: str, version: int, path: str) -> Response:
-    file = _find(coordinator, dataset, version, path)
-    return serve(request, coordinator.store, file.sha256, name=path, size=file.size)
+def _serve(request: Request, context: ContextDep, dataset: str, version: int, path: str) -> Response:
+    file = _find(context, dataset, version, path)
+    return serve(request, context.store, file.sha256, name=path, size=file.size)

@@ -1,20 +1,15 @@
 """Whether the coordinator lives, whether it can serve, and its metrics."""
 
-from typing import Annotated
-
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from sqlalchemy import text
 from stickslip_schemas.base.document import Document
 
 from stickslip_services import __version__
 from stickslip_services.api.metrics import Metrics
-from stickslip_services.api.routes.common import coordinator_of, problem_responses
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.api.routes.common import ContextDep, problem_responses
 
 router = APIRouter(tags=["health"])
-
-CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
 
 class Health(Document):
@@ -30,9 +25,9 @@ async def get_livez() -> Health:
 
 
 @router.get("/readyz", responses=problem_responses())
-def get_readyz(coordinator: CoordinatorDep) -> Health:
+def get_readyz(context: ContextDep) -> Health:
     """Tell that the database can be read; 503 where it cannot."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         connection.execute(text("SELECT seq FROM jobs LIMIT 1"))
     return Health(version=__version__)
 

@@ -10,17 +10,14 @@ from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.files import matches
-from stickslip_services.api.routes.common import BODY_PROBLEMS, PageDep, coordinator_of, problem_responses
+from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, PageDep, problem_responses
 from stickslip_services.api.sse import OPENAPI as STREAM
 from stickslip_services.api.sse import Feeds
-from stickslip_services.catalog.textures import check_textures
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.jobs import Replay, etag, find_job, list_jobs, list_previews, list_samples
-from stickslip_services.queue.validating import validate
+from stickslip_services.queue import control
+from stickslip_services.queue.jobs import etag, find_job, list_jobs, list_previews, list_samples, show_job
+from stickslip_services.queue.submit import Replay, submit_job, validate_spec
 
 router = APIRouter(tags=["jobs"])
-
-CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
 SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec))]
 
@@ -54,7 +51,7 @@ _REPLAYED: dict[str, Any] = {
 )
 def post_job(
     spec: SpecBody,
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     idempotency_key: Annotated[
         str | None,
         Header(
@@ -75,24 +72,23 @@ def post_job(
 
     429: the project of the key has as many jobs or samples as it may have.
     """
-    job = coordinator.submit(spec, idempotency_key, priority=priority, traceparent=traceparent)
+    job = submit_job(context, spec, idempotency_key, priority=priority, traceparent=traceparent)
     if isinstance(job, Replay):
         return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
     return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})
 
 
 @router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
-def validate_job(spec: SpecBody, coordinator: CoordinatorDep) -> Validation:
+def validate_job(spec: SpecBody, context: ContextDep) -> Validation:
     """Tell what a job would be, without making one."""
-    check_textures(coordinator.store, spec)
-    return validate(coordinator.database, spec)
+    return validate_spec(context, spec)
 
 
 @router.get("/v1/jobs", responses=problem_responses(422))
-def get_jobs(page: PageDep, coordinator: CoordinatorDep) -> Page[Job]:
+def get_jobs(page: PageDep, context: ContextDep) -> Page[Job]:
     """List jobs, newest first."""
-    with coordinator.database.read() as connection:
-        return list_jobs(connection, page, coordinator.alive_workers(connection))
+    with context.database.read() as connection:
+        return list_jobs(context, connection, page)
 
 
 @router.get(
@@ -104,12 +100,10 @@ def get_jobs(page: PageDep, coordinator: CoordinatorDep) -> Page[Job]:
         **problem_responses(404),
     },
 )
-def get_job(
-    job_id: str, coordinator: CoordinatorDep, if_none_match: Annotated[str | None, Header()] = None
-) -> Response:
+def get_job(job_id: str, context: ContextDep, if_none_match: Annotated[str | None, Header()] = None) -> Response:
     """Return a job."""
-    with coordinator.database.read() as connection:
-        job = coordinator.show(connection, int(find_job(connection, job_id).seq))
+    with context.database.read() as connection:
+        job = show_job(context, connection, int(find_job(connection, job_id).seq))
     content, tag = job.model_dump_json(), etag(job)
     if matches(if_none_match, tag):
         return Response(status_code=304, headers={"ETag": tag})
@@ -124,50 +118,50 @@ def get_job(
 def patch_job(
     job_id: str,
     patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))],
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     response: Response,
     if_match: IfMatch = None,
 ) -> JobDetail:
     """Give a job another priority, from its next task on. 409: it has ended."""
-    return _tagged(response, coordinator.prioritise(job_id, patch.priority, if_match=_etags(if_match)))
+    return _tagged(response, control.prioritise_job(context, job_id, patch.priority, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=_CHANGED)
-def cancel_job(job_id: str, coordinator: CoordinatorDep, response: Response, if_match: IfMatch = None) -> JobDetail:
+def cancel_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
     """Cancel a job. Tasks that only it needs are dropped; what is finished or published stays."""
-    return _tagged(response, coordinator.cancel(job_id, if_match=_etags(if_match)))
+    return _tagged(response, control.cancel_job(context, job_id, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:pause", status_code=202, responses=_CHANGED)
-def pause_job(job_id: str, coordinator: CoordinatorDep, response: Response, if_match: IfMatch = None) -> JobDetail:
+def pause_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
     """Pause a job: nothing more is started for it, and what runs finishes. Its place in the queue stays."""
-    return _tagged(response, coordinator.pause(job_id, if_match=_etags(if_match)))
+    return _tagged(response, control.pause_job(context, job_id, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:resume", status_code=202, responses=_CHANGED)
-def resume_job(job_id: str, coordinator: CoordinatorDep, response: Response, if_match: IfMatch = None) -> JobDetail:
+def resume_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
     """Let a paused job go on."""
-    return _tagged(response, coordinator.resume(job_id, if_match=_etags(if_match)))
+    return _tagged(response, control.resume_job(context, job_id, if_match=_etags(if_match)))
 
 
 @router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404, 422))
 def get_samples(
     job_id: str,
     page: PageDep,
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     state: Annotated[
         TaskState | None, Query(description="only samples in this state; `rejected` lists the rejects")
     ] = None,
 ) -> Page[SampleState]:
     """List the samples of a job by slot; empty until the job is planned."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return list_samples(connection, find_job(connection, job_id).seq, page, state)
 
 
 @router.get("/v1/jobs/{job_id}/previews", responses=problem_responses(404))
-def get_previews(job_id: str, coordinator: CoordinatorDep) -> list[Preview]:
+def get_previews(job_id: str, context: ContextDep) -> list[Preview]:
     """List the pictures of samples that there are so far."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         return list_previews(connection, find_job(connection, job_id).seq)
 
 
@@ -189,13 +183,13 @@ def get_previews(job_id: str, coordinator: CoordinatorDep) -> list[Preview]:
 def get_events(
     job_id: str,
     request: Request,
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     last_event_id: Annotated[
         str | None, Header(pattern=r"^[0-9]{0,18}$", description="id of the last event that you have")
     ] = None,
 ) -> Response:
     """Follow a job."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         job = int(find_job(connection, job_id).seq)
     feeds: Feeds = request.app.state.feeds
     return feeds.stream(job, after=int(last_event_id or 0))

@@ -1,8 +1,8 @@
 """Textures of users: uploading them."""
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 from stickslip_schemas.documents.problems import FieldError, ProblemCode
@@ -10,9 +10,8 @@ from stickslip_schemas.documents.responses import TextureEntry
 from stickslip_schemas.format.pictures import UnfitPictureError
 
 from stickslip_services.api.problems import ProblemError
-from stickslip_services.api.routes.common import BODY_PROBLEMS, coordinator_of, problem_responses
+from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, problem_responses
 from stickslip_services.catalog.textures import store_texture
-from stickslip_services.queue.coordinator import Coordinator
 
 router = APIRouter(tags=["textures"])
 
@@ -24,7 +23,7 @@ _BODY = {"requestBody": {"required": True, "content": dict.fromkeys(MEDIA_TYPES,
 
 
 @router.post("/v1/textures", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_BODY)
-async def post_texture(request: Request, coordinator: Annotated[Coordinator, Depends(coordinator_of)]) -> TextureEntry:
+async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
     """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side. It may be sent twice.
 
     A picture that no job names is deleted by `stickslip gc` after a day.
@@ -42,7 +41,7 @@ async def post_texture(request: Request, coordinator: Annotated[Coordinator, Dep
             raise UnfitPictureError(
                 f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}"
             )
-        return await run_in_threadpool(store_texture, coordinator.store, data)
+        return await run_in_threadpool(store_texture, context.store, data)
     except UnfitPictureError as error:
         field = FieldError(pointer="", rule=str(error), value=f'"{len(data)} bytes"')
         raise ProblemError(422, ProblemCode.validation_failed, str(error), fields=[field]) from error

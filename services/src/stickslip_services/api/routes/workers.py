@@ -1,4 +1,4 @@
-"""The worker API: a dispatcher registers, leases tasks, says that it lives, and reports."""
+"""The worker API: dispatchers register, lease tasks, send heartbeats, and report results."""
 
 import asyncio
 from collections.abc import Callable
@@ -20,8 +20,10 @@ from stickslip_schemas.documents.worker_api import (
 
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.metrics import Metrics
-from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, coordinator_of, problem_responses
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, ContextDep, problem_responses
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.lease import heartbeat, lease_tasks, register_worker
+from stickslip_services.queue.report import report_results
 from stickslip_services.queue.workers import show_workers
 
 T = TypeVar("T")
@@ -32,14 +34,12 @@ _LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest)
 _HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat)
 _REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
 
-CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
-
 
 @router.get("/v1/workers", responses=problem_responses())
-def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
+def get_workers(context: ContextDep) -> list[WorkerEntry]:
     """List the workers that have registered, the newest session of each name, newest first."""
-    with coordinator.database.read() as connection:
-        return show_workers(connection, alive_since=coordinator.alive_since, frames=coordinator.frames)
+    with context.database.read() as connection:
+        return show_workers(context, connection)
 
 
 @router.post(
@@ -49,10 +49,10 @@ def get_workers(coordinator: CoordinatorDep) -> list[WorkerEntry]:
     openapi_extra=body_schema("WorkerRegistration") | KEYED,
 )
 def post_worker(
-    registration: Annotated[WorkerRegistration, Depends(JsonBody(WorkerRegistration))], coordinator: CoordinatorDep
+    registration: Annotated[WorkerRegistration, Depends(JsonBody(WorkerRegistration))], context: ContextDep
 ) -> WorkerSession:
     """Register a worker. An earlier session of the name loses its leases at once."""
-    return coordinator.register(registration)
+    return register_worker(context, registration)
 
 
 @router.post(
@@ -63,8 +63,7 @@ def post_worker(
 )
 async def post_lease(request: Request) -> Response:
     """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken over."""
-    coordinator: Coordinator = coordinator_of(request)
-    return await _answer(request, _LEASE_REQUEST, coordinator.lease)
+    return await _answer(request, _LEASE_REQUEST, lease_tasks)
 
 
 @router.post(
@@ -75,8 +74,7 @@ async def post_lease(request: Request) -> Response:
 )
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
-    coordinator: Coordinator = coordinator_of(request)
-    return await _answer(request, _HEARTBEAT, coordinator.heartbeat)
+    return await _answer(request, _HEARTBEAT, heartbeat)
 
 
 @router.post(
@@ -87,25 +85,25 @@ async def post_heartbeat(request: Request) -> Response:
 )
 async def post_report(request: Request) -> Response:
     """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
-    coordinator: Coordinator = coordinator_of(request)
     metrics: Metrics = request.app.state.metrics
 
-    def report(batch: ReportBatch) -> ReportAnswer:
-        answer = coordinator.report(batch)
+    def report(context: Context, batch: ReportBatch) -> ReportAnswer:
+        answer = report_results(context, batch)
         metrics.count_reports(batch, answer)
         return answer
 
     return await _answer(request, _REPORT_BATCH, report)
 
 
-async def _answer(request: Request, document: JsonBody[T], verb: Callable[[T], BaseModel]) -> Response:
-    """Read a document, do what it says and write the answer, all in one go in one thread.
+async def _answer(request: Request, document: JsonBody[T], verb: Callable[[Context, T], BaseModel]) -> Response:
+    """Read a document, call a verb with it, and serialise the answer, all in one call of one thread.
 
     Workers ask many times a second. The answer, which may have megabytes, is not validated a second time.
     """
+    context: Context = request.app.state.context
     body = await document.received(request)
 
     def work() -> str:
-        return verb(document.read(body)).model_dump_json()
+        return verb(context, document.read(body)).model_dump_json()
 
     return Response(await asyncio.to_thread(work), media_type="application/json")

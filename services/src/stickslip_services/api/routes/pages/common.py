@@ -1,14 +1,10 @@
-"""Shared by the routes of pages: the coordinator, and HTML with its security headers."""
+"""Shared by the routes of pages: HTML with its security headers."""
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import Depends, Response
+from fastapi import Response
 
-from stickslip_services.api.routes.common import coordinator_of
 from stickslip_services.pages.rendering import render
-from stickslip_services.queue.coordinator import Coordinator
-
-CoordinatorDep = Annotated[Coordinator, Depends(coordinator_of)]
 
 _POLICY = {
     "Content-Security-Policy": (
@@ -21,6 +17,6 @@ _POLICY = {
 }
 
 
-def html_page(template: str, **context: Any) -> Response:
+def html_page(template: str, **values: Any) -> Response:
     """Return a rendered template as a response; everything that it loads comes from this server."""
-    return Response(render(template, **context), media_type="text/html", headers=_POLICY)
+    return Response(render(template, **values), media_type="text/html", headers=_POLICY)

@@ -12,13 +12,14 @@ from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
-from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page
+from stickslip_services.api.routes.common import ContextDep
+from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import histograms, sample_view, sliders, thumbs
 from stickslip_services.pages.sample_data import SampleData
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
 
 router = APIRouter()
 
@@ -26,17 +27,17 @@ Version = Annotated[int, Path(ge=1, lt=2**31)]
 
 
 @router.get("/datasets")
-def get_datasets(coordinator: CoordinatorDep) -> Response:
+def get_datasets(context: ContextDep) -> Response:
     """Show the datasets."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         datasets = list_datasets(connection, PageRequest(100, None)).items
     return html_page("datasets.html", here="datasets", datasets=datasets)
 
 
 @router.get("/datasets/{dataset}")
-def get_dataset(dataset: str, coordinator: CoordinatorDep) -> Response:
+def get_dataset(dataset: str, context: ContextDep) -> Response:
     """Go to the newest version of a dataset."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         versions = find_dataset(connection, dataset).versions
     if not versions:
         raise NotFoundError(f"dataset {dataset} has no version yet")
@@ -44,10 +45,10 @@ def get_dataset(dataset: str, coordinator: CoordinatorDep) -> Response:
 
 
 @router.get("/datasets/{dataset}/v{version}")
-def get_version(request: Request, dataset: str, version: Version, coordinator: CoordinatorDep) -> Response:
+def get_version(request: Request, dataset: str, version: Version, context: ContextDep) -> Response:
     """Show a version."""
-    found, committed, data = _open(coordinator, dataset, version)
-    context = thumbs(data, request.query_params, 0)
+    found, committed, data = _open(context, dataset, version)
+    values = thumbs(data, request.query_params, 0)
     return html_page(
         "dataset.html",
         here="datasets",
@@ -60,8 +61,8 @@ def get_version(request: Request, dataset: str, version: Version, coordinator: C
         file_count=None if data.manifest.sections else len(data.manifest.files) + 3,
         card=_listed(data, "README.md"),
         picture=_listed(data, "preview.webp"),
-        url=coordinator.settings.url,
-        **context,
+        url=context.settings.url,
+        **values,
     )
 
 
@@ -75,18 +76,18 @@ def get_thumbs(
     request: Request,
     dataset: str,
     version: Version,
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     start: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> Response:
     """Show the samples that the sliders leave."""
-    found, committed, data = _open(coordinator, dataset, version)
+    found, committed, data = _open(context, dataset, version)
     return html_page("thumbs.html", dataset=found, version=committed, **thumbs(data, request.query_params, start))
 
 
-def _open(coordinator: Coordinator, dataset: str, version: int) -> tuple[Dataset, DatasetVersion, SampleData]:
-    with coordinator.database.read() as connection:
+def _open(context: Context, dataset: str, version: int) -> tuple[Dataset, DatasetVersion, SampleData]:
+    with context.database.read() as connection:
         found, committed = find_dataset(connection, dataset), find_version(connection, dataset, version)
-    return found, committed, _sample_data(coordinator.store, committed.manifest)
+    return found, committed, _sample_data(context.store, committed.manifest)
 
 
 @lru_cache(maxsize=8)
@@ -95,9 +96,9 @@ def _sample_data(store: Store, manifest: str) -> SampleData:
 
 
 @router.get("/datasets/{dataset}/v{version}/samples/{slot}")
-def get_sample(dataset: str, version: Version, slot: int, coordinator: CoordinatorDep) -> Response:
+def get_sample(dataset: str, version: Version, slot: int, context: ContextDep) -> Response:
     """Show a sample: its pictures, curves, shape and labels."""
-    found, committed, data = _open(coordinator, dataset, version)
+    found, committed, data = _open(context, dataset, version)
     manifest = data.manifest
     if not 0 <= slot < manifest.sample_count:
         raise NotFoundError(f"version {version} of {dataset} has slots 0 to {manifest.sample_count - 1}, not {slot}")
@@ -121,11 +122,11 @@ def get_picture(
     slot: Annotated[int, Path(ge=0)],
     array: str,
     index: Annotated[int, Path(ge=0)],
-    coordinator: CoordinatorDep,
+    context: ContextDep,
     step: Annotated[int, Query(ge=1, le=8)] = 1,
 ) -> Response:
     """Return one picture of a sample; with `step`, every so many pixels."""
-    _, _, data = _open(coordinator, dataset, version)
+    _, _, data = _open(context, dataset, version)
     values = _value(data, array, slot)
     if values.ndim != 4 or index >= len(values):
         raise NotFoundError(f"{array} has no picture {index}")
@@ -135,10 +136,10 @@ def get_picture(
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.json")
 def get_values(
-    dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, coordinator: CoordinatorDep
+    dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, context: ContextDep
 ) -> Response:
     """Return the points of a shape by step, (step, point, xyz), and the triangles where there are any."""
-    _, _, data = _open(coordinator, dataset, version)
+    _, _, data = _open(context, dataset, version)
     values = np.asarray(_value(data, array, slot), dtype=np.float32)
     steps = values if values.ndim == 3 else values[None]
     chosen = np.linspace(0, len(steps) - 1, min(len(steps), 60)).astype(int)

@@ -13,19 +13,24 @@ from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page
+from stickslip_services.api.routes.common import ContextDep
+from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job
 from stickslip_services.queue.jobs import (
     find_job,
     list_jobs,
     list_samples,
     newest_previews,
+    show_job,
     stage_durations,
 )
-from stickslip_services.queue.retrying import failed_tasks
+from stickslip_services.queue.retries import failed_tasks
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter()
 
@@ -38,35 +43,35 @@ CHANGE_SECONDS = 1.0
 
 
 @router.get("/")
-def get_jobs(coordinator: CoordinatorDep) -> Response:
+def get_jobs(context: ContextDep) -> Response:
     """Show the jobs."""
-    return html_page("jobs.html", here="jobs", url=coordinator.settings.url, **_jobs(coordinator))
+    return html_page("jobs.html", here="jobs", url=context.settings.url, **_jobs(context))
 
 
 @router.get("/ui/jobs")
-def get_jobs_part(coordinator: CoordinatorDep) -> Response:
+def get_jobs_part(context: ContextDep) -> Response:
     """Show the list of jobs alone."""
-    return html_page("jobs_list.html", **_jobs(coordinator))
+    return html_page("jobs_list.html", **_jobs(context))
 
 
-def _jobs(coordinator: Coordinator) -> dict[str, Any]:
-    with coordinator.database.read() as connection:
-        workers = coordinator.alive_workers(connection)
-        jobs = list_jobs(connection, PageRequest(SHOWN_JOBS, None), workers).items
+def _jobs(context: Context) -> dict[str, Any]:
+    with context.database.read() as connection:
+        workers = alive_workers(context, connection)
+        jobs = list_jobs(context, connection, PageRequest(SHOWN_JOBS, None)).items
         pictures = {job.id: newest_previews(connection, find_job(connection, job.id).seq, 5) for job in jobs[:10]}
     return {"jobs": jobs, "pictures": pictures, "workers": len(workers), "states": JobState}
 
 
 @router.get("/jobs/{job_id}")
-def get_job(job_id: str, coordinator: CoordinatorDep) -> Response:
+def get_job(job_id: str, context: ContextDep) -> Response:
     """Show a job."""
-    with coordinator.database.read() as connection:
-        context = _job(coordinator, connection, job_id)
-    spec: JobSpec = context["job"].spec
+    with context.database.read() as connection:
+        values = _job(context, connection, job_id)
+    spec: JobSpec = values["job"].spec
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
     document["axes"] = {name: _short_form(axis) for name, axis in document["axes"].items()}
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    return html_page("job.html", here="jobs", spec=text, **context)
+    return html_page("job.html", here="jobs", spec=text, **values)
 
 
 def _short_form(axis: dict[str, Any]) -> Any:
@@ -77,39 +82,39 @@ def _short_form(axis: dict[str, Any]) -> Any:
 
 
 @router.get("/ui/jobs/{job_id}")
-def get_job_part(job_id: str, coordinator: CoordinatorDep) -> Response:
+def get_job_part(job_id: str, context: ContextDep) -> Response:
     """Show what changes of a job."""
-    with coordinator.database.read() as connection:
-        return html_page("job_state.html", **_job(coordinator, connection, job_id))
+    with context.database.read() as connection:
+        return html_page("job_state.html", **_job(context, connection, job_id))
 
 
-def _job(coordinator: Coordinator, connection: Connection, job_id: str) -> dict[str, Any]:
+def _job(context: Context, connection: Connection, job_id: str) -> dict[str, Any]:
     seq = int(find_job(connection, job_id).seq)
-    job: JobDetail = coordinator.show(connection, seq)
+    job: JobDetail = show_job(context, connection, seq)
     rejected = list_samples(connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected).items
     return {
         "job": job,
         "durations": stage_durations(connection, seq),
-        "elapsed": _elapsed(job, coordinator),
+        "elapsed": _elapsed(job, context),
         "previews": newest_previews(connection, seq, 24),
         "rejected": rejected,
-        "failed": failed_tasks(connection, seq, coordinator.settings, SHOWN_LOST),
+        "failed": failed_tasks(connection, seq, context.settings, SHOWN_LOST),
         "states": JobState,
-        "url": coordinator.settings.url,
+        "url": context.settings.url,
     }
 
 
-def _elapsed(job: JobDetail, coordinator: Coordinator) -> float | None:
+def _elapsed(job: JobDetail, context: Context) -> float | None:
     if job.started_at is None:
         return None
-    end = coordinator.clock() if job.finished_at is None else job.finished_at.timestamp()
+    end = context.clock() if job.finished_at is None else job.finished_at.timestamp()
     return end - job.started_at.timestamp()
 
 
 @router.get("/ui/jobs/{job_id}/map")
-def get_job_map(job_id: str, coordinator: CoordinatorDep) -> Response:
+def get_job_map(job_id: str, context: ContextDep) -> Response:
     """Show the grid of a job as maps that fill."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         row = find_job(connection, job_id)
         spec = job_spec_adapter.validate_json(row.spec)
         if spec.sample_count > MOST_SAMPLES:
@@ -123,35 +128,33 @@ def get_job_map(job_id: str, coordinator: CoordinatorDep) -> Response:
 
 
 @router.post("/ui/jobs/{job_id}/{verb}")
-def change_job(job_id: str, verb: str, coordinator: CoordinatorDep) -> Response:
+def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
     """Pause, resume or cancel a job, or submit its spec again; answer with where to go."""
     if verb == "resubmit":
-        with coordinator.database.read() as connection:
+        with context.database.read() as connection:
             spec = job_spec_adapter.validate_json(find_job(connection, job_id).spec)
-        made = coordinator.submit(spec, None)
+        made = submit_job(context, spec)
         assert isinstance(made, JobDetail)  # there is no key, and so no replay
         job_id = made.id
     elif verb in ("pause", "resume", "cancel"):
-        {"pause": coordinator.pause, "resume": coordinator.resume, "cancel": coordinator.cancel}[verb](job_id)
+        {"pause": pause_job, "resume": resume_job, "cancel": cancel_job}[verb](context, job_id)
     else:
         raise NotFoundError(f"a job has no verb {verb[:50]!r}")
     return Response(status_code=204, headers={"HX-Redirect": f"/jobs/{job_id}"})
 
 
 @router.get("/ui/changes")
-def get_changes(coordinator: CoordinatorDep) -> StreamingResponse:
+def get_changes(context: ContextDep) -> StreamingResponse:
     """Tell a page that something has changed, at most once a second; nothing is read for it."""
-    return StreamingResponse(
-        _changes(coordinator), headers={"Cache-Control": "no-store"}, media_type="text/event-stream"
-    )
+    return StreamingResponse(_changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
 
 
-async def _changes(coordinator: Coordinator) -> AsyncIterator[bytes]:
+async def _changes(context: Context) -> AsyncIterator[bytes]:
     yield b"retry: 2000\n\n"
     told = -1  # the first message comes at once: something may have changed since the page was made
     while True:
-        await coordinator.bell.wait(told, 15.0)
-        rung = coordinator.bell.rung
-        yield b": still here\n\n" if rung == told else b"event: change\ndata: {}\n\n"
-        told = rung
+        await context.notifier.wait(told, 15.0)
+        count = context.notifier.count
+        yield b": still here\n\n" if count == told else b"event: change\ndata: {}\n\n"
+        told = count
         await asyncio.sleep(CHANGE_SECONDS)

@@ -8,41 +8,42 @@ from fastapi import APIRouter, Request, Response
 from sqlalchemy import Connection
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 
-from stickslip_services.api.routes.pages.common import CoordinatorDep, html_page
+from stickslip_services.api.routes.common import ContextDep
+from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.catalog.certificates import find_certificate, list_certificates
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.pages.plots import line_plot
-from stickslip_services.queue.coordinator import Coordinator
-from stickslip_services.queue.workers import show_workers
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.workers import alive_workers, show_workers
 
 router = APIRouter()
 
 
 @router.get("/certificates")
-def get_certificates(coordinator: CoordinatorDep) -> Response:
+def get_certificates(context: ContextDep) -> Response:
     """Show the certificates."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         entries = list_certificates(connection, PageRequest(200, None)).items
-        builds = _builds(coordinator, connection)
+        builds = _builds(context, connection)
     return html_page("certificates.html", here="certificates", entries=entries, builds=builds)
 
 
 @router.get("/certificates/{digest}")
-def get_certificate(digest: str, coordinator: CoordinatorDep) -> Response:
+def get_certificate(digest: str, context: ContextDep) -> Response:
     """Show a certificate: a row for each protocol."""
-    with coordinator.database.read() as connection:
+    with context.database.read() as connection:
         stored = find_certificate(connection, digest)
-        builds = _builds(coordinator, connection)
-    certificate = Certificate.model_validate_json(coordinator.store.read(stored.artifact))
+        builds = _builds(context, connection)
+    certificate = Certificate.model_validate_json(context.store.read(stored.artifact))
     plots = {protocol.protocol: list(_curves(protocol)) for protocol in certificate.protocols}
     return html_page(
         "certificate.html", here="certificates", certificate=certificate, digest=digest, builds=builds, plots=plots
     )
 
 
-def _builds(coordinator: Coordinator, connection: Connection) -> set[str]:
-    return {builds.sim_core for worker in coordinator.alive_workers(connection) for builds in worker.builds.values()}
+def _builds(context: Context, connection: Connection) -> set[str]:
+    return {builds.sim_core for worker in alive_workers(context, connection) for builds in worker.builds.values()}
 
 
 def _curves(protocol: ProtocolReport) -> Iterator[str]:
@@ -64,27 +65,27 @@ def _known(x: Numbers, y: Numbers) -> list[tuple[float, float]]:
 
 
 @router.get("/workers")
-def get_workers(coordinator: CoordinatorDep) -> Response:
+def get_workers(context: ContextDep) -> Response:
     """Show the workers."""
-    return html_page("workers.html", here="workers", **_workers(coordinator))
+    return html_page("workers.html", here="workers", **_workers(context))
 
 
 @router.get("/ui/workers")
-def get_workers_part(coordinator: CoordinatorDep) -> Response:
+def get_workers_part(context: ContextDep) -> Response:
     """Show the list of workers alone."""
-    return html_page("workers_list.html", **_workers(coordinator))
+    return html_page("workers_list.html", **_workers(context))
 
 
-def _workers(coordinator: Coordinator) -> dict[str, Any]:
-    with coordinator.database.read() as connection:
-        workers = show_workers(connection, alive_since=coordinator.alive_since, frames=coordinator.frames)
+def _workers(context: Context) -> dict[str, Any]:
+    with context.database.read() as connection:
+        workers = show_workers(context, connection)
         certified = {
             entry.sim_core: entry
             for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
             if entry.extent == "full" and entry.passed
         }
-    disk = coordinator.store.room()
-    now = as_datetime(coordinator.clock())
+    disk = context.store.room()
+    now = as_datetime(context.clock())
     return {"workers": workers, "certified": certified, "disk": disk, "memory": _memory(), "now": now}
 
 

@@ -1,27 +1,43 @@
-"""Reports: how leased tasks ended. The first result of the holder of the lease is the task's result, for ever.
+"""Reports: results of leased tasks. The first result from the holder of the lease is final.
 
-A dataset version is committed by the very transaction that accepts the report of its publish task.
+A dataset version is committed by the transaction that accepts the report of its publish task.
 """
 
+import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from sqlalchemy import bindparam, delete, insert, select, update
+from stickslip_schemas import tracing
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
-from stickslip_schemas.documents.worker_api import Report, ReportVerdict
+from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
+from stickslip_schemas.store import Store, is_unavailable
 
-from stickslip_services.catalog.versions import ManifestSummary, commit_version, find_committed, find_reserved
+from stickslip_services.catalog.versions import (
+    ManifestSummary,
+    check_output,
+    commit_version,
+    find_committed,
+    find_reserved,
+    read_version,
+)
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.queue.jobs import traceparent_of
 from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, start_tasks
+from stickslip_services.queue.recompute import recompute
+from stickslip_services.queue.retries import fail_tries, give_back, lose
+from stickslip_services.queue.workers import find_worker, is_silent, note_seen
 
 Verdict = Literal["accepted", "duplicate", "stale"]
 
@@ -51,13 +67,13 @@ class _Ended:
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """What a batch of reports came to: the verdicts, and the tasks that are for `retrying` to go on with."""
+    """The outcome of a batch of reports: the verdicts, and the tasks that `retries` continues with."""
 
     verdicts: tuple[ReportVerdict, ...]
     released: tuple[HeldTask, ...]
     failures: tuple[tuple[HeldTask, Reason, str], ...]
     damaged: tuple[tuple[int, tuple[Sha256, ...]], ...]
-    """Of failed tasks, the inputs that were damaged or missing."""
+    """Damaged or missing inputs of failed tasks, by task."""
 
 
 _NOTE_REPORT = Prepared(
@@ -95,12 +111,76 @@ _COUNT_DOWN = Prepared(
 )
 
 
+def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
+    """Judge the reports of a worker, one by one, and store the results; raise UnknownWorkerError."""
+    versions: dict[str, ManifestSummary] = {}
+    began = time.monotonic()
+    reports = [_checked_in_store(context.store, report, versions) for report in batch.reports]
+    with context.ledger() as book:
+        worker = find_worker(book.connection, batch.worker_id)
+        if is_silent(context, worker):
+            note_seen(book.connection, worker.id, book.now)
+        taken = take_reports(book, worker.id, reports, versions)
+        give_back(book, taken.released)
+        charged: list[tuple[HeldTask, Reason, str]] = []
+        for task, reason, message in taken.failures:
+            if reason is Reason.store_unavailable:
+                context.store_watch.note(f"worker {worker.name} cannot use the store: {message}")
+                give_back(book, [task])
+            elif reason is Reason.worker_lost:
+                lose(book, [task], context.settings, message=message)
+            else:
+                charged.append((task, reason, message))
+        fail_tries(book, charged, context.settings)
+        for consumer, digests in taken.damaged:
+            recompute(book, consumer, digests)
+    for verdict in taken.verdicts:
+        if verdict.verdict == "accepted" and verdict.task_id in versions:
+            _after_commit(context, verdict.task_id, time.monotonic() - began)
+    return ReportAnswer(verdicts=taken.verdicts)
+
+
+def _after_commit(context: Context, task: str, seconds: float) -> None:
+    """Delete the temporary artifacts of a publish task, and record the span of its commit."""
+    with suppress(OSError):
+        for digest in context.sections.pop(task, ()):
+            context.store.delete(digest)
+    if tracing.is_on():
+        with context.database.read() as connection:
+            traceparent = traceparent_of(connection, task)
+        tracing.record("commit", parent=traceparent, seconds=seconds, task=task)
+
+
+def _checked_in_store(store: Store, report: Report, versions: dict[str, ManifestSummary]) -> Report:
+    """Return the report, or a failure where the store lacks its artifacts; add the summary of a manifest."""
+    if report.result is None or report.result.output is None:
+        return report
+    output = report.result.output
+    try:
+        if isinstance(output, PublishOutput):
+            versions[report.task_id] = read_version(store, output)
+        else:
+            check_output(store, output)
+    except (OSError, ValueError) as error:
+        unavailable = isinstance(error, OSError) and is_unavailable(error)
+        reason = Reason.store_unavailable if unavailable else Reason.storage_error
+        return report.model_copy(
+            update={"result": _failed(report.result, reason, f"the result does not hold: {error}")}
+        )
+    return report
+
+
+def _failed(result: TaskResult, reason: Reason, message: str) -> TaskResult:
+    update = {"outcome": "failed", "reason": reason, "message": message[:2000], "output": None}
+    return result.model_copy(update=update)
+
+
 def take_reports(
     book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, ManifestSummary]
 ) -> Taken:
-    """Judge each report and write down the results that the accepted ones bring.
+    """Judge each report, and store the results of the accepted ones.
 
-    `versions` has, for each publish report by task, what its manifest says; it was read before the transaction.
+    `versions` has the summaries of manifests by publish task; they were read before the transaction.
     """
     verdicts: list[ReportVerdict] = []
     released: list[HeldTask] = []
@@ -138,7 +218,7 @@ def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
 
 
 def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[str, ManifestSummary]) -> TaskResult:
-    """Return the result, or a failure where it does not answer the task."""
+    """Return the result, or a failure where it does not fit the task."""
     name = task_id(task.stage, task.key)
     wrong: str | None = None
     reason = Reason.internal_error
@@ -154,13 +234,13 @@ def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[st
             wrong = f"the manifest is not that of {reserved}"
     if wrong is None:
         return result
-    return result.model_copy(update={"outcome": "failed", "reason": reason, "message": wrong, "output": None})
+    return _failed(result, reason, wrong)
 
 
 def _take_results(
     book: Ledger, ended: Sequence[_Ended], versions: dict[str, ManifestSummary]
 ) -> tuple[tuple[HeldTask, Reason, str], ...]:
-    """Write results down; return the failures."""
+    """Store results; return the failures."""
     # Who reports a result has started the task, whether or not a heartbeat said so in between.
     start_tasks(book, [(end.task.seq, end.task.stage) for end in ended if end.task.state is TaskState.leased])
     ended = [replace(end, task=replace(end.task, state=TaskState.running)) for end in ended]
@@ -181,7 +261,7 @@ def _take_results(
 
 
 def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
-    """Let a version exist, and the jobs that asked for it succeed."""
+    """Commit a version, and end the jobs that wait for it."""
     connection = book.connection
     holders = [holder.job for holder in book.holders([publish_task]).get(publish_task, ())]
     waiting = connection.execute(
@@ -198,7 +278,7 @@ def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
 
 
 def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
-    """Write results down and let what depends on them go on."""
+    """Store results, and release the tasks that depend on them."""
     if not settled:
         return
     _SETTLE.run_all(
@@ -222,7 +302,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
         task, result = end.task, end.result
         state = TaskState(result.outcome)
         book.moved(task.seq, task.stage, TaskState.running, state)
-        # What is rejected is often found at once: it says little of what the others take.
+        # Rejections often come early, so their durations are not representative.
         call_seconds = None if state is TaskState.rejected else result.call_seconds
         cost = (result.cpu_seconds, result.wall_seconds, call_seconds)
         book.ran(Run(task.seq, task.stage, end.kind, end.cost_group, *cost))
@@ -237,7 +317,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
 
 
 def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
-    """Count settled dependencies down; a rejected simulation rejects its renders, which settles them in turn."""
+    """Decrement `waiting_on` of dependents; a rejected simulation rejects its renders, which settles them in turn."""
     edges = [edge for batch in batches(settled) for edge in _DEPENDENTS.tuples(book.connection, {"b_tasks": batch})]
     if not edges:
         return

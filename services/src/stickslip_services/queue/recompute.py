@@ -1,11 +1,13 @@
-"""Tasks whose results were lost after all: an artifact that rotted in the store, or is gone, is made again.
+"""Recomputing results that were damaged or lost in the store.
 
-Whoever needs such an artifact reports it. The task that made it, found among those that the reporter builds on, goes
-back to `pending`, and all that depend on it wait for one task more. What that task needs itself it reports in turn.
+A task whose inputs are damaged reports them. The tasks that made them, found among its dependencies, go back to
+`pending`, and their dependents wait for them. If the inputs of those tasks are damaged too, they report that in turn.
 
-A job whose dataset was made before it came ends when the dataset has been checked, and what is damaged is made again.
+A job whose dataset existed before its submission ends when the files of the dataset have been checked; damaged ones
+are recomputed.
 """
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable
@@ -15,19 +17,25 @@ from sqlalchemy import Connection, bindparam, select, update
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 
-from stickslip_services.catalog.versions import find_committed
+from stickslip_services.catalog.versions import damaged_files, find_committed
 from stickslip_services.database.database import batches, insert_rows
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ledger import LIVE, Ending, Ledger, live_jobs
+
+logger = logging.getLogger(__name__)
+
+CHECKED_AT_ONCE = 64 * 2**20
+"""Largest dataset that is checked within a request, and not in the background [bytes]."""
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True, slots=True)
 class MadeJob:
-    """A live job whose dataset was made before it came."""
+    """A live job whose dataset existed before its submission."""
 
     job: int
     publish_task: int
@@ -43,8 +51,8 @@ class _Maker:
     state: TaskState
 
 
-def make_again(book: Ledger, consumer: int, digests: Collection[Sha256]) -> int:
-    """Let the tasks that made `digests` run again, and `consumer`, which waits, wait for them; return how many."""
+def recompute(book: Ledger, consumer: int, digests: Collection[Sha256]) -> int:
+    """Reset the tasks that made `digests`, and let `consumer` wait for them; return their number."""
     makers = _find_makers(book, consumer, set(digests))
     if not makers:
         return 0
@@ -74,14 +82,32 @@ _MADE_JOBS = Prepared(
 
 
 def made_jobs(connection: Connection) -> list[MadeJob]:
-    """Return the live jobs whose dataset was made before they came; its files have to be checked."""
+    """Return the live jobs whose dataset existed before their submission, and has not been checked yet."""
     return [MadeJob(*row) for row in _MADE_JOBS.tuples(connection)]
 
 
-def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:
-    """End a job whose dataset is there and whole, or else let the tasks that made it run again.
+def check_made_datasets(context: Context, *, at_most: int | None = None) -> None:
+    """Check the datasets of `made_jobs`, and end the jobs or recompute what is damaged.
 
-    `damaged` are the artifacts that are not whole; None where the manifest itself cannot be trusted.
+    All files are read. Datasets of more than `at_most` bytes are left for a call without it.
+    """
+    with context.database.read() as connection:
+        found = made_jobs(connection)
+    for made in found:
+        if at_most is None or made.bytes <= at_most:
+            try:
+                damaged = damaged_files(context.store, made.manifest, made.group)
+            except OSError as error:  # out of reach: the next sweep tries again
+                logger.warning("an existing dataset cannot be checked now: %s", error)
+                continue
+            with context.ledger() as book:
+                end_made(book, made, damaged)
+
+
+def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:
+    """End a job whose dataset is intact; otherwise reset the tasks that made the damaged files.
+
+    `damaged` has the digests of the damaged artifacts; None where the manifest itself cannot be trusted.
     """
     if made not in made_jobs(book.connection):
         return  # cancelled, or ended by another check
@@ -96,17 +122,17 @@ def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> 
     message = f"the dataset was made before, but {what} damaged or lost in the store; what is missing is made again"
     set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
     reopen_task(book, made.publish_task)
-    make_again(book, made.publish_task, damaged or frozenset())
+    recompute(book, made.publish_task, damaged or frozenset())
 
 
 def reopen_task(book: Ledger, task: int) -> None:
-    """Let one task that has a result run again."""
+    """Reset one task that has a result."""
     row = book.connection.execute(select(tasks.c.stage, tasks.c.state).where(tasks.c.seq == task)).one()
     reopen(book, [_Maker(task, Stage(row.stage), TaskState(row.state))])
 
 
 def reopen(book: Ledger, makers: Iterable[_Maker]) -> None:
-    """Let tasks that have ended, and that a live job needs, run again. Their outputs stay until there are new ones."""
+    """Reset ended tasks that a live job needs. Their outputs stay until there are new ones."""
     ended = [maker for maker in makers if maker.state in (TaskState.succeeded, TaskState.failed, TaskState.cancelled)]
     job_of = live_jobs(book.connection, [maker.seq for maker in ended])
     ended = [maker for maker in ended if maker.seq in job_of]
@@ -135,7 +161,7 @@ def reopen(book: Ledger, makers: Iterable[_Maker]) -> None:
 
 
 def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[_Maker]:
-    """Look for the tasks that made `digests`, first among those that `consumer` needs, then among what those need."""
+    """Return the tasks that made `digests`, searched breadth-first among the dependencies of `consumer`."""
     makers: list[_Maker] = []
     level, seen = {consumer}, {consumer}
     while level and digests:
@@ -159,7 +185,7 @@ def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[_Mak
 
 
 def _wait_for(book: Ledger, more: Counter[int]) -> None:
-    """Let tasks wait for so many more others."""
+    """Increase the number of tasks that each task waits for."""
     rows = [{"b_seq": task, "b_more": count} for task, count in more.items() if count]
     if rows:
         book.connection.execute(

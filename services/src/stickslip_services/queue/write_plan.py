@@ -1,7 +1,7 @@
-"""Writing a job and its plan down.
+"""Inserting a job and its plan into the database.
 
-A task that is there already is shared: where it is settled the job has it for nothing, where it waits or runs both jobs
-wait for it, where it failed or was cancelled the new job starts it again.
+A task that exists already is shared. If it is settled, the job gets its result for free; if it waits or runs, both jobs
+wait for it; if it failed or was cancelled, the new job starts it again.
 """
 
 import json
@@ -40,7 +40,7 @@ _ADD_GROUPS = Prepared(
 def insert_job(
     book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "", traceparent: str | None = None
 ) -> int:
-    """Write a job down, without its tasks; return its `seq`."""
+    """Insert a job without its tasks; return its `seq`."""
     result = book.connection.execute(
         insert(jobs).values(
             id=new_id("job"),
@@ -61,7 +61,7 @@ def insert_job(
 
 
 def begin_planning(book: Ledger, job: int, terms: Terms) -> None:
-    """Write down what a job is made with; its tasks come in pieces, from slot 0 on."""
+    """Store the terms of a job, and start its counters; its tasks follow in pieces, from slot 0 on."""
     book.connection.execute(
         update(jobs)
         .where(jobs.c.seq == job)
@@ -72,10 +72,10 @@ def begin_planning(book: Ledger, job: int, terms: Terms) -> None:
     insert_rows(book.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
 
 
-def plan_piece(book: Ledger, job: int, piece: Plan) -> None:
-    """Write the tasks of a piece of a job; the last one makes a job that was `planning` `queued` or `running`.
+def write_plan(book: Ledger, job: int, piece: Plan) -> None:
+    """Insert the tasks of a piece of a job; the last piece makes a `planning` job `queued` or `running`.
 
-    If its dataset was made before, the job ends once that has been checked (`reopening`).
+    If its dataset exists already, the job ends once the dataset has been checked (`recompute`).
     """
     last = _insert_plan(book, job, piece)
     book.connection.execute(update(jobs).where(jobs.c.seq == job).values(planned=piece.end))
@@ -85,7 +85,13 @@ def plan_piece(book: Ledger, job: int, piece: Plan) -> None:
     done = {"publish_task": publish_task, "planner": None, "planner_until": None}
     book.connection.execute(update(jobs).where(jobs.c.seq == job).values(done))
     if last is TaskState.succeeded:
-        set_job_state(book.connection, job, JobState.queued, book.now, message="all of it was made before: checking it")
+        set_job_state(
+            book.connection,
+            job,
+            JobState.queued,
+            book.now,
+            message="the dataset exists already: its files are being checked",
+        )
     elif _has_started_tasks(book.connection, job):
         set_job_state(book.connection, job, JobState.running, book.now)
     elif piece.first > 0:
@@ -181,7 +187,7 @@ def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
 
 
 def _retry(book: Ledger, job: int, lost: Sequence[_Known]) -> None:
-    """Let failed and cancelled tasks wait for a new try: to submit again is to ask for it."""
+    """Reset failed and cancelled tasks: submitting a spec again retries them."""
     for task in lost:
         book.moved(task.seq, task.stage, task.state, TaskState.pending)
     for batch in batches(lost):

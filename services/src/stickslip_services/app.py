@@ -1,10 +1,10 @@
-"""The coordinator: the parts put together as an ASGI application, and the process that serves it.
+"""The coordinator: its ASGI application, its background services, and the process that serves them.
 
-    python -m stickslip_services.coordinator --data DIR --port N
-    python -m stickslip_services.coordinator --openapi > docs/openapi.json
+    python -m stickslip_services.app --data DIR --port N
+    python -m stickslip_services.app --openapi > docs/openapi.json
 
-The port is bound before anything else is done, so that `--port 0` can say which one it got: the line
-`listening on http://...` on standard output is the sign that requests are answered.
+The port is bound first, so that `--port 0` can print the port that it got. The line `listening on http://...` on
+standard output means that requests are answered.
 """
 
 import argparse
@@ -13,7 +13,8 @@ import json
 import logging
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable
+from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +27,7 @@ from stickslip_schemas import tracing
 
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, local_worker_key
-from stickslip_services.access.webhooks import Messenger
+from stickslip_services.access.webhooks import WebhookDelivery
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
 from stickslip_services.api.auth import KeyMiddleware, OriginMiddleware
@@ -43,41 +44,101 @@ from stickslip_services.database.opening import opened
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.local.process import configure_logging, listen, locked
 from stickslip_services.pages.rendering import STATIC
-from stickslip_services.queue.coordinator import Coordinator
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.recompute import check_made_datasets
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
 
 PLAN_SECONDS = 0.2
-"""Time between two looks for jobs that are to be planned [s]."""
+"""Polling interval for unplanned jobs [s]."""
 
 GRACE_SECONDS = 3
-"""How long open requests (event streams) may go on after a signal to stop [s]."""
+"""Time that open requests (event streams) have to end after a signal [s]."""
+
+
+class LoopService(ABC):
+    """A background service: calls `run_once` in a thread, again and again, with pauses of `seconds` [s]."""
+
+    def __init__(self, context: Context, seconds: float) -> None:
+        self.context = context
+        self.seconds = seconds
+
+    @abstractmethod
+    def run_once(self) -> None:
+        """Do the work that is due."""
+
+    async def run(self) -> None:
+        """Loop until cancelled. An error is logged, and does not end the loop."""
+        while True:
+            await asyncio.sleep(self.seconds)
+            try:
+                await run_in_threadpool(self.run_once)
+            except Exception:  # for example a full disk
+                logger.exception("%s failed", type(self).__name__)
+
+
+class SweepService(LoopService):
+    """Takes back expired leases, retries tasks, and watches the store."""
+
+    def run_once(self) -> None:
+        """Sweep once."""
+        sweep(self.context)
+
+
+class CheckService(LoopService):
+    """Checks the files of existing datasets for the jobs that asked for them again."""
+
+    def run_once(self) -> None:
+        """Check the datasets of all waiting jobs."""
+        check_made_datasets(self.context)
+
+
+class PlanService(LoopService):
+    """Plans jobs of many samples."""
+
+    def __init__(self, context: Context, seconds: float) -> None:
+        super().__init__(context, seconds)
+        self._planner = Planner(context)
+
+    def run_once(self) -> None:
+        """Plan until nothing is left to plan."""
+        self._planner.run()
+
+
+class WebhookService(LoopService):
+    """Delivers job events to webhooks."""
+
+    def __init__(self, context: Context, seconds: float) -> None:
+        super().__init__(context, seconds)
+        self.delivery = WebhookDelivery(context.database, context.clock)
+
+    def run_once(self) -> None:
+        """Deliver all messages that are due."""
+        self.delivery.run()
 
 
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
-    """Return the application; the database is opened when it starts."""
-    coordinator = Coordinator(settings, clock)
-    messenger = Messenger(coordinator.database, coordinator.clock)
-    metrics = Metrics(coordinator.database, coordinator.store, coordinator.alive_workers, coordinator.eta_watch.held)
+    """Return the application; the database is migrated when it starts."""
+    context = Context.open(settings, clock)
+    metrics = Metrics(context)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        await run_in_threadpool(coordinator.start)
+        await run_in_threadpool(start, context)
         every = settings.sweep_seconds
-        keepers = [
-            asyncio.create_task(_for_ever(coordinator.sweep, every)),
-            asyncio.create_task(_for_ever(coordinator.check_made_datasets, every)),
-            asyncio.create_task(_for_ever(coordinator.plan_large_jobs, PLAN_SECONDS)),
-            asyncio.create_task(_for_ever(messenger.deliver, every)),
-            asyncio.create_task(coordinator.database.listen(coordinator.bell.ring)),
-        ]
+        webhooks = WebhookService(context, every)
+        services = [SweepService(context, every), CheckService(context, every), PlanService(context, PLAN_SECONDS)]
+        running = [asyncio.create_task(service.run()) for service in (*services, webhooks)]
+        running.append(asyncio.create_task(context.database.listen(context.notifier.notify)))
         yield
-        messenger.stop()
-        for keeper in keepers:
-            keeper.cancel()
-        await asyncio.gather(*keepers, return_exceptions=True)
-        coordinator.close()
+        webhooks.delivery.stop()
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+        context.close()
         await run_in_threadpool(tracing.stop)  # here: a signal ends the process as soon as the server has stopped
 
     app = FastAPI(
@@ -89,9 +150,9 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         redoc_url=None,
         openapi_url="/openapi.json",
     )
-    app.state.coordinator = coordinator
+    app.state.context = context
     app.state.metrics = metrics
-    app.state.feeds = Feeds(coordinator.database, coordinator.bell, coordinator.show)
+    app.state.feeds = Feeds(context)
     app.state.worker_key = local_worker_key(settings.worker_key_path)
     routers = [module.router for module in (jobs, textures, datasets, certificates, tasks, workers, health, pages)]
     for router in routers:
@@ -101,31 +162,21 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
-    app.add_middleware(KeyMiddleware, ring=KeyRing(coordinator.database), required=settings.keys_required)
+    app.add_middleware(KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required)
     app.add_middleware(OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
     app.add_middleware(RequestIdMiddleware)
     app.add_middleware(TimingMiddleware, observe=metrics.observe)
     return app
 
 
-async def _for_ever(work: Callable[[], None], seconds: float) -> None:
-    """Do some work again and again, in a thread, with pauses between."""
-    while True:
-        await asyncio.sleep(seconds)
-        try:
-            await run_in_threadpool(work)
-        except Exception:  # a full disk, say: the next time it may be otherwise
-            logger.exception("%s failed", work.__name__)
-
-
 def openapi_text() -> str:
-    """Return the OpenAPI document as it is committed."""
+    """Return the OpenAPI document in its committed form."""
     with TemporaryDirectory() as data:
         return json.dumps(make_app(Settings(data=Path(data), database=None)).openapi(), indent=2, sort_keys=True) + "\n"
 
 
 class _Server(uvicorn.Server):
-    """Says on standard output where it listens, once it does."""
+    """Prints the URL on standard output as soon as it listens."""
 
     def __init__(self, config: uvicorn.Config, url: str) -> None:
         super().__init__(config)
@@ -139,8 +190,8 @@ class _Server(uvicorn.Server):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run until a signal comes; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m stickslip_services.coordinator", description="The coordinator.")
+    """Run until a signal arrives; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m stickslip_services.app", description="The coordinator.")
     parser.add_argument("--data", type=Path, help="directory of the database and the store")
     parser.add_argument("--store", help="directory of the store, or s3://BUCKET/PREFIX (DATA/store)")
     parser.add_argument("--database", help="URL of a PostgreSQL database; STICKSLIP_DATABASE hides its password better")
@@ -181,7 +232,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _serve(settings: Settings, descriptor: int | None) -> int:
-    """Answer requests until a signal comes; return the exit status."""
+    """Answer requests until a signal arrives; return the exit status."""
     try:
         listener = listen(settings.host, settings.port) if descriptor is None else socket.socket(fileno=descriptor)
     except OSError as error:

@@ -1,10 +1,9 @@
-"""Auditing the ledger: what must hold of the database between any two transactions."""
+"""Invariants of the queue: conditions that hold in the database between any two transactions."""
 
 from collections import Counter
 
 from sqlalchemy import Connection, case, func, select
 from stickslip_schemas.base.states import JobState, Stage, TaskState
-
 from stickslip_services.database.tables import (
     dataset_versions,
     job_counts,
@@ -19,8 +18,8 @@ from stickslip_services.database.tables import (
 from stickslip_services.queue.ledger import LIVE, OVER, RUNNABLE
 
 
-def audit(connection: Connection) -> list[str]:
-    """Return what does not hold; empty where all is well."""
+def violations(connection: Connection) -> list[str]:
+    """Return the violated invariants, in words; an empty list if all hold."""
     return [
         *_task_faults(connection),
         *_dependency_faults(connection),

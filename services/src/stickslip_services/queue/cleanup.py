@@ -1,19 +1,25 @@
-"""Removing a version of a dataset, with the jobs that made it and the tasks that nobody else needs.
+"""Clean-up: removing versions of datasets, and finding artifacts that nothing refers to.
 
-The files stay in the store, where other versions may use them; what nothing refers to any more, `unused` finds.
+A version goes with the jobs that made it, and the tasks that no other job needs. Its files stay in the store, where
+other versions may use them, until `unused` finds them.
 """
 
+import re
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, delete, select, update
+from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
 from stickslip_schemas.base.states import JobState
+from stickslip_schemas.format.manifest import Contents, Manifest, seal_text
 from stickslip_schemas.store import Store
 
 from stickslip_services.access.audit_log import note
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import (
+    certificates,
     dataset_versions,
     datasets,
     events,
@@ -31,10 +37,12 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.errors import ConflictError, NotFoundError
 
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
 
 @dataclass(frozen=True, slots=True)
 class Removed:
-    """What went with a version."""
+    """Number of jobs and tasks removed with a version."""
 
     jobs: int
     tasks: int
@@ -90,8 +98,61 @@ def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
 
 
 def _still_held(connection: Connection, held: set[int]) -> set[int]:
-    """Return which tasks a job has; a job has all that its tasks build on, too."""
+    """Return which of the tasks a job still has; a job has all dependencies of its tasks, too."""
     found: set[int] = set()
     for batch in batches(held):
         found.update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.task.in_(batch)).distinct()))
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class Unused:
+    """A file of the store that may be deleted."""
+
+    name: str
+    """See `Store.delete`."""
+    bytes: int
+
+
+def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Unused]:
+    """Yield artifacts and temporary files without references, unchanged for `older_than` seconds.
+
+    References are those of tasks, jobs, versions and certificates in the database, and of versions in the store.
+    Raises CorruptArtifactError, OSError or ValueError where the manifest of a version cannot be read.
+    """
+    needed = _needed(database, store)
+    latest = time.time() - older_than
+    for file in store.stored():
+        is_needed = is_sha256(file.name) and bytes.fromhex(file.name) in needed
+        if not is_needed and not file.is_shown and file.modified_at < latest:
+            yield Unused(file.name, file.bytes)
+
+
+def _needed(database: Database, store: Store) -> set[bytes]:
+    """Return the digests of all artifacts that the database refers to."""
+    needed: set[bytes] = set()
+
+    def add(*digests: Sha256 | None) -> None:
+        needed.update(bytes.fromhex(digest) for digest in digests if digest)
+
+    with database.read() as connection:
+        for texts in connection.execute(select(tasks.c.output, tasks.c.payload)):
+            for text in texts:
+                add(*_DIGEST.findall(text or ""))
+        add(*connection.scalars(select(previews.c.digest)))
+        for manifest, spec in connection.execute(select(jobs.c.manifest, jobs.c.spec)):
+            add(manifest, *_DIGEST.findall(spec))  # a spec names textures, also before its tasks are planned
+        for certificate in connection.execute(select(certificates.c.artifact, certificates.c.page)):
+            add(*certificate)
+        columns = dataset_versions.c
+        versions = connection.execute(
+            select(columns.manifest, columns.group_digest).where(columns.manifest.is_not(None))
+        )
+        for manifest, group in versions.all():
+            contents = Contents(
+                Manifest.model_validate_json(store.read(manifest)), lambda file: store.read(file.sha256)
+            )
+            add(manifest, group, *(file.sha256 for file in contents.files()))
+            if group is not None:
+                add(sha256(seal_text(manifest, group)))
+    return needed

@@ -1,11 +1,10 @@
-"""Leases: who may run which task, and until when.
+"""Which tasks are leased next: fair shares of projects and jobs.
 
-A lease is (worker, token); the token of a task increments at each lease, so that a worker that lost its lease is told
-from the one that has it. The next task goes to the project that has the fewest tasks on lease; of its jobs, to the one
-of the highest priority, and of those to the one that has the fewest tasks on lease: a small job does not wait behind a
-big one, jobs of one size share evenly, and no project can take all workers by its priorities or its number of jobs.
-Within a job and stage the order is that of the slots, so that shards fill up one after the other. How many tasks of
-each stage run is the dispatcher's choice.
+The next task is that of the project with the fewest tasks on lease; of its jobs, of the one with the highest priority,
+and of those, of the one with the fewest tasks on lease. So a small job does not wait behind a big one, jobs of equal
+priority share evenly, and no project can occupy all workers by its priorities or its number of jobs. Within a job and
+stage the order is that of the slots, so that shards fill up one after the other. The dispatcher chooses how many tasks
+of each stage it runs.
 """
 
 import heapq
@@ -13,27 +12,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
-from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Stage, TaskState
-from stickslip_schemas.documents.worker_api import Lease, LeaseState
 
-from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
-from stickslip_services.queue.compose import Publish, StoredTask, compose_tasks, reserve_version
-from stickslip_services.queue.costs import limit_seconds, long_groups, read_costs
-from stickslip_services.queue.eta import Cost, Group
-from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.queue.compose import StoredTask, reserve_version
+from stickslip_services.queue.eta import Cost, Group, limit_seconds, long_groups, read_costs
+from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
     LIVE,
     RUNNABLE,
-    HeldTask,
     Ledger,
-    cancel_tasks,
-    live_jobs,
-    release,
-    runnable_tasks,
-    start_tasks,
 )
 from stickslip_services.queue.workers import RegisteredWorker
 from stickslip_services.settings import Settings
@@ -115,7 +104,7 @@ _LEASE = Prepared(
 def has_ready_task(
     connection: Connection, worker: RegisteredWorker, stages: Iterable[Stage], *, at_most: float | None
 ) -> bool:
-    """Tell whether a lease request of these stages would be granted anything; `at_most` seconds a call."""
+    """Return whether a request for these stages would be granted a task of at most `at_most` seconds a call."""
     costs = {} if at_most is None else read_costs(connection)
     return any(
         _READY_TASK.scalar(
@@ -135,7 +124,7 @@ def has_ready_task(
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A task that has been leased and is still to be composed."""
+    """A leased task that is not composed yet."""
 
     task: StoredTask
     job: int
@@ -180,23 +169,6 @@ def grant_leases(
     return grants
 
 
-def compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
-    """Return what the worker is told of the tasks that it has been granted; see `compose_tasks`."""
-    composed = compose_tasks(connection, [grant.task for grant in grants], publish)
-    traceparents = _traceparents_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
-    return tuple(
-        Lease(
-            task_id=grant.task_id,
-            token=grant.token,
-            attempt=grant.attempt,
-            limit_seconds=grant.limit_seconds,
-            traceparent=traceparents.get(grant.job),
-            task=composed[grant.task.seq],
-        )
-        for grant in grants
-    )
-
-
 def _pick(
     connection: Connection,
     worker: RegisteredWorker,
@@ -205,7 +177,7 @@ def _pick(
     costs: Mapping[Group, Cost],
     at_most: float | None,
 ) -> list[_Ready]:
-    """Choose ready tasks of a stage, one at a time; see the module for which comes next."""
+    """Choose ready tasks of a stage, one at a time, in the order that the module describes."""
     queues: dict[str, list[_Waiting]] = {}
     for job, project, priority, on_lease in _jobs_with_pending(connection, stage):
         ready = [
@@ -289,82 +261,3 @@ def _ready_tasks(
         )
         for row in rows
     ]
-
-
-def renew_leases(
-    book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState], settings: Settings
-) -> tuple[str, ...]:
-    """Renew leases, note which tasks have been started, and return the tasks that the worker has to drop."""
-    drop: list[str] = []
-    mine: list[tuple[LeaseState, HeldTask]] = []
-    keys = {state.task_id: task_key(state.task_id) for state in held}
-    names = ("key", "seq", "stage", "state", "tries", "losses", "token", "owner")
-    columns = [tasks.c[name] for name in names]
-    rows = {
-        row.key: row
-        for batch in batches(key for key in keys.values() if key is not None)
-        for row in book.connection.execute(select(*columns).where(tasks.c.key.in_(batch)))
-    }
-    for lease in held:
-        row = rows.get(keys[lease.task_id] or b"")
-        if row is None or row.owner != worker.id or row.token != lease.token or worker.superseded:
-            drop.append(lease.task_id)
-        else:
-            mine.append(
-                (lease, HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses))
-            )
-    unneeded = _unneeded(book, mine)
-    cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
-    halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
-    for _, task in mine:
-        if task.seq in halted:
-            release(book, task, TaskState.pending)
-    drop.extend(lease.task_id for lease, task in mine if task.seq in unneeded | halted)
-    kept = [(lease, task) for lease, task in mine if task.seq not in unneeded | halted]
-    for batch in batches(kept):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([task.seq for _, task in batch]))
-            .values(expires_at=book.now + settings.lease_seconds)
-        )
-    started = [task for lease, task in kept if lease.started and task.state is TaskState.leased]
-    start_tasks(book, [(task.seq, task.stage) for task in started])
-    return tuple(drop)
-
-
-def renew_all_leases(connection: Connection, now: float, settings: Settings) -> None:
-    """Give every lease its full time again: while the coordinator was down, no heartbeat could arrive."""
-    connection.execute(
-        update(tasks).where(text("tasks.owner IS NOT NULL")).values(expires_at=now + settings.lease_seconds)
-    )
-
-
-def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
-    """Return the tasks to cancel: those of jobs being cancelled, and of ended jobs those that have not been started.
-
-    What a failed job had already started is left to finish: it is paid for, and kept for the next time.
-    """
-    seqs = [task.seq for _, task in held]
-    needed = live_jobs(book.connection, seqs)
-    cancelling = book.holders(seq for seq in seqs if seq not in needed)
-    return {
-        task.seq
-        for lease, task in held
-        if task.seq not in needed and (task.seq in cancelling or not _is_started(lease, task))
-    }
-
-
-def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
-    """Return the tasks to give back: those that only paused jobs need and that have not been started."""
-    waiting = {task.seq for lease, task in held if not _is_started(lease, task)}
-    return live_jobs(book.connection, waiting).keys() - runnable_tasks(book.connection, waiting)
-
-
-def _is_started(lease: LeaseState, task: HeldTask) -> bool:
-    return lease.started or task.state is TaskState.running
-
-
-def _traceparents_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
-    """Return the traceparents of the jobs that have one, by `seq`."""
-    rows = connection.execute(select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_(job_seqs)))
-    return {seq: traceparent for seq, traceparent in rows if traceparent is not None}

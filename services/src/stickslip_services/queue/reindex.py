@@ -1,8 +1,8 @@
-"""Finding the datasets of a store again after the database was lost.
+"""Rebuilding the index of datasets from the store after the database was lost.
 
-A version is known by its manifest, its root's metadata and the seal that vouches for both. Of each version that is
-whole a job is written down that has made it, so that the dataset is listed and can be pulled, and a spec that is
-submitted again finds it. Results of single simulations and renders are not found again, and neither are certificates.
+A version is identified by its manifest, the metadata of its root, and the seal that binds both. For each intact version
+the job that made it is inserted, so that the dataset is listed and can be pulled, and a spec that is submitted again
+finds it. Results of single simulations and renders, and certificates, are not restored.
 """
 
 from collections.abc import Iterator
@@ -27,9 +27,8 @@ from stickslip_services.database.database import Database
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.plan import Terms
-from stickslip_services.queue.planning import pieces
-from stickslip_services.queue.submitting import begin_planning, insert_job, plan_piece
+from stickslip_services.queue.plan import Terms, pieces
+from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
 
 PIECE = 10_000
 """Samples that are planned at once."""
@@ -93,7 +92,7 @@ def _take_in(database: Database, store: Store, manifest: Manifest, output: Publi
             job = insert_job(book, manifest.spec)
             begin_planning(book, job, terms)
             for piece in pieces(manifest.spec, terms, size=PIECE):
-                plan_piece(book, job, piece)
+                write_plan(book, job, piece)
             task = connection.scalar(select(jobs.c.publish_task).where(jobs.c.seq == job))
             assert task is not None
             connection.execute(

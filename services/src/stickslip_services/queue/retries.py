@@ -1,9 +1,9 @@
-"""What becomes of a task that was not finished: another try, or the end. And when its lease expires.
+"""Retries: what happens to a leased task that fails, or whose worker is lost.
 
-A try counts only where the task had been started, and where it was not the worker that was lost. A failed try waits a
-little (1 s, 2 s, ...) before the next; after `max_tries` of them the task fails. One that took its process with it each
-time is set aside: the jobs that need it go on with everything else. Any other failure ends every job that needs the
-task: it starts no further tasks; what is running finishes and is kept.
+Losing a worker does not count as a failed try, and neither does a task that had not been started. After the n-th failed
+try the task waits `retry_seconds` 2^(n-1); after `max_tries` of them it fails. A task that ended its process each time
+is quarantined, and the jobs that need it continue with everything else. Any other failure ends all jobs that need the
+task: they start no further tasks, and running ones finish and are kept.
 """
 
 import shlex
@@ -17,6 +17,7 @@ from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ending, HeldTask, Ledger, cancel_tasks, live_jobs, release
@@ -24,7 +25,7 @@ from stickslip_services.settings import Settings
 
 
 def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: bool = False) -> list[HeldTask]:
-    """Return the tasks that `owners` hold, or whose lease has expired."""
+    """Return the leased tasks of `owners`, or those whose lease has expired."""
     query = select(tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.tries, tasks.c.losses).where(
         text("tasks.owner IS NOT NULL")  # in the words of the partial index
     )
@@ -39,13 +40,13 @@ def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: boo
 
 
 def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:
-    """Let tasks wait again as if they had never been leased, or cancel them where no live job needs them."""
+    """Return tasks to `pending` as if they had never been leased; cancel those that no live job needs."""
     for task, job in _still_needed(book, held):
         release(book, task, TaskState.pending, job=job)
 
 
 def lose(book: Ledger, held: Sequence[HeldTask], settings: Settings, *, message: str) -> None:
-    """Take leases from a lost worker. Tasks that it had started are not to blame, unless it happens too often."""
+    """Take back the leases of a lost worker. A task fails after `max_losses` lost workers."""
     give_back(book, [task for task in held if task.state is TaskState.leased])
     for task, job in _still_needed(book, [task for task in held if task.state is not TaskState.leased]):
         losses = task.losses + 1
@@ -56,7 +57,7 @@ def lose(book: Ledger, held: Sequence[HeldTask], settings: Settings, *, message:
 
 
 def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], settings: Settings) -> None:
-    """Count failed tries; each task tries again or fails for good."""
+    """Count failed tries; each task is retried later, or fails for good."""
     why = {task.seq: (reason, message) for task, reason, message in failures}
     for task, job in _still_needed(book, [task for task, _, _ in failures]):
         reason, message = why[task.seq]
@@ -71,7 +72,7 @@ def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], s
 
 
 def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, times: int, settings: Settings) -> None:
-    """Let a task fail for good; `times` it failed."""
+    """Let a task fail for good after `times` failures or losses."""
     tries = task.tries + (reason is not Reason.worker_lost)
     values = {"job": job, "tries": tries, "finished_at": book.now}
     name = task_id(task.stage, task.key)
@@ -80,13 +81,15 @@ def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, 
         _tell(book, task, TaskState.failed, reason, message)
         _fail_jobs(book, task, f"task {name} failed {times} times, at last with {reason}: {message}", settings)
         return
-    message = f"set aside after {times} tries, at last {reason}: {message}. To reproduce: {reproducer(name, settings)}"
+    message = (
+        f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {reproducer(name, settings)}"
+    )
     release(book, task, TaskState.failed, reason=Reason.quarantined, message=message, **values)
     _tell(book, task, TaskState.failed, Reason.quarantined, message)
     for job_seq in _live_holders(book, task):
         count = _count_failed(book.connection, job_seq)
         if count > settings.max_quarantined:
-            _fail_jobs(book, task, f"{count} of its tasks were set aside, at last {name}: {message}", settings)
+            _fail_jobs(book, task, f"{count} of its tasks were quarantined, at last {name}: {message}", settings)
             return
         state = JobState(book.connection.execute(select(jobs.c.state).where(jobs.c.seq == job_seq)).scalar_one())
         if state in RUNNABLE:
@@ -113,19 +116,23 @@ _IS_DUE = Prepared(
 
 
 def is_sweep_due(connection: Connection, now: float) -> bool:
-    """Tell whether a lease has expired or a retry is due, without taking the write lock."""
+    """Return whether a lease has expired or a retry is due, without taking the write lock."""
     return bool(_IS_DUE.scalar(connection, {"b_now": now}))
 
 
-def sweep(book: Ledger, settings: Settings) -> None:
-    """Take expired leases back and let due retries wait for a worker again."""
-    expired = find_held(book, expired=True)
-    lose(book, expired, settings, message=f"no heartbeat for {settings.lease_seconds:g} s")
-    _retry_due(book)
+def take_back(context: Context) -> None:
+    """Take back expired leases, and return tasks whose retry is due to `pending`."""
+    with context.database.read() as connection:
+        if not is_sweep_due(connection, context.clock()):
+            return
+    with context.ledger() as book:
+        message = f"no heartbeat for {context.settings.lease_seconds:g} s"
+        lose(book, find_held(book, expired=True), context.settings, message=message)
+        _retry_due(book)
 
 
 def _retry_due(book: Ledger) -> None:
-    """Let tasks whose wait is over be leased again."""
+    """Return tasks whose retry is due to `pending`."""
     due = book.connection.execute(
         select(tasks.c.seq, tasks.c.stage).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now)
     ).all()
@@ -140,7 +147,7 @@ def _retry_due(book: Ledger) -> None:
 
 
 def reproducer(name: str, settings: Settings) -> str:
-    """Return the command that runs a task again, by itself, on a machine with a worker's environment."""
+    """Return the shell command that runs a task alone, on a machine with a worker's environment."""
     fetch = f"curl -s {settings.url}/v1/tasks/{name} -o task.json"
     return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(settings.store_place)}"
 

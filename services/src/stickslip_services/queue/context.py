@@ -1,0 +1,66 @@
+"""The context of one coordinator: what the verbs of the queue share, and its state in memory."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.store import Store, open_store
+
+from stickslip_services.clock import Clock
+from stickslip_services.database.database import Database
+from stickslip_services.database.opening import connect
+from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.eta import EtaWatch
+from stickslip_services.queue.ledger import Ledger
+from stickslip_services.queue.notifier import Notifier
+from stickslip_services.queue.store_watch import StoreWatch
+from stickslip_services.settings import Settings
+
+
+@dataclass(slots=True)
+class Context:
+    """Database, store, clock and settings of a coordinator. What is in memory only is lost with a restart."""
+
+    settings: Settings
+    database: Database
+    clock: Clock
+    store: Store
+    store_watch: StoreWatch
+    notifier: Notifier = field(default_factory=Notifier)
+    eta_watch: EtaWatch = field(default_factory=EtaWatch)
+    frames_by_worker: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
+    """Progress of simulations from the last heartbeat of each worker: (frames done, frames total) by task."""
+    sections: dict[str, tuple[Sha256, ...]] = field(default_factory=dict)
+    """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an earlier process."""
+    is_closing: bool = False
+
+    @classmethod
+    def open(cls, settings: Settings, clock: Clock | None = None) -> "Context":
+        """Connect to the database and the store; `clock` replaces the clock of the database, for tests."""
+        database, store = connect(settings), open_store(settings.store_place)
+        clock = clock or database.clock
+        watch = StoreWatch(store, settings.data, min_free_bytes=settings.min_free_bytes, clock=clock)
+        return cls(settings, database, clock, store, watch)
+
+    def close(self) -> None:
+        """Close the database."""
+        self.is_closing = True
+        self.database.close()
+
+    @contextmanager
+    def ledger(self) -> Iterator[Ledger]:
+        """Open a write transaction with a ledger; notify watchers after the commit."""
+        with self.database.write() as connection, ledger(connection, self.clock()) as book:
+            yield book
+        self.notifier.notify()
+
+    @property
+    def frames(self) -> dict[str, tuple[int, int]]:
+        """Progress of running simulations by task: (frames done, frames total)."""
+        return {task: frames for by_task in list(self.frames_by_worker.values()) for task, frames in by_task.items()}
+
+    @property
+    def alive_since(self) -> float:
+        """Workers whose last message is older than this are presumed lost [s since 1970]."""
+        return self.clock() - self.settings.lease_seconds

@@ -1,0 +1,135 @@
+"""Control of jobs: cancel, pause, resume and prioritise them. Each change is one transaction with an audit entry."""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import Connection, Row, select, update
+from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.documents.responses import JobDetail
+
+from stickslip_services.access.audit_log import note
+from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.tables import jobs
+from stickslip_services.errors import ConflictError, PreconditionFailedError
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.events import set_job_state
+from stickslip_services.queue.jobs import etag, find_job, show_job
+from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
+from stickslip_services.queue.planner import plan_waiting_jobs
+from stickslip_services.queue.workers import NO_WORKER, note_stranded
+
+IfMatch = Collection[str] | None
+"""Entity tags, one of which the job must have; None: any. Otherwise PreconditionFailedError is raised."""
+
+
+def cancel_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:
+    """Cancel a job; one that is cancelled, or being cancelled, stays so. Raise ConflictError if it has ended."""
+    with _change(context, job_id, if_match, "job.cancel") as (book, job):
+        if job.state not in (JobState.cancelling, JobState.cancelled):
+            if not JobState(job.state).is_open:
+                raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
+            _set_state(book, job.seq, JobState.cancelling, Reason.cancelled, "tasks that are running are being stopped")
+            give_up_tasks(book, job.seq)
+    return _shown(context, job.seq)
+
+
+def pause_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:
+    """Pause a job: no further tasks are leased, running ones finish. Raise ConflictError if it has ended."""
+    with _change(context, job_id, if_match, "job.pause") as (book, job):
+        pausing = (JobState.pausing, JobState.paused)
+        if job.state not in (*RUNNABLE, *pausing):
+            raise ConflictError(
+                f"job {job_id} is {job.state}, and only one that is planning, queued or running can be paused"
+            )
+        if job.state not in pausing or job.reason is not None:  # a job that waits for the store stays paused after it
+            _set_state(book, job.seq, JobState.pausing, None, "nothing more is started; tasks that are running finish")
+            charge_waiting_tasks(book.connection, job.seq)
+    return _shown(context, job.seq)
+
+
+def resume_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:
+    """Resume a paused job with the builds that it was planned for; a job that is not paused is left as it is.
+
+    Raises ConflictError if it has ended, or while the store takes no results.
+    """
+    if trouble := context.store_watch.trouble:
+        raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
+    with _change(context, job_id, if_match, "job.resume") as (book, job):
+        _resume(book, job)
+    plan_waiting_jobs(context)
+    note_stranded(context)
+    return _shown(context, job.seq)
+
+
+def prioritise_job(context: Context, job_id: str, priority: int, *, if_match: IfMatch = None) -> JobDetail:
+    """Set the priority of a job. Raise ConflictError if it has ended."""
+    with _change(context, job_id, if_match, "job.prioritise", priority=priority) as (book, job):
+        if not JobState(job.state).is_open:
+            raise ConflictError(f"job {job_id} has ended ({job.state}); its priority cannot be changed")
+        book.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(priority=priority))
+        charge_waiting_tasks(book.connection, job.seq)
+    return _shown(context, job.seq)
+
+
+def hold_jobs(book: Ledger, trouble: str) -> None:
+    """Pause all runnable jobs because the store takes no results."""
+    message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
+    for seq in book.connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))).all():
+        _set_state(book, seq, JobState.pausing, Reason.store_unavailable, message)
+        charge_waiting_tasks(book.connection, seq)
+
+
+def release_jobs(book: Ledger) -> None:
+    """Resume the jobs that waited for the store."""
+    for job_id in held_jobs(book.connection):
+        _resume(book, find_job(book.connection, job_id))
+
+
+_HELD_JOBS = Prepared(
+    select(jobs.c.id)
+    .where(jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable)
+    .order_by(jobs.c.seq)
+)
+
+
+def held_jobs(connection: Connection) -> list[str]:
+    """Return the ids of the jobs that wait for the store."""
+    return [job_id for (job_id,) in _HELD_JOBS.tuples(connection)]
+
+
+@contextmanager
+def _change(
+    context: Context, job_id: str, if_match: IfMatch, action: str, **details: Any
+) -> Iterator[tuple[Ledger, Row[Any]]]:
+    """Open a transaction that changes a job; yield its ledger and the job's row. It ends with an audit entry."""
+    with context.ledger() as book:
+        job = find_job(book.connection, job_id)
+        if if_match is not None and etag(show_job(context, book.connection, job.seq)) not in if_match:
+            raise PreconditionFailedError(
+                f"job {job_id} has changed since the ETag in If-Match, {', '.join(if_match)[:200]}: get it again"
+            )
+        yield book, job
+        note(book.connection, action, job_id, book.now, **details)
+
+
+def _resume(book: Ledger, job: Row[Any]) -> None:
+    if job.state in RUNNABLE:
+        return
+    if job.state not in (JobState.pausing, JobState.paused):
+        raise ConflictError(f"job {job.id} is {job.state}, and only a paused job can be resumed")
+    state = JobState.queued if job.started_at is None else JobState.running
+    if job.builds is not None and job.planned < job.sample_count:
+        state = JobState.planning
+    reason, message = (None, "") if job.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
+    _set_state(book, job.seq, state, reason, message)
+    charge_waiting_tasks(book.connection, job.seq)
+
+
+def _set_state(book: Ledger, job: int, state: JobState, reason: Reason | None, message: str) -> None:
+    set_job_state(book.connection, job, state, book.now, reason=reason, message=message)
+
+
+def _shown(context: Context, job: int) -> JobDetail:
+    with context.database.read() as connection:
+        return show_job(context, connection, job)

@@ -1,0 +1,215 @@
+"""Leases: workers register, lease tasks, and renew their leases.
+
+A lease is (worker, token). The token of a task increments with each lease (fencing), so that a message of a worker that
+has lost its lease is recognised.
+"""
+
+from collections.abc import Iterable, Sequence
+
+from sqlalchemy import Connection, select, text, update
+from stickslip_schemas import tracing
+from stickslip_schemas.base.states import Stage, TaskState
+from stickslip_schemas.documents.tasks import PublishTask
+from stickslip_schemas.documents.worker_api import (
+    Heartbeat,
+    HeartbeatAnswer,
+    Lease,
+    LeaseBatch,
+    LeaseRequest,
+    LeaseState,
+    WorkerRegistration,
+    WorkerSession,
+)
+
+from stickslip_services.database.database import batches
+from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.errors import ConflictError
+from stickslip_services.queue.compose import Publish, compose_tasks
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.grants import Grant, grant_leases, has_ready_task
+from stickslip_services.queue.ids import task_key
+from stickslip_services.queue.jobs import has_runnable_job
+from stickslip_services.queue.ledger import (
+    HeldTask,
+    Ledger,
+    cancel_tasks,
+    live_jobs,
+    release,
+    runnable_tasks,
+    start_tasks,
+)
+from stickslip_services.queue.planner import plan_waiting_jobs
+from stickslip_services.queue.retries import find_held, is_sweep_due, lose, take_back
+from stickslip_services.queue.workers import (
+    RegisteredWorker,
+    find_worker,
+    insert_worker,
+    is_silent,
+    note_seen,
+    note_stranded,
+    other_sessions,
+)
+
+BUSY_POLL_SECONDS = 0.2
+IDLE_POLL_SECONDS = 1.0
+
+
+def register_worker(context: Context, registration: WorkerRegistration) -> WorkerSession:
+    """Register a worker; an earlier session of the name loses its leases."""
+    with context.ledger() as book:
+        old = other_sessions(book.connection, registration.name)
+        worker = insert_worker(book.connection, registration, book.now)
+        message = f"worker {registration.name} was started anew"
+        lose(book, find_held(book, owners=old), context.settings, message=message)
+    plan_waiting_jobs(context)
+    note_stranded(context)
+    return WorkerSession(worker_id=worker.id, lease_seconds=context.settings.lease_seconds)
+
+
+def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
+    """Lease tasks to a worker; raise UnknownWorkerError, or ConflictError for a superseded session."""
+    wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
+    with context.database.read() as connection:
+        worker = _unsuperseded(connection, request.worker_id)
+        due = is_sweep_due(connection, context.clock())
+        ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
+        waiting = ready or has_runnable_job(connection)
+    _note_seen(context, worker)
+    if due:
+        take_back(context)
+    if context.store_watch.trouble:
+        return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
+    if not (ready or due):
+        return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
+    with context.ledger() as book:
+        worker = _unsuperseded(book.connection, worker.id)
+        grants = grant_leases(book, worker, wanted, context.settings, at_most=request.at_most_seconds)
+    # The dependencies of these tasks have ended, so composing them needs no write transaction.
+    with context.database.read() as connection:
+        leases = _compose_leases(connection, grants, context.store.publish)
+    context.sections |= {lease.task_id: lease.task.sections for lease in leases if isinstance(lease.task, PublishTask)}
+    return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
+
+
+def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
+    """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
+    with context.database.read() as connection:
+        worker = find_worker(connection, message.worker_id)
+    _note_seen(context, worker)
+    context.frames_by_worker[worker.id] = {
+        lease.task_id: lease.frames for lease in message.leases if lease.frames is not None
+    }
+    if not message.leases:
+        return HeartbeatAnswer(drop=())
+    with context.ledger() as book:
+        worker = find_worker(book.connection, worker.id)
+        drop = _renew_leases(book, worker, message.leases, context.settings.lease_seconds)
+    return HeartbeatAnswer(drop=drop)
+
+
+def _note_seen(context: Context, worker: RegisteredWorker) -> None:
+    """Store that a worker is alive, unless that was done a moment ago: a poll is not worth a write."""
+    if is_silent(context, worker):
+        with context.database.write() as connection:
+            note_seen(connection, worker.id, context.clock())
+
+
+def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
+    worker = find_worker(connection, worker_id)
+    if worker.superseded:
+        raise ConflictError(f"another session of worker {worker.name} has registered; this one gets no tasks")
+    return worker
+
+
+def _compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
+    """Return the leases of granted tasks; see `compose_tasks`."""
+    composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+    traceparents = _traceparents_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
+    return tuple(
+        Lease(
+            task_id=grant.task_id,
+            token=grant.token,
+            attempt=grant.attempt,
+            limit_seconds=grant.limit_seconds,
+            traceparent=traceparents.get(grant.job),
+            task=composed[grant.task.seq],
+        )
+        for grant in grants
+    )
+
+
+def _renew_leases(
+    book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState], lease_seconds: float
+) -> tuple[str, ...]:
+    """Renew leases, note which tasks have been started, and return the tasks that the worker must drop."""
+    drop: list[str] = []
+    mine: list[tuple[LeaseState, HeldTask]] = []
+    keys = {state.task_id: task_key(state.task_id) for state in held}
+    names = ("key", "seq", "stage", "state", "tries", "losses", "token", "owner")
+    columns = [tasks.c[name] for name in names]
+    rows = {
+        row.key: row
+        for batch in batches(key for key in keys.values() if key is not None)
+        for row in book.connection.execute(select(*columns).where(tasks.c.key.in_(batch)))
+    }
+    for lease in held:
+        row = rows.get(keys[lease.task_id] or b"")
+        if row is None or row.owner != worker.id or row.token != lease.token or worker.superseded:
+            drop.append(lease.task_id)
+        else:
+            mine.append(
+                (lease, HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses))
+            )
+    unneeded = _unneeded(book, mine)
+    cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
+    halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
+    for _, task in mine:
+        if task.seq in halted:
+            release(book, task, TaskState.pending)
+    drop.extend(lease.task_id for lease, task in mine if task.seq in unneeded | halted)
+    kept = [(lease, task) for lease, task in mine if task.seq not in unneeded | halted]
+    for batch in batches(kept):
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq.in_([task.seq for _, task in batch]))
+            .values(expires_at=book.now + lease_seconds)
+        )
+    started = [task for lease, task in kept if lease.started and task.state is TaskState.leased]
+    start_tasks(book, [(task.seq, task.stage) for task in started])
+    return tuple(drop)
+
+
+def renew_all_leases(connection: Connection, now: float, lease_seconds: float) -> None:
+    """Renew every lease: while the coordinator was down, no heartbeat could arrive."""
+    connection.execute(update(tasks).where(text("tasks.owner IS NOT NULL")).values(expires_at=now + lease_seconds))
+
+
+def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
+    """Return the tasks to cancel: those of `cancelling` jobs, and of ended jobs those that have not been started.
+
+    Tasks that a failed job has started finish, and their results are kept for the next submission.
+    """
+    seqs = [task.seq for _, task in held]
+    needed = live_jobs(book.connection, seqs)
+    cancelling = book.holders(seq for seq in seqs if seq not in needed)
+    return {
+        task.seq
+        for lease, task in held
+        if task.seq not in needed and (task.seq in cancelling or not _is_started(lease, task))
+    }
+
+
+def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
+    """Return the tasks to give back: those that only paused jobs need, and that have not been started."""
+    waiting = {task.seq for lease, task in held if not _is_started(lease, task)}
+    return live_jobs(book.connection, waiting).keys() - runnable_tasks(book.connection, waiting)
+
+
+def _is_started(lease: LeaseState, task: HeldTask) -> bool:
+    return lease.started or task.state is TaskState.running
+
+
+def _traceparents_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
+    """Return the traceparents of the jobs that have one, by `seq`."""
+    rows = connection.execute(select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_(job_seqs)))
+    return {seq: traceparent for seq, traceparent in rows if traceparent is not None}

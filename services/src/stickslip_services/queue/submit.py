@@ -1,0 +1,201 @@
+"""Submission of jobs: checks, idempotency, planning at once or later, and what a job of a spec would be."""
+
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, func, insert, select
+from stickslip_schemas import tracing
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import JobState, Reason, TaskState
+from stickslip_schemas.documents.responses import JobDetail, Validation
+from stickslip_schemas.format.layout import bytes_estimate
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.grid import count
+from stickslip_schemas.spec.jobs import JobSpec
+
+from stickslip_services.access.audit_log import note
+from stickslip_services.access.projects import check_quota, this_project
+from stickslip_services.catalog.textures import check_textures
+from stickslip_services.database.database import Database, batches
+from stickslip_services.database.tables import dataset_versions, idempotency_keys, jobs, tasks
+from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.queue.closing import ledger
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.events import set_job_state
+from stickslip_services.queue.jobs import show_job
+from stickslip_services.queue.ledger import Ledger
+from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, terms_for
+from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
+from stickslip_services.queue.workers import NO_WORKER
+from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
+
+LOOKED_UP = 10_000
+"""The largest grid whose tasks are looked up one by one for existing results."""
+
+_SETTLED = [state for state in TaskState if state.is_settled]
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """The answer to the first request with an idempotency key."""
+
+    job_id: str
+    response: str
+
+
+def submit_job(
+    context: Context,
+    spec: JobSpec,
+    idempotency_key: str | None = None,
+    *,
+    priority: int = 0,
+    traceparent: str | None = None,
+) -> JobDetail | Replay:
+    """Make a job of a spec, or return the answer to an earlier request with the same idempotency key.
+
+    All spans of the job have one parent, which is a child of `traceparent`, the span of the request.
+
+    Raises UnknownTextureError, QuotaExceededError, KindNotAvailableError, PresetNotCertifiedError, or
+    IdempotencyKeyReusedError.
+    """
+    check_textures(context.store, spec)
+    with collector_at_rest(), tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count):
+        answer = _submit(context, spec, idempotency_key, priority, tracing.traceparent())
+        tracing.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
+        return answer
+
+
+def _submit(
+    context: Context, spec: JobSpec, key: str | None, priority: int, traceparent: str | None
+) -> JobDetail | Replay:
+    project, print_ = this_project(), fingerprint(spec)
+    at_once = spec.sample_count <= context.settings.plan_samples
+    plan: Plan | None = None
+    planned_for: Terms | None = None
+    while True:
+        with context.database.read() as connection:
+            if replay := _find_replay(connection, key, print_):
+                return replay
+            check_quota(connection, project, spec.sample_count)
+            terms = terms_for(connection, spec)
+        if terms is not None and at_once and planned_for != terms:
+            plan, planned_for = expand(spec, terms, previews=context.settings.previews_per_job), terms
+        with context.database.write() as connection:
+            if replay := _find_replay(connection, key, print_):
+                return replay
+            if terms_for(connection, spec) != terms:
+                continue  # meanwhile a worker with other builds, or a certificate, has been registered
+            check_quota(connection, project, spec.sample_count)
+            now = context.clock()
+            with ledger(connection, now) as book:
+                job = insert_job(book, spec, priority=priority, project=project, traceparent=traceparent)
+                _enqueue(book, job, terms, plan)
+            shown = show_job(context, connection, job)
+            details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
+            note(connection, "job.submit", shown.id, now, **details)
+            if key:
+                _keep_replay(connection, key, print_, job, shown.model_dump_json(), now)
+        context.notifier.notify()
+        check_made_datasets(context, at_most=CHECKED_AT_ONCE)
+        return shown
+
+
+def _enqueue(book: Ledger, job: int, terms: Terms | None, plan: Plan | None) -> None:
+    """Queue a new job with its whole plan, or for planning piece by piece, or to wait for the first worker."""
+    if terms is None:
+        reason = Reason.waiting_for_worker
+        set_job_state(book.connection, job, JobState.queued, book.now, reason=reason, message=NO_WORKER)
+        return
+    begin_planning(book, job, terms)
+    set_job_state(book.connection, job, JobState.planning if plan is None else JobState.queued, book.now)
+    if plan is not None:
+        write_plan(book, job, plan)
+
+
+def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> Replay | None:
+    """Return the answer to an earlier request with this key; raise IdempotencyKeyReusedError for another document."""
+    if not key:
+        return None
+    row = connection.execute(
+        select(idempotency_keys.c.fingerprint, idempotency_keys.c.response, jobs.c.id)
+        .join(jobs, jobs.c.seq == idempotency_keys.c.job)
+        .where(idempotency_keys.c.key == key)
+    ).one_or_none()
+    if row is None:
+        return None
+    if row.fingerprint != fingerprint:
+        raise IdempotencyKeyReusedError(f"the Idempotency-Key {key!r} came with another document before")
+    return Replay(row.id, row.response)
+
+
+def _keep_replay(connection: Connection, key: str, fingerprint: str, job: int, response: str, now: float) -> None:
+    """Store the answer to a request."""
+    connection.execute(
+        insert(idempotency_keys).values(key=key, fingerprint=fingerprint, job=job, response=response, created_at=now)
+    )
+
+
+def fingerprint(spec: JobSpec) -> str:
+    """Return the digest that identifies a submitted document."""
+    return sha256(spec.model_dump_json().encode())
+
+
+def validate_spec(context: Context, spec: JobSpec) -> Validation:
+    """Return counts and sizes of a job of `spec`, and why it would be refused, if so, without making one.
+
+    Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises UnknownTextureError.
+    """
+    check_textures(context.store, spec)
+    database = context.database
+    counts = count(spec)
+    raw = bytes_estimate(spec)
+    terms, refusal = None, None
+    with database.read() as connection:
+        try:
+            terms = terms_for(connection, spec)
+        except (KindNotAvailableError, PresetNotCertifiedError) as error:
+            refusal = str(error)
+        compression = _compression(connection, spec.kind)
+    return Validation(
+        spec=spec,
+        spec_digest=spec.content_digest,
+        sample_count=counts.samples,
+        simulation_count=counts.simulations,
+        render_count=counts.renders,
+        task_count=counts.tasks,
+        expected_splits=counts.expected_splits,
+        cached_count=None if terms is None else _cached(database, spec, terms),
+        bytes_estimate=raw,
+        stored_bytes_estimate=None if compression is None else round(raw * compression),
+        certificate=None if terms is None else terms.certificate,
+        refusal=refusal,
+    )
+
+
+def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
+    """Return the number of tasks that have a result; None where the grid is too large to look them up."""
+    with database.read() as connection:
+        planned_so = (jobs.c.kind == spec.kind, jobs.c.builds == terms.builds.model_dump_json())
+        if connection.scalar(select(jobs.c.seq).where(*planned_so).limit(1)) is None:
+            return 0
+        if spec.sample_count > LOOKED_UP:
+            return None
+    with collector_at_rest():
+        plan = expand(spec, terms)
+        with database.read() as connection:
+            found = (
+                connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(_SETTLED)))
+                for batch in batches(plan.tasks)
+            )
+            return sum(number or 0 for number in found)
+
+
+def _compression(connection: Connection, kind: str) -> float | None:
+    """Return stored bytes over raw bytes of the newest dataset of a kind; None where there is none."""
+    row = connection.execute(
+        select(jobs.c.spec, dataset_versions.c.bytes)
+        .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)
+        .where(jobs.c.kind == kind, dataset_versions.c.manifest.is_not(None))
+        .order_by(dataset_versions.c.created_at.desc())
+        .limit(1)
+    ).one_or_none()
+    return None if row is None else row.bytes / bytes_estimate(job_spec_adapter.validate_json(row.spec))
