@@ -22,11 +22,11 @@ from typing import Any
 import httpx
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import HttpApi, RunningServer, start_server
+from stickslip_testing.servers import HttpApi, ServerProcess, start_server
 from stickslip_testing.worker import PretendWorker
 
 
-def cpu_seconds(server: RunningServer) -> float:
+def cpu_seconds(server: ServerProcess) -> float:
     """Return the CPU time that a server has taken so far [s]."""
     fields = Path(f"/proc/{server.process.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -43,13 +43,13 @@ def database_seconds() -> float:
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def submit(server: RunningServer, count: int, **spec: Any) -> str:
+def submit(server: ServerProcess, count: int, **spec: Any) -> str:
     """Submit rods with `count` simulations; return the job."""
     grid = rods(gamma=[1.0 + number for number in range(count)], phi1=[1.0], **spec)
     return str(httpx.post(f"{server.url}/v1/jobs", json=grid, timeout=60, trust_env=False).json()["id"])
 
 
-def report_lease_and_complete(server: RunningServer, worker: PretendWorker, batch: int, count: int) -> None:
+def report_lease_and_complete(server: ServerProcess, worker: PretendWorker, batch: int, count: int) -> None:
     """Lease and complete simulations, so many with a request."""
     submit(server, count, poisson=0.1 + 0.001 * batch, views=None)
     (first,) = worker.lease(simulate=1)
@@ -69,7 +69,7 @@ def report_lease_and_complete(server: RunningServer, worker: PretendWorker, batc
     )
 
 
-async def report_watchers(server: RunningServer, worker: PretendWorker, count: int, seconds: float) -> None:
+async def report_watchers(server: ServerProcess, worker: PretendWorker, count: int, seconds: float) -> None:
     """Let many watch one job that goes on."""
     job = submit(server, 400, poisson=0.31)
     heard: list[list[str]] = []
@@ -102,7 +102,7 @@ async def report_watchers(server: RunningServer, worker: PretendWorker, count: i
     print(f"{count} watchers: {share:.0%} of a core; every one heard the same states: {len(told) == 1}")
 
 
-async def report_clients(server: RunningServer, worker: PretendWorker, count: int, seconds: float) -> None:
+async def report_clients(server: ServerProcess, worker: PretendWorker, count: int, seconds: float) -> None:
     """Let many clients ask once a second while a job runs."""
     job = submit(server, 400, poisson=0.32)
     took: list[float] = []

@@ -128,9 +128,7 @@ class DatasetVersion(Document):
 
     version: int
     manifest: Sha256
-    group: Sha256 | None = Field(
-        description="of the root's zarr.json, which names the manifest; null: made before versions were sealed"
-    )
+    group: Sha256 = Field(description="of the root's zarr.json, which names the manifest")
     created_at: datetime
     sample_count: int
     valid_count: int

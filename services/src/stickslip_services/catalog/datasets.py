@@ -51,10 +51,8 @@ def find_version(connection: Connection, dataset: str, version: int) -> DatasetV
 
 def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
     """Return the file at `path` of a version; raise NotFoundError where the version has none."""
-    digests = {MANIFEST_NAME: version.manifest}
-    if version.group is not None:
-        digests[GROUP_NAME] = version.group
-        digests[SEAL_NAME] = sha256(seal_text(version.manifest, version.group))
+    seal = sha256(seal_text(version.manifest, version.group))
+    digests = {MANIFEST_NAME: version.manifest, GROUP_NAME: version.group, SEAL_NAME: seal}
     if path in digests:
         return FileEntry(path=path, sha256=digests[path], size=_size(store, digests[path]))
     file = _listed(store, version.manifest, path)

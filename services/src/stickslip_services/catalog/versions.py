@@ -140,14 +140,12 @@ def find_committed(connection: Connection, publish_task: int) -> CommittedVersio
     return CommittedVersion(reference, row.sample_count, row.sample_count - row.valid_count)
 
 
-def damaged_files(store: Store, manifest: Sha256, group: Sha256 | None) -> frozenset[Sha256] | None:
+def damaged_files(store: Store, manifest: Sha256, group: Sha256) -> frozenset[Sha256] | None:
     """Return the digests of the files of a version that are not whole, in the store or in the version's directory.
 
     None where the files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
     Raises OSError where the store is out of reach.
     """
-    if group is None:
-        return None
     seal = sha256(seal_text(manifest, group))
     try:
         document = Manifest.model_validate_json(store.read(manifest))

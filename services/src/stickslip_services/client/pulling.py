@@ -188,17 +188,12 @@ def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
 def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents, dict[str, bytes]]:
     """Return the contents of a version, and the bytes of its three sealed files by name, the manifest last."""
     promised = client.version(dataset, version)
-    if promised.group is None:
-        raise DamagedError(
-            f"version {version} of {dataset} was made before versions were sealed, and nothing vouches for its "
-            "manifest: submit its spec again to make a sealed version"
-        )
     manifest, content = client.manifest(dataset, version)
     root = f"/v1/datasets/{dataset}/versions/{version}/files/"
     group, seal = (client.request("GET", root + name).content for name in (GROUP_NAME, SEAL_NAME))
     if (sha256(content), sha256(group)) != (promised.manifest, promised.group):
         raise DamagedError(
-            f"{MANIFEST_NAME} or {GROUP_NAME} of {dataset}, version {version}, has not the digest that was promised"
+            f"{MANIFEST_NAME} or {GROUP_NAME} of {dataset}, version {version}, does not have the committed digest"
         )
     try:
         check_seal(content, group, seal)

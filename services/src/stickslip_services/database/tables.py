@@ -260,7 +260,7 @@ dataset_versions = Table(
     Column("version", Integer, primary_key=True, autoincrement=False),
     Column("publish_task", _Wide, nullable=False, unique=True),
     Column("manifest", String),  # null: the number is taken, the version is not committed
-    Column("group_digest", String),  # of the root's zarr.json; null also for a version without a seal
+    Column("group_digest", String),  # of the root's zarr.json
     Column("created_at", Float),
     Column("sample_count", Integer),
     Column("valid_count", Integer),

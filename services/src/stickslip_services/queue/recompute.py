@@ -40,7 +40,7 @@ class MadeJob:
     job: int
     publish_task: int
     manifest: Sha256
-    group: Sha256 | None
+    group: Sha256
     bytes: int
 
 
