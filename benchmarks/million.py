@@ -32,7 +32,7 @@ import numpy as np
 from plan import context, peak_megabytes, spec
 from sqlalchemy import text
 from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
-from stickslip_schemas.format.chunks import encode_chunk, encode_shard
+from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore

@@ -12,7 +12,7 @@ import tensorstore
 import xarray
 from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.format.chunks import CorruptChunkError
+from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods
 from stickslip_training.data.reader import DatasetReader

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, RecordRef
-from stickslip_schemas.format.chunks import encode_chunk
+from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry, Rejection
 from stickslip_schemas.kinds.rod_hang import RodHangSpec

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, RenderTask, TaskResult
-from stickslip_schemas.format.chunks import encode_chunk
+from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.store import open_store
 
 BUILD = "2" * 64

@@ -139,7 +139,7 @@ def test_a_kinds_own_files_are_in_its_builds_and_in_no_others() -> None:
         ("fabrics.py", "simulate", set()),
         ("fabrics.py", "pack", set(KINDS) - {"rod_hang"}),
         ("arrays.py", "pack", set(KINDS)),
-        ("chunks.py", "pack", set(KINDS)),
+        ("codecs.py", "pack", set(KINDS)),
     ],
 )
 def test_a_new_fabric_makes_no_rod_again_and_a_new_texture_no_simulation(

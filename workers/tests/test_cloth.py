@@ -15,8 +15,7 @@ from PIL import Image
 from publishing import publish_task
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, SimulateTask
-from stickslip_schemas.format.chunks import encode_trajectory
-from stickslip_schemas.format.codecs import encode_clip
+from stickslip_schemas.format.codecs import encode_clip, encode_trajectory
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest, Pictures, Rejection
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint

@@ -6,7 +6,7 @@ import pytest
 from ray import exceptions as ray_errors
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
-from stickslip_schemas.format.chunks import CorruptChunkError
+from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError

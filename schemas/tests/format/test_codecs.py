@@ -2,8 +2,14 @@
 
 import numpy as np
 import pytest
-from stickslip_schemas.format.chunks import CorruptChunkError, decode_chunk, encode_chunk
-from stickslip_schemas.format.codecs import axes_order, decode_sample, encode_sample
+from stickslip_schemas.format.codecs import (
+    CorruptChunkError,
+    axes_order,
+    decode_chunk,
+    decode_sample,
+    encode_chunk,
+    encode_sample,
+)
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 SHAPE = (6, 24, 20, 3)

@@ -14,7 +14,7 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_testing.samples import Sample, samples, split_of
 
-BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
+BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
 
 def one(
@@ -255,6 +255,7 @@ def test_points_are_the_samples_of_the_models() -> None:
     cloth = {"material": ["mine", "royal-target"], "mu": [0.3, 1.0], "texture": ["dots", "plaid"]}
     documents = [
         {"kind": "rod_hang", "axes": {"gamma": [1, 2.5], "phi0": [-1.0, 1], "phi1": 6}},
+        GRID | {"splits": {"by": "clip"}},
         {
             "kind": "cloth_drag",
             "materials": {"mine": own},

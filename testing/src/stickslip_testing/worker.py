@@ -33,8 +33,7 @@ from stickslip_schemas.documents.worker_api import (
     ReportBatch,
     WorkerRegistration,
 )
-from stickslip_schemas.format.chunks import decode_chunk, decode_shard_index, encode_chunk, encode_shard
-from stickslip_schemas.format.codecs import encode_sample
+from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, encode_sample, encode_shard
 from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,

@@ -203,7 +203,7 @@ def test_a_valid_sample_without_a_chunk_raises(clips, tmp_path):
 
 def test_a_chunk_of_another_size_raises(clips, tmp_path):
     """A smaller chunk with a good checksum would leave a part of the buffer as it was."""
-    from stickslip_schemas.format.chunks import encode_chunk, encode_shard
+    from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 
     made = clips.copy(tmp_path / "v1")
     shape = made.arrays["video"].shape[1:]

@@ -27,8 +27,7 @@ from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_line
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
-from stickslip_schemas.format.chunks import decode_chunk
-from stickslip_schemas.format.codecs import decode_clip
+from stickslip_schemas.format.codecs import decode_chunk, decode_clip
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.plan.sources import UNCOUNTED, sources
 from stickslip_schemas.spec.appearance import shown_frames

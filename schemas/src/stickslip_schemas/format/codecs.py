@@ -1,23 +1,83 @@
-"""How the values of one sample are coded, by what they are: clips, trajectories, and all else.
+"""Chunks and shards as bytes [Zarr v3, sharding_indexed codec].
 
-A clip is `transpose -> zstd(CLIP_LEVEL) -> crc32c`: the same row of all frames is together, for most of it is as it was
-in the frame before. The other two are in `stickslip_schemas.format.chunks`.
+A chunk is `zstd(ZSTD_LEVEL) -> crc32c`. Two sorts of arrays have codecs of their own:
+
+- A trajectory is `transpose -> blosc(zstd, byte shuffle) -> crc32c`.
+- A clip is `transpose -> zstd(CLIP_LEVEL) -> crc32c`. The same row of all frames is together, for most of it is as it
+  was in the frame before.
+
+A shard is its chunks one after the other, then the index: one (offset, length) pair of little-endian uint64 per chunk,
+then the index's own crc32c.
 """
 
 import threading
+from collections.abc import Sequence
 
+import google_crc32c
 import numpy as np
+from numcodecs import blosc
+from numcodecs.zstd import Zstd
 
-from stickslip_schemas.format.chunks import ZSTD_LEVEL, decode_chunk, decode_trajectory, encode_chunk, encode_trajectory
 from stickslip_schemas.spec.arrays import ArrayLayout
 
+# With threads of its own, blosc writes its blocks in the order in which they happen to be done.
+blosc.use_threads = False
+
+ZSTD_LEVEL = 3
+BLOSC_LEVEL = 5
 CLIP_LEVEL = 11
 """Of zstd, for clips: written once, read many times, and reading is as fast as at level 3."""
+MISSING = 2**64 - 1
+"""Offset and length of a chunk that is not in the shard."""
 
 _ROWS_FIRST = (1, 0, 2, 3)
 
 _scratch = threading.local()
 """The last buffer of a thread to decode clips into: memory that is new to the process costs a tenth of the decoding."""
+
+_CRC_BYTES = 4
+_RESIDUE = 0x48674BC7
+"""The crc32c of any bytes with their own little-endian crc32c behind them."""
+
+
+class CorruptChunkError(ValueError):
+    """A checksum does not hold, or a chunk is not of the size that it should have."""
+
+
+def encode_chunk(data: bytes | np.ndarray, level: int = ZSTD_LEVEL) -> bytes:
+    """Return the encoded chunk of C-ordered little-endian `data`, with a level of zstd."""
+    return _with_crc(bytes(Zstd(level=level).encode(data)))
+
+
+def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:
+    """Return the decoded bytes of a chunk, into all of `out` where it is given; raise CorruptChunkError."""
+    frame = _without_crc(chunk, "chunk")
+    if out is not None and (size := _content_size(frame)) != out.nbytes:
+        # The decoder would fill a part of `out` and leave the rest as it was, without a word.
+        raise CorruptChunkError(f"the chunk decodes to {size} bytes, and {out.nbytes} are expected")
+    return Zstd().decode(frame, out)  # type: ignore[no-any-return]  # untyped library
+
+
+def encode_trajectory(data: np.ndarray) -> bytes:
+    """Return the encoded chunk of one sample's `data`, (frames, ..., k).
+
+    The axes are reversed, so that the values of one coordinate over time are neighbours, and bytes of one significance
+    are put together: the float32 positions of a dragged cloth then take half the space of a plain chunk.
+    """
+    turned = np.ascontiguousarray(data.T).astype(data.dtype.newbyteorder("<"), copy=False)
+    codec = blosc.Blosc(cname="zstd", clevel=BLOSC_LEVEL, shuffle=blosc.SHUFFLE)
+    return _with_crc(bytes(codec.encode(turned)))
+
+
+def decode_trajectory(chunk: bytes, out: np.ndarray) -> None:
+    """Decode a chunk that `encode_trajectory` has made into all of `out`; raise CorruptChunkError."""
+    frame = _without_crc(chunk, "chunk")
+    size = int.from_bytes(frame[4:8], "little")  # of blosc's header
+    if len(frame) < 16 or size != out.nbytes:
+        raise CorruptChunkError(f"the chunk decodes to {size} bytes, and {out.nbytes} are expected")
+    turned = np.empty(out.shape[::-1], dtype=out.dtype)
+    blosc.decompress(frame, turned)
+    out[...] = turned.T
 
 
 def encode_clip(clip: np.ndarray) -> bytes:
@@ -83,3 +143,54 @@ def empty_in_order(array: ArrayLayout, count: int) -> np.ndarray:
 def zstd_level(array: ArrayLayout) -> int:
     """Return the level of zstd that an array's chunks are written with, where they are no trajectory."""
     return CLIP_LEVEL if array.is_clip else ZSTD_LEVEL
+
+
+def check_chunk(chunk: bytes) -> None:
+    """Raise CorruptChunkError where the checksum of an encoded chunk does not hold; nothing is decoded."""
+    _without_crc(chunk, "chunk")
+
+
+def encode_shard(chunks: Sequence[bytes | None]) -> bytes:
+    """Return the shard of encoded `chunks` in C order of the chunk grid; None is a chunk that is missing."""
+    index = np.full((len(chunks), 2), MISSING, dtype="<u8")
+    offset = 0
+    for position, chunk in enumerate(chunks):
+        if chunk is not None:
+            index[position] = offset, len(chunk)
+            offset += len(chunk)
+    return b"".join(chunk for chunk in chunks if chunk is not None) + _with_crc(index.tobytes())
+
+
+def shard_index_size(chunk_count: int) -> int:
+    """Return the size in bytes of the index at a shard's end."""
+    return 16 * chunk_count + _CRC_BYTES
+
+
+def decode_shard_index(data: bytes, chunk_count: int) -> np.ndarray:
+    """Return the index, (chunk_count, 2) uint64 of offset and length, from a shard's last bytes."""
+    index = _without_crc(data[-shard_index_size(chunk_count) :], "shard index")
+    return np.frombuffer(index, dtype="<u8").reshape(chunk_count, 2)
+
+
+def _with_crc(data: bytes) -> bytes:
+    return data + int(google_crc32c.value(data)).to_bytes(_CRC_BYTES, "little")
+
+
+def _without_crc(data: bytes, what: str) -> memoryview:
+    """Return the bytes before the checksum, without a copy of them."""
+    if len(data) < _CRC_BYTES or google_crc32c.value(data) != _RESIDUE:
+        raise CorruptChunkError(f"the crc32c of the {what} does not hold")
+    return memoryview(data)[:-_CRC_BYTES]
+
+
+def _content_size(frame: memoryview) -> int | None:
+    """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None where it states none."""
+    if len(frame) < 6 or bytes(frame[:4]) != b"\x28\xb5\x2f\xfd":
+        return None
+    descriptor = frame[4]
+    single_segment = descriptor >> 5 & 1
+    width = (single_segment, 2, 4, 8)[descriptor >> 6]
+    start = 5 + (1 - single_segment) + (0, 1, 2, 4)[descriptor & 3]
+    if width == 0 or len(frame) < start + width:
+        return None
+    return int.from_bytes(frame[start : start + width], "little") + (256 if width == 2 else 0)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.format.chunks import CorruptChunkError, decode_chunk
+from stickslip_schemas.format.codecs import CorruptChunkError, decode_chunk
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import (
     MANIFEST_NAME,

@@ -5,13 +5,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.format.chunks import (
-    MISSING,
-    decode_chunk,
-    decode_shard_index,
-    shard_index_size,
-)
-from stickslip_schemas.format.codecs import decode_sample
+from stickslip_schemas.format.codecs import MISSING, decode_chunk, decode_sample, decode_shard_index, shard_index_size
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Contents, FileEntry, Rejection
 from stickslip_schemas.spec.arrays import ArrayLayout

@@ -8,7 +8,7 @@ DatasetError
 └── SourceError            the server does not answer, or not with what was asked for
 """
 
-from stickslip_schemas.format.chunks import CorruptChunkError
+from stickslip_schemas.format.codecs import CorruptChunkError
 
 
 class DatasetError(Exception):

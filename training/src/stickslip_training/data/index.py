@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.format.chunks import (
+from stickslip_schemas.format.codecs import (
     MISSING,
     CorruptChunkError,
     decode_chunk,
+    decode_sample,
     decode_shard_index,
     shard_index_size,
 )
-from stickslip_schemas.format.codecs import decode_sample
 from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry, Manifest, ManifestSection
 from stickslip_schemas.spec.arrays import ArrayLayout
 

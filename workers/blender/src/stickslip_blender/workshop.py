@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
-from stickslip_schemas.format.chunks import encode_chunk
-from stickslip_schemas.format.codecs import encode_clip
+from stickslip_schemas.format.codecs import encode_chunk, encode_clip
 from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.store import open_store, write_durably
 

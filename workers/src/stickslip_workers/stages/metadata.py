@@ -3,8 +3,7 @@
 import warnings
 
 import numpy as np
-from stickslip_schemas.format.chunks import BLOSC_LEVEL
-from stickslip_schemas.format.codecs import axes_order, zstd_level
+from stickslip_schemas.format.codecs import BLOSC_LEVEL, axes_order, zstd_level
 from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.spec.jobs import JobSpec

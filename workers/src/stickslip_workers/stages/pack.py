@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.documents.tasks import PackOutput, PackSlot, PackTask, RecordRef, TaskResult
-from stickslip_schemas.format.chunks import check_chunk, encode_chunk, encode_shard, encode_trajectory
+from stickslip_schemas.format.codecs import check_chunk, encode_chunk, encode_shard, encode_trajectory
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.spec.arrays import ArrayLayout

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import canonical_json
 from stickslip_schemas.documents.tasks import PublishOutput, PublishSection, PublishTask, TaskResult
-from stickslip_schemas.format.chunks import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
+from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
 from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import content_key, referred
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
-from stickslip_schemas.format.chunks import decode_chunk, encode_chunk
+from stickslip_schemas.format.codecs import decode_chunk, encode_chunk
 from stickslip_schemas.format.pictures import moving
 from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.spec.fabrics import Texture

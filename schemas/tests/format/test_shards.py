@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from stickslip_schemas.format.chunks import (
+from stickslip_schemas.format.codecs import (
     MISSING,
     CorruptChunkError,
     decode_chunk,
