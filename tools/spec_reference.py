@@ -39,7 +39,7 @@ An axis of names, such as `material`, takes one name or a list. A job has at mos
 """
 
 AXIS_HEAD = ("| axis | values | meaning |", "|---|---|---|")
-KEY_HEAD = ("| key | values | default | meaning | cost |", "|---|---|---|---|---|")
+KEY_HEAD = ("| key | values | default | meaning |", "|---|---|---|---|")
 
 CUSTOM: tuple[tuple[str, str, type[Document]], ...] = (
     ("materials", "fabric", FabricNumbers),
@@ -121,7 +121,8 @@ def _field_row(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:
     default = json.dumps(field["default"]) if "default" in field else "" if "anyOf" in field else "required"
     meaning = field.get("description") or value.get("description", "")
     default = "`{}`" if name in _MAPPINGS else f"`{default}`" if default not in ("", "required") else default
-    cells = (f"`{name}`", _allowed(value), default, _first_line(meaning), field.get("x-cost", ""))
+    cost = f". Cost: {field['x-cost']}" if "x-cost" in field else ""
+    cells = (f"`{name}`", _allowed(value), default, _first_line(meaning) + cost)
     return f"| {' | '.join(cells)} |"
 
 
