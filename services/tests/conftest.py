@@ -7,12 +7,13 @@ import itertools
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING
 
 import pytest
 from stickslip_services.addresses import DATABASE_VARIABLE
-from stickslip_services.database.database import Database
-from stickslip_services.database.opening import connect
+from stickslip_services.database.database import Database, Role
+from stickslip_services.database.opening import connect, opened
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.sweep import start
@@ -112,12 +113,24 @@ def clock() -> ManualClock:
 
 
 @pytest.fixture
-def settings(tmp_path: Path, database: str) -> Settings:
-    return Settings(data=tmp_path / "data", durable=False)
+def settings(tmp_path: Path, database: str, request: pytest.FixtureRequest) -> Settings:
+    """Settings of a coordinator; parametrise it indirectly with a dictionary for others than the defaults."""
+    return Settings(data=tmp_path / "data", durable=False, **getattr(request, "param", {}))
+
+
+@pytest.fixture(scope="session")
+def migrated_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SQLite file with all tables: a copy of it saves each test the migration."""
+    settings = Settings(data=tmp_path_factory.mktemp("migrated"), database=None, durable=False)
+    with opened(settings, Role.visitor):
+        return settings.database_path
 
 
 @pytest.fixture
-def context(settings: Settings, clock: ManualClock) -> Iterator[Context]:
+def context(settings: Settings, clock: ManualClock, migrated_file: Path) -> Iterator[Context]:
+    if settings.database is None:
+        settings.data.mkdir()
+        copyfile(migrated_file, settings.database_path)
     made = Context.open(settings, clock)
     start(made)
     yield made

@@ -1,0 +1,220 @@
+"""The rules of leasing, each by itself: fencing, expiry, retries, back-off, losses, priorities, cancelling, quotas."""
+
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.worker_api import LeaseRequest
+from stickslip_services.access.projects import acting_for, check_quota, find_project, set_quota
+from stickslip_services.database.tables import tasks
+from stickslip_services.errors import ConflictError, QuotaExceededError
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job
+from stickslip_services.queue.ids import task_key
+from stickslip_services.queue.lease import lease_tasks
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
+from stickslip_testing.worker import DirectApi, PretendWorker, failure
+
+
+def submit(context: Context, *, priority: int = 0, project: str = "", **spec: Any) -> str:
+    with acting_for(project):
+        return submit_job(context, parsed(rods(**spec)), priority=priority).id  # type: ignore[union-attr]
+
+
+def row(context: Context, task_id: str) -> Any:
+    """Return the row of a task."""
+    with context.database.read() as connection:
+        return connection.execute(select(tasks).where(tasks.c.key == task_key(task_id))).one()
+
+
+def gammas(leases: Any) -> list[float]:
+    return [lease.task.simulation.gamma for lease in leases]
+
+
+@pytest.mark.parametrize("is_leased", [False, True])
+def test_cancelling_a_job_frees_its_quota(context: Context, worker: PretendWorker, is_leased: bool) -> None:
+    with context.database.write() as connection:
+        set_quota(connection, "lab", max_samples=4, max_jobs=1, now=context.clock())
+    job_id = submit(context, project="lab")
+    leases = worker.lease(simulate=1) if is_leased else ()
+    with context.database.read() as connection, pytest.raises(QuotaExceededError):
+        check_quota(connection, "lab", 1)
+    cancel_job(context, job_id)
+    worker.beat(*leases)
+    with context.database.read() as connection:
+        project = find_project(connection, "lab")
+        assert (project.samples, project.jobs) == (0, 0)
+        check_quota(connection, "lab", 4)
+    submit(context, project="lab", gamma=(8.0, 9.0))
+
+
+@pytest.mark.parametrize("settings", [{"max_tries": 5, "retry_seconds": 3.0}], indirect=True)
+def test_the_wait_before_a_retry_doubles(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    for tries, wait in enumerate((3.0, 6.0, 12.0, 24.0), start=1):
+        (lease,) = worker.lease(simulate=1)
+        worker.report((lease, failure()))
+        failed = row(context, lease.task_id)
+        assert (failed.state, failed.tries, failed.retry_at) == (TaskState.soft_failed, tries, clock.now + wait)
+        clock.advance(wait - 0.01)
+        sweep(context)
+        assert worker.lease() == ()
+        clock.advance(0.01)
+
+
+def test_unstarted_tasks_of_a_lost_worker_are_not_charged(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    submit(context)
+    started, unstarted = worker.lease(simulate=2)
+    worker.start(started)
+    clock.advance(31)
+    sweep(context)
+    lost, kept = row(context, started.task_id), row(context, unstarted.task_id)
+    assert (lost.state, lost.attempts, lost.losses, lost.tries) == (TaskState.pending, 1, 1, 0)
+    assert (kept.state, kept.attempts, kept.losses, kept.tries) == (TaskState.pending, 0, 0, 0)
+
+
+def test_each_lease_of_a_task_has_a_higher_token(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    tokens = []
+    for _ in range(3):
+        (lease,) = worker.lease(simulate=1)
+        tokens.append(lease.token)
+        clock.advance(31)
+        sweep(context)
+    assert tokens == [1, 2, 3]
+
+
+def test_the_holder_of_an_earlier_lease_is_fenced_off(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    """The same worker leases a task twice: its message about the first lease is stale."""
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    (old,) = worker.lease(simulate=1)
+    clock.advance(31)
+    (new,) = worker.lease(simulate=1)
+    assert worker.beat(old) == (old.task_id,)
+    assert worker.report((old, worker.result(old.task))) == ["stale"]
+    assert worker.beat(new) == ()
+    assert worker.report((new, worker.result(new.task))) == ["accepted"]
+
+
+def test_a_lease_expires_when_its_time_is_over_and_not_before(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    (lease,) = worker.lease(simulate=1)
+    clock.advance(context.settings.lease_seconds - 0.01)
+    sweep(context)
+    assert row(context, lease.task_id).owner == worker.id
+    worker.beat(lease)
+    clock.advance(context.settings.lease_seconds - 0.01)
+    sweep(context)
+    assert row(context, lease.task_id).owner == worker.id
+    clock.advance(0.02)
+    sweep(context)
+    assert row(context, lease.task_id).owner is None
+
+
+def test_the_first_result_wins(context: Context, worker: PretendWorker) -> None:
+    """Two reports of one lease, in one batch and in another one."""
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    (lease,) = worker.lease(simulate=1)
+    result = worker.result(lease.task)
+    assert worker.report((lease, result), (lease, failure())) == ["accepted", "duplicate"]
+    assert worker.report((lease, failure())) == ["duplicate"]
+    assert row(context, lease.task_id).state == TaskState.succeeded
+
+
+def test_a_task_fails_with_its_last_try(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    job_id = submit(context, gamma=(1.0,), phi1=(1.0,))
+    for _ in range(context.settings.max_tries):
+        assert show_job(context, job_id).state in (JobState.queued, JobState.running)
+        (lease,) = worker.lease(simulate=1)
+        worker.report((lease, failure(Reason.internal_error)))
+        clock.advance(60)
+        sweep(context)
+    failed = row(context, lease.task_id)
+    assert (failed.state, failed.tries) == (TaskState.failed, context.settings.max_tries)
+    assert show_job(context, job_id).state is JobState.failed
+
+
+@pytest.mark.parametrize("settings", [{"max_losses": 2}], indirect=True)
+def test_a_task_is_quarantined_with_its_last_loss(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    for state in (TaskState.pending, TaskState.failed):
+        (lease,) = worker.lease(simulate=1)
+        worker.start(lease)
+        clock.advance(31)
+        sweep(context)
+        assert row(context, lease.task_id).state == state
+    assert row(context, lease.task_id).reason == Reason.quarantined
+
+
+def test_the_job_of_the_highest_priority_comes_first(context: Context, worker: PretendWorker) -> None:
+    submit(context, gamma=(1.0,))
+    submit(context, gamma=(2.0,), priority=5)
+    submit(context, gamma=(3.0,), priority=-5)
+    assert gammas(worker.lease(simulate=6)) == [2.0, 2.0, 1.0, 1.0, 3.0, 3.0]
+
+
+def test_jobs_of_one_priority_take_turns(context: Context, worker: PretendWorker) -> None:
+    submit(context, gamma=(1.0,))
+    submit(context, gamma=(2.0,))
+    assert gammas(worker.lease(simulate=1)) == [1.0]
+    assert gammas(worker.lease(simulate=3)) == [2.0, 1.0, 2.0]
+
+
+def test_cancelling_stops_waiting_tasks_at_once_and_running_ones_with_the_heartbeat(
+    context: Context, worker: PretendWorker
+) -> None:
+    job_id = submit(context)
+    (running,) = worker.lease(simulate=1)
+    worker.start(running)
+    assert cancel_job(context, job_id).state is JobState.cancelling
+    assert worker.lease() == ()
+    with context.database.read() as connection:
+        states = set(connection.scalars(select(tasks.c.state).where(tasks.c.key != task_key(running.task_id))))
+    assert states == {TaskState.cancelled}
+    assert worker.beat(running) == (running.task_id,)
+    assert show_job(context, job_id).state is JobState.cancelled
+
+
+def test_a_superseded_session_gets_no_tasks_and_keeps_none(context: Context, worker: PretendWorker) -> None:
+    submit(context)
+    (lease,) = worker.lease(simulate=1)
+    PretendWorker(DirectApi(context), context.store).register()
+    with pytest.raises(ConflictError):
+        lease_tasks(context, LeaseRequest(worker_id=worker.id, wanted={Stage.simulate: 1}))
+    assert worker.beat(lease) == (lease.task_id,)
+    assert row(context, lease.task_id).state == TaskState.pending
+
+
+@pytest.mark.parametrize("settings", [{"lease_limit": 2}], indirect=True)
+def test_one_request_leases_no_more_than_the_limit(context: Context, worker: PretendWorker) -> None:
+    submit(context)
+    assert len(worker.lease(simulate=3)) == 2
+
+
+def test_a_render_waits_for_its_simulation(context: Context, worker: PretendWorker) -> None:
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    (simulation,) = worker.lease()
+    assert worker.lease() == ()
+    worker.finish(simulation)
+    assert [lease.task.stage for lease in worker.lease()] == [Stage.render]
+
+
+def test_leases_are_renewed_at_the_start_of_a_coordinator(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    """No heartbeat can arrive while it is down."""
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    (lease,) = worker.lease(simulate=1)
+    clock.advance(3600)
+    start(context)
+    sweep(context)
+    assert row(context, lease.task_id).expires_at == clock.now + context.settings.lease_seconds
