@@ -8,13 +8,13 @@ from stickslip_schemas.store.base import (
     Store,
     Stored,
     artifact_name,
+    in_parallel,
     is_unavailable,
     shown_name,
     version_name,
 )
 from stickslip_schemas.store.directory import DirectoryStore, sync, write_durably
 from stickslip_schemas.store.opening import open_store, store_place
-from stickslip_schemas.store.parallel import in_parallel
 
 __all__ = [
     "CorruptArtifactError",

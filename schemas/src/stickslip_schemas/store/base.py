@@ -7,17 +7,23 @@ that a Zarr reader asks for: `datasets/ID/vN/PATH`.
 
 import errno
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 from stickslip_schemas.base.keys import is_sha256
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 ARTIFACTS = "artifacts"
 DATASETS = "datasets"
 VERSION = re.compile(r"v[1-9]\d{0,8}")
 """How the directory of a version is called."""
+AT_ONCE = 32
+"""Requests to a store at once: a bucket answers each after a while, and all of them after little more."""
 
 _SCRATCH = re.compile(r"\.([0-9a-f]{64})\..*\.tmp")
 _UNAVAILABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ESTALE, errno.EHOSTUNREACH)
@@ -168,3 +174,13 @@ def shown_name(dataset: str, version: int, path: str) -> str:
     if any(part in ("", ".", "..") for part in path.split("/")):
         raise ValueError(f"path must be relative, without empty parts, '.' and '..'; got {path!r}")
     return f"{version_name(dataset, version)}/{path}"
+
+
+def in_parallel(function: Callable[[T], R], items: Iterable[T], *, at_once: int = AT_ONCE) -> list[R]:
+    """Return what `function` gives for each item, in their order; raise the first error, and begin nothing more."""
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            return list(pool.map(function, items))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise

@@ -78,10 +78,10 @@ class BucketStore:
 
     @property
     def cache(self) -> None:
-        """See `Store`: there is none."""
+        """Return None: there is none."""
 
     def publish(self, data: bytes) -> str:
-        """See `Store`. An artifact that is there already is compared by its entity tag, or else read."""
+        """An artifact that is there already is compared by its entity tag, or else read."""
         digest = sha256(data)
         name = artifact_name(digest)
         if len(data) < LARGE or not self.exists(digest):
@@ -128,7 +128,6 @@ class BucketStore:
         return head["e_tag"] == tag or self.holds(digest, size=len(data))
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
-        """See `Store`."""
         if offset != 0 or length is not None:
             return self.read_many(digest, [Span(offset, self.size(digest) - offset if length is None else length)])[0]
         data = self._get(artifact_name(digest))
@@ -137,7 +136,7 @@ class BucketStore:
         return data
 
     def read_many(self, digest: str, spans: Sequence[Span]) -> list[bytes]:
-        """See `Store`. Each part is a request: obstore's `get_ranges` panics where an object ends too early."""
+        """Each part is a request: obstore's `get_ranges` panics where an object ends too early."""
         return [self._read_span(digest, span) for span in spans]
 
     def _read_span(self, digest: str, span: Span) -> bytes:
@@ -157,25 +156,22 @@ class BucketStore:
         return part
 
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """See `Store`. Each block is a request, so that a connection that breaks costs one block."""
+        """Each block is a request, so that a connection that breaks costs one block."""
         while start < stop:
             (block,) = self.read_many(digest, [Span(start, min(BLOCK, stop - start))])
             start += len(block)
             yield block
 
     def size(self, digest: str) -> int:
-        """See `Store`."""
         return int(self._head(artifact_name(digest))["size"])
 
     def exists(self, digest: str, *, size: int = 0) -> bool:
-        """See `Store`."""
         try:
             return self.size(digest) >= size
         except FileNotFoundError:
             return False
 
     def holds(self, digest: str, *, size: int | None = None) -> bool:
-        """See `Store`."""
         try:
             found = self.size(digest)
             if size not in (None, found):
@@ -188,27 +184,24 @@ class BucketStore:
         return hashed.hexdigest() == digest
 
     def delete(self, name: str) -> None:
-        """See `Store`."""
         self._delete([artifact_name(name)])
 
     def stored(self) -> Iterator[Stored]:
-        """See `Store`. A bucket has no leftovers, and does not know what versions show: they show copies."""
+        """A bucket has no leftovers, and does not know what versions show: they show copies."""
         for found in self._list(f"{ARTIFACTS}/"):
             digest = found["path"].rpartition("/")[2]
             if is_sha256(digest) and found["path"] == artifact_name(digest):
                 yield Stored(digest, found["size"], found["last_modified"].timestamp(), is_shown=False)
 
     def url(self, digest: str, *, seconds: float) -> str | None:
-        """See `Store`: a presigned URL."""
+        """Return a presigned URL."""
         return str(obstore.sign(self._objects, "GET", artifact_name(digest), timedelta(seconds=seconds)))
 
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
-        """See `Store`."""
         source, target = artifact_name(digest), shown_name(dataset, version, path)
         self._tried(lambda: obstore.copy(self._objects, source, target))
 
     def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
-        """See `Store`."""
         name = shown_name(dataset, version, path)
         artifact_name(digest)
         try:
@@ -217,11 +210,9 @@ class BucketStore:
             return False
 
     def read_shown(self, dataset: str, version: int, path: str) -> bytes:
-        """See `Store`."""
         return self._get(shown_name(dataset, version, path))
 
     def versions(self, path: str) -> Iterator[ShownVersion]:
-        """See `Store`."""
         for dataset in self._folders(DATASETS):
             for version in self._folders(f"{DATASETS}/{dataset}"):
                 if VERSION.fullmatch(version) is None:
@@ -234,18 +225,15 @@ class BucketStore:
                 yield ShownVersion(dataset, int(version[1:]), head["last_modified"].timestamp())
 
     def hide(self, dataset: str, version: int) -> None:
-        """See `Store`."""
         self._delete([found["path"] for found in self._list(f"{version_name(dataset, version)}/")])
 
     def is_shown(self, dataset: str, version: int) -> bool:
-        """See `Store`."""
         return bool(self._list(f"{version_name(dataset, version)}/"))
 
     def room(self) -> None:
-        """See `Store`: a bucket has no limit."""
+        """Return None: a bucket has no limit."""
 
     def probe(self) -> None:
-        """See `Store`."""
         if self._patience > PROBE_PATIENCE:
             return BucketStore(self._bucket, self._prefix, patience=PROBE_PATIENCE).probe()
         name = f".probe-{random.randbytes(8).hex()}"

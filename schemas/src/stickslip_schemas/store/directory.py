@@ -41,12 +41,10 @@ class DirectoryStore:
 
     @property
     def place(self) -> str:
-        """See `Store`."""
         return str(self.root)
 
     @property
     def cache(self) -> Path:
-        """See `Store`."""
         return self.root
 
     def path(self, digest: str) -> Path:
@@ -58,14 +56,13 @@ class DirectoryStore:
         return self.root / version_name(dataset, version)
 
     def publish(self, data: bytes) -> str:
-        """See `Store`. An artifact that is there already is read and compared."""
+        """An artifact that is there already is read and compared."""
         digest = sha256(data)
         if not self.holds(digest, size=len(data)):
             write_durably(self.path(digest), data)
         return digest
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
-        """See `Store`."""
         if offset != 0 or length is not None:
             return self.read_many(digest, [Span(offset, self.size(digest) - offset if length is None else length)])[0]
         data = self.path(digest).read_bytes()
@@ -74,7 +71,6 @@ class DirectoryStore:
         return data
 
     def read_many(self, digest: str, spans: Sequence[Span]) -> list[bytes]:
-        """See `Store`."""
         parts = []
         with self.path(digest).open("rb") as file:
             for offset, length in spans:
@@ -84,7 +80,6 @@ class DirectoryStore:
         return parts
 
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """See `Store`."""
         with self.path(digest).open("rb") as file:
             file.seek(start)
             while start < stop:
@@ -95,18 +90,15 @@ class DirectoryStore:
                 yield block
 
     def size(self, digest: str) -> int:
-        """See `Store`."""
         return self.path(digest).stat().st_size
 
     def exists(self, digest: str, *, size: int = 0) -> bool:
-        """See `Store`."""
         try:
             return self.size(digest) >= size
         except OSError:
             return False
 
     def holds(self, digest: str, *, size: int | None = None) -> bool:
-        """See `Store`."""
         try:
             with self.path(digest).open("rb") as file:
                 if size is not None and os.fstat(file.fileno()).st_size != size:
@@ -116,11 +108,10 @@ class DirectoryStore:
             return False
 
     def delete(self, name: str) -> None:
-        """See `Store`."""
         self.path(name).unlink(missing_ok=True)
 
     def stored(self) -> Iterator[Stored]:
-        """See `Store`. Files with names that no store gives are left out."""
+        """Files with names that no store gives are left out."""
         for path in sorted((self.root / ARTIFACTS).glob("*/*")):
             try:
                 is_ours = path == self.path(path.name)
@@ -132,12 +123,12 @@ class DirectoryStore:
                 yield Stored(path.name, status.st_size, status.st_mtime, is_shown)
 
     def url(self, digest: str, *, seconds: float) -> str | None:
-        """See `Store`: there is none."""
+        """Return None: there is none."""
         artifact_name(digest)
         return None
 
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
-        """See `Store`. Where the file system has no hard links, the bytes are written a second time."""
+        """Where the file system has no hard links, the bytes are written a second time."""
         target = self.root / shown_name(dataset, version, path)
         target.parent.mkdir(parents=True, exist_ok=True)
         scratch = _scratch_path(target)
@@ -150,7 +141,6 @@ class DirectoryStore:
         scratch.unlink(missing_ok=True)  # replace() does nothing where both names are one file already
 
     def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
-        """See `Store`."""
         place = self.root / shown_name(dataset, version, path)
         with suppress(OSError):
             if place.samefile(self.path(digest)):
@@ -161,18 +151,15 @@ class DirectoryStore:
             return False
 
     def read_shown(self, dataset: str, version: int, path: str) -> bytes:
-        """See `Store`."""
         return (self.root / shown_name(dataset, version, path)).read_bytes()
 
     def versions(self, path: str) -> Iterator[ShownVersion]:
-        """See `Store`."""
         for place in sorted(self.root.glob(f"{DATASETS}/*/v*/{path}")):
             dataset, version = place.relative_to(self.root / DATASETS).parts[:2]
             if VERSION.fullmatch(version):
                 yield ShownVersion(dataset, int(version[1:]), place.stat().st_mtime)
 
     def hide(self, dataset: str, version: int) -> None:
-        """See `Store`."""
         directory = self.dataset_path(dataset, version)
         if directory.is_dir():
             shutil.rmtree(directory)
@@ -180,18 +167,16 @@ class DirectoryStore:
                 directory.parent.rmdir()
 
     def is_shown(self, dataset: str, version: int) -> bool:
-        """See `Store`."""
         return any(path.is_file() for path in self.dataset_path(dataset, version).rglob("*"))
 
     def room(self) -> Room:
-        """See `Store`: that of the disk."""
+        """Return the room on the disk."""
         place = self.root
         while not place.exists():
             place = place.parent
         return Room(*shutil.disk_usage(place))
 
     def probe(self) -> None:
-        """See `Store`."""
         self.root.mkdir(parents=True, exist_ok=True)
         path = self.root / f".probe-{os.getpid()}"
         try:
