@@ -293,7 +293,7 @@ class TestShawl:
 
     def test_refusals(self) -> None:
         for settings, message in (
-            ({"mu": -1.0}, r"mu: must be in \[0, 10\], one or one a sheet, got -1.0"),
+            ({"mu": -1.0}, r"mu: must be in \[0, 10\], got -1.0"),
             ({"self_friction": 11.0}, r"mu: must be in \[0, 10\], got 11.0"),
             ({"frames": 151}, r"frames: must be in \[1, 150\], got 151"),
             ({"swing": 2.5}, r"swing: must be in \[0, 2\], got 2.5"),

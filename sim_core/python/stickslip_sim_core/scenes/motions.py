@@ -3,7 +3,7 @@
 All are smooth in time, and begin and end at rest.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -22,28 +22,21 @@ def _times(times: ArrayLike) -> Floats:
     return t
 
 
-def _between(times: Floats, values: Floats, slopes: Floats, time: float) -> Floats:
-    """Return the cubic Hermite interpolant of values (K, ...) at a time; the first before all, the last after."""
-    t = min(max(time, float(times[0])), float(times[-1]))
-    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
-    if k < 0:
-        return np.array(values[0])
-    h = times[k + 1] - times[k]
-    s = (t - times[k]) / h
-    found: Floats = (
-        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * values[k]
-        + s**2 * (3.0 - 2.0 * s) * values[k + 1]
-        + h * s * (1.0 - s) ** 2 * slopes[k]
-        + h * s**2 * (s - 1.0) * slopes[k + 1]
-    )
-    return found
+def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[float], Floats]:
+    """Return the cubic Hermite interpolant of values (K, ...); constant before the first and after the last."""
+    from scipy.interpolate import CubicHermiteSpline  # here, so that importing the package stays quick
+
+    if len(times) == 1:
+        return lambda _time: np.array(values[0])
+    path = CubicHermiteSpline(times, values, slopes)
+    return lambda time: np.asarray(path(min(max(time, float(times[0])), float(times[-1]))))
 
 
 @dataclass(frozen=True, eq=False)
 class Keyframes:
     """A rigid motion through keyframes, without overshoot: monotone cubics [Fritsch & Carlson 1980].
 
-    Before the first keyframe all is where the first says, and after the last where the last says.
+    Nothing moves before the first and after the last keyframe.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -61,8 +54,7 @@ class Keyframes:
     about: ArrayLike = (0.0, 0.0, 0.0)
     """(3,): the point at the start that rotations are about [m]."""
 
-    _values: Floats = field(init=False, repr=False)
-    _slopes: Floats = field(init=False, repr=False)
+    _path: Callable[[float], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times))
@@ -73,12 +65,12 @@ class Keyframes:
                 raise ValueError(f"{name}: must be finite, of shape {expected}, got {value.tolist()}")
             object.__setattr__(self, name, value)
         values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
-        object.__setattr__(self, "_values", values)
-        object.__setattr__(self, "_slopes", _monotone(np.asarray(self.times), values))
+        times = np.asarray(self.times)
+        object.__setattr__(self, "_path", _through(times, values, _monotone(times, values)))
 
     def at(self, time: float) -> tuple[Floats, Floats]:
         """Return the motion at a time [s]: x -> R x + b, as R (3, 3) and b (3,) [m]."""
-        found = _between(np.asarray(self.times), self._values, self._slopes, time)
+        found = self._path(time)
         R, about = rotation(found[3:]), np.asarray(self.about)
         shift: Floats = about + found[:3] - R @ about
         return R, shift
@@ -86,25 +78,19 @@ class Keyframes:
 
 def _monotone(times: Floats, values: Floats) -> Floats:
     """Return the slopes of monotone cubics (K, n) at keyframes: 0 at both ends and where a value turns back."""
+    from scipy.interpolate import PchipInterpolator
+
     slopes = np.zeros_like(values)
-    h = np.diff(times)[:, None]
-    rate = np.diff(values, axis=0) / h
-    before, after = rate[:-1], rate[1:]
-    first, last = 2.0 * h[1:] + h[:-1], h[1:] + 2.0 * h[:-1]
-    same = before * after > 0.0
-    safe = np.where(same, before, 1.0), np.where(same, after, 1.0)
-    slopes[1:-1] = np.where(same, (first + last) / (first / safe[0] + last / safe[1]), 0.0)
+    if len(times) > 2:
+        slopes[1:-1] = PchipInterpolator(times, values).derivative()(times[1:-1])
     return slopes
 
 
 def rotation(turn: ArrayLike) -> Floats:
-    """Return the matrix (3, 3) of a rotation vector (3,) [rad]: I + sin(a) K + (1 - cos(a)) K^2 [Rodrigues 1840]."""
-    v = np.asarray(turn, float)
-    angle = float(np.sqrt((v * v).sum()))
-    x, y, z = v / angle if angle > 0.0 else v
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    found: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
-    return found
+    """Return the matrix (3, 3) of a rotation vector (3,) [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.asarray(turn, float)).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +110,7 @@ class MovingMesh:
     positions: ArrayLike
     """(F, N, 3) [m]"""
 
-    _slopes: Floats = field(init=False, repr=False)
+    _path: Callable[[float], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times))
@@ -140,11 +126,11 @@ class MovingMesh:
         h = np.diff(times)[:, None, None]
         rate = np.diff(path, axis=0) / h
         slopes[1:-1] = (h[1:] * rate[:-1] + h[:-1] * rate[1:]) / (h[1:] + h[:-1])
-        object.__setattr__(self, "_slopes", slopes)
+        object.__setattr__(self, "_path", _through(times, path, slopes))
 
     def at(self, time: float) -> Floats:
         """Return the vertices at a time [s]: (N, 3) [m]."""
-        return _between(np.asarray(self.times), np.asarray(self.positions), self._slopes, time)
+        return self._path(time)
 
 
 def read_moving_mesh(path: str | Path, *, frame_rate: float | None = None) -> MovingMesh:
