@@ -221,7 +221,7 @@ PARTS: Mapping[str, Callable[[str], None]] = {
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the chosen parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parts = [*PARTS, "protocols"]
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(parts)}; none: all")

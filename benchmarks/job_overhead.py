@@ -43,7 +43,7 @@ def rods(count: int, quality: str) -> dict[str, Any]:
 
 
 class Accounts:
-    """CPU times of all processes of a service, also of those that have ended, up to the last look."""
+    """CPU times of all processes of a service, ended ones included, up to the last look."""
 
     def __init__(self, marker: str) -> None:
         self._marker = marker

@@ -3,7 +3,7 @@
     python benchmarks/queue_costs.py [--watchers 500] [--seconds 10] [--database postgresql://...]
 
 A coordinator runs as a process of its own with a database on a real disk, and its CPU time is read from /proc. That of
-a PostgreSQL server on this machine is told beside it: of all its processes, so nothing else is to use it. Workers
+a PostgreSQL server on this machine is shown beside it: of all its processes, so nothing else may use it. Workers
 pretend: their results are made up and lie in the store. Times of many clients depend on what else the machine does, so
 the load is printed with them.
 """

@@ -101,7 +101,7 @@ def test_images(path: Path) -> None:
 
 
 def linter(name: str, package: str) -> str:
-    """Return the path of a program, of this environment or of the machine; skip the test where there is none."""
+    """Return the path of a program, of this environment or of the machine; skip the test if there is none."""
     found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
     if found is None:
         pytest.skip(f"{name} is not installed: pip install {package}")

@@ -134,7 +134,7 @@ def test_the_code_of_a_dataset_card_runs(rods: Path, monkeypatch: pytest.MonkeyP
         if block.language == "python":
             exec(block.code, names)
     assert names["sample"].shape == (4, 224, 224, 3)
-    assert names["train"].kind == "rod_hang"
+    assert names["train"].reader.kind == "rod_hang"
 
 
 def test_the_reference_of_specs_is_up_to_date() -> None:

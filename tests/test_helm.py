@@ -397,7 +397,7 @@ def test_as_many_workers_are_asked_for_as_the_queue_is_long(
     both = [
         {"series": name.replace("{", f'{{namespace="{NAMESPACE}",pod="{pod}",'), "values": str(value)}
         for name, value in series.items()
-        for pod in ("coordinator-0", "coordinator-1")  # each tells of the same queue
+        for pod in ("coordinator-0", "coordinator-1")  # each reports the same queue
     ]
     case = {"expr": expressions()[-1], "eval_time": "0m", "exp_samples": [{"labels": "{}", "value": expected}]}
     (tmp_path / "test.yaml").write_text(yaml.safe_dump({"tests": [{"input_series": both, "promql_expr_test": [case]}]}))

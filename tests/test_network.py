@@ -60,7 +60,7 @@ def test_work_goes_on_whatever_happens_to_machines(
     assert states == ["succeeded"] * len(states)
     tries, losses = lab.sums()
     assert tries == 0
-    assert losses >= 2  # of those that ran; one at least on each machine that was lost
+    assert losses >= 2  # of running tasks; one at least on each machine that was lost
     assert lab.faults() == []
 
 

@@ -1,4 +1,4 @@
-"""A scene of a user's own, from its file to trajectories: the command line, the workers' program and the core."""
+"""A custom scene, from its file to trajectories: the command line, the workers' program and the core."""
 
 import json
 import subprocess

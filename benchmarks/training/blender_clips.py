@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--held-out-textures", action="store_true")
     parser.add_argument("--held-out-viewpoints", action="store_true")
     parser.add_argument("--lighting", default="drawn", help="drawn or held-out")
-    parser.add_argument("--segmentation", action="store_true", help="write what is seen at every pixel, too")
+    parser.add_argument("--segmentation", action="store_true", help="write the segmentation of every pixel, too")
     args = parser.parse_args()
     with np.load(args.runs) as file:
         low, high = file["differences"]

@@ -63,7 +63,7 @@ def points(fabric: str, runs: int, seed: int, ranges: dict[str, tuple[float, flo
 
 
 def instants_of(frames: int) -> list[int]:
-    """Return the instants that clips show, of those that are simulated."""
+    """Return the simulated instants that clips show."""
     return [instant for instant in shown_frames(SHOWN, FRAMES) if instant < frames]
 
 

@@ -1,4 +1,4 @@
-"""Jobs of many samples: planned piece by piece, by whoever is there, while others work."""
+"""Jobs of many samples: planned piece by piece, by any coordinator, while others work."""
 
 from pathlib import Path
 from typing import Any
@@ -351,7 +351,7 @@ def _planned(client: httpx.Client, job_id: str) -> int:
 def test_people_see_how_far_the_plan_is(
     settings: Settings, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stickslip_services.app.PLAN_SECONDS", 1e6)  # it plans when the test says so
+    monkeypatch.setattr("stickslip_services.app.PLAN_SECONDS", 1e6)  # it plans when the test calls it
     made = make_app(settings, clock=clock)
     context: Context = made.state.context
     planner = Planner(context)

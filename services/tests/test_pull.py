@@ -57,7 +57,7 @@ class Meddler(httpx.BaseTransport):
         meddled = self._meddle(request, response)
         if isinstance(meddled.stream, Breaks):
             return meddled
-        stream = httpx.ByteStream(meddled.content)  # it is to be read once more, as a stream
+        stream = httpx.ByteStream(meddled.content)  # it is read once more, as a stream
         return httpx.Response(meddled.status_code, headers=meddled.headers, stream=stream)
 
     def close(self) -> None:

@@ -31,7 +31,7 @@ from typer.testing import CliRunner, Result
 
 @pytest.fixture
 def made(settings: Settings) -> dict[str, object]:
-    """Two datasets, one with a rejected sample; then the database is lost. Return what was known of them."""
+    """Two datasets, one with a rejected sample; then the database is lost. Return their listings."""
     context = Context.open(settings)
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()

@@ -1,4 +1,4 @@
-"""Artifacts that rot in the store: found when read, made again, and nothing fails for ever."""
+"""Damaged artifacts in the store: found when read, recomputed, and no job fails for good."""
 
 import random
 from pathlib import Path
@@ -73,7 +73,7 @@ def test_200_rotten_artifacts_are_mended(context: Context, worker: PretendWorker
         for path in rng.sample(artifacts(directory(worker)), 10):
             rot(path, rng)
         finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
-        if round_ % 5 == 4:  # the grid grows: what was made for the smaller one is read again
+        if round_ % 5 == 4:  # the grid grows: results of the smaller one are read again
             gammas = [*gammas, 4.0 + round_]
             finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
 

@@ -140,7 +140,7 @@ def test_what_a_version_shows_is_kept_though_no_database_knows_it(in_bucket: Set
     fresh = Context.open(in_bucket)
     start(fresh)
     PretendWorker(DirectApi(fresh), fresh.store).register()
-    submitted(fresh, (5.0,))  # it is in use, and knows nothing of what was made before
+    submitted(fresh, (5.0,))  # it is in use, and has none of the earlier results
     fresh.close()
     before = {name for name in objects(bucket) if "/datasets/" in name}
     assert (

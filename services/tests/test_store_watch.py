@@ -111,7 +111,7 @@ def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
 
 
 def test_a_store_that_is_a_file_pauses_the_job(context: Context, worker: PretendWorker) -> None:
-    """Works without root: whatever keeps the store from being written is told with its reason."""
+    """Works without root: every error of writing to the store is reported with its reason."""
     root = Path(context.settings.store_place)
     if root.exists():
         root.rmdir()

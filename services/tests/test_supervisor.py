@@ -1,4 +1,4 @@
-"""`stickslip up` with real processes; the dispatcher is a stub that says what it was told and waits."""
+"""`stickslip up` with real processes; the dispatcher is a stub that prints its arguments and waits."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Webhooks: everything is told, in order and signed, whatever receivers and coordinators do."""
+"""Webhooks: every event is delivered, in order and signed, whatever receivers and coordinators do."""
 
 import json
 import threading
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.databases
 
 
 class Receiver:
-    """Keeps what it is sent, and answers as it is told."""
+    """Keeps all messages, and answers with preset statuses."""
 
     def __init__(self) -> None:
         self.status = 204

@@ -1,4 +1,4 @@
-"""Scenes of a user's own: sheets, bodies that move, and friction of each two."""
+"""Custom scenes: sheets, bodies that move, and friction of each two."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Results are those recorded, to the bit: SHA-256 of what short scenes return.
+"""Results are equal to the recorded ones, bit by bit: SHA-256 of what short scenes return.
 
     python sim_core/tests/test_golden.py           # compare with golden.json
     python sim_core/tests/test_golden.py --record  # after a change meant to change results: say why

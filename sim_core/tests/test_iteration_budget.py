@@ -1,6 +1,6 @@
 """How many iterations Newton's method takes where friction turns and follows the normal force.
 
-The counts are of the portable kernels, and repeat to the bit. Without the share of friction in Newton's matrix, the
+The counts are of the portable kernels, and repeat exactly. Without the share of friction in Newton's matrix, the
 sphere takes ten times as many. Without its share in what contact prescribes, the shaken floor takes a fifth more.
 Results stay right in both cases; only the cost grows. So they do where cloth slides over cloth.
 """

@@ -39,7 +39,7 @@ class TestCantilever:
         np.testing.assert_allclose(ratio - 1, [-0.046, -0.0045], rtol=0.02)
 
     def test_refined(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Four orders less change nothing above 1e-9: what is left at full order is far below."""
+        """Four orders less change nothing above 1e-9: the remaining error at full order is far below."""
         gamma = 10.0 ** np.arange(-3.0, 5.1)
         fine = master_curves.cantilever(gamma)
         monkeypatch.setattr(boundary_value, "STAGES", 6)
@@ -67,7 +67,7 @@ class TestLateralBuckling:
         rod = master_curves.lateral_buckling_rod() * np.sqrt(2 / (1 + poisson)) * (1 - poisson**2)
         excess = master_curves.lateral_buckling([0.01, 0.02], poisson) / rod - 1
         assert 0 < excess[0] < 0.01
-        assert 2 * excess[0] - excess[1] == pytest.approx(0, abs=4e-4)  # what is left at aspect 0
+        assert 2 * excess[0] - excess[1] == pytest.approx(0, abs=4e-4)  # the limit at aspect 0
 
     def test_wide_strip_is_stiffer(self) -> None:
         weights = master_curves.lateral_buckling([0.05, 0.2, 1.0], 0.3)

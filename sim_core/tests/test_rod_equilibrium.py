@@ -1,4 +1,4 @@
-"""The rods against what is known without this solver: closed forms, scipy's boundary value solver, the inverse."""
+"""The rods against results from other methods: closed forms, scipy's boundary value solver, the inverse."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Cloth that feels itself and other cloth: nothing crosses, friction is exact, and without contact nothing changes."""
+"""Self-contact and contact with other cloth: nothing crosses, friction is exact; without contact nothing changes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -171,7 +171,7 @@ class TestBearing:
         assert (share @ pairs.forces)[2] == pytest.approx(weight, rel=1e-3)
 
     def test_within_a_sheet_all_bear(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A strip that folds onto itself is the same to the bit."""
+        """A strip that folds onto itself is the same bit by bit."""
 
         def run(bearing: str) -> bytes:
             monkeypatch.setattr(tumbles, "SelfContact", lambda mu: SelfContact(mu, bearing=bearing))

@@ -1,4 +1,4 @@
-"""Datasets to test with, written by zarr-python: an implementation that our reader knows nothing of."""
+"""Datasets to test with, written by zarr-python: an independent implementation."""
 
 import json
 import shutil

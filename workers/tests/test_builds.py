@@ -77,7 +77,7 @@ def _files(stage: str, name: str) -> set[Path]:
 
 
 def _only_passes_on(path: Path) -> bool:
-    """Tell whether a file has imports, a docstring and `__all__`, and nothing else."""
+    """Return whether a file has imports, a docstring and `__all__` only."""
     return all(
         isinstance(node, ast.Import | ast.ImportFrom)
         or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))

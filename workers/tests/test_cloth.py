@@ -44,7 +44,7 @@ SIDE = 5
 
 @dataclass
 class Core:
-    """A core that moves a sheet at once: slides it with mu, and breaks where it is told to."""
+    """A core that moves a sheet at once: slides it with mu, and breaks where it is set to."""
 
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     changes: dict[str, Any] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The dispatcher on Ray, with a coordinator and a renderer that do what they are told."""
+"""The dispatcher on Ray, with a coordinator and a renderer of test doubles."""
 
 import os
 import signal

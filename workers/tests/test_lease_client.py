@@ -24,7 +24,7 @@ def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 class SlowCoordinator:
-    """Answers when it is told to."""
+    """Answers when it is set to."""
 
     def __init__(self) -> None:
         self.asked, self.may_answer = threading.Event(), threading.Event()

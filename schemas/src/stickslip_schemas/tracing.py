@@ -122,7 +122,7 @@ def _tracer() -> Tracer:
 
 
 def _context(parent: str | None) -> Context:
-    """Return the context of a parent; an empty one where there is none, so that no span of this thread is taken."""
+    """Return the context of a parent; an empty one if there is none, so that no span of this thread is taken."""
     return _propagator.extract({"traceparent": parent or ""}, Context())
 
 

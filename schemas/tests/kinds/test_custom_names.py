@@ -1,4 +1,4 @@
-"""What a spec may say of textures, cameras, lamps and floors of the user's own."""
+"""Custom textures, cameras, lamps and floors of a spec."""
 
 import io
 import re

@@ -33,7 +33,7 @@ def one(
 
 
 def test_pinned_keys() -> None:
-    """Keys of finished work: if one of these changes, every dataset in the world would be made again."""
+    """Keys of finished work: if one of these changes, every dataset in the world would be recomputed."""
     sample = one()
     assert sample.simulation_key == PINNED["simulation"]
     assert sample.split == PINNED["split"]

@@ -26,7 +26,7 @@ struct Constants {
   FactorSettings factor;
 
   Constants() = default;
-  // Replaces those named "group.name". Throws std::invalid_argument where there is none of that name, or where a value
+  // Replaces those named "group.name". Throws std::invalid_argument if there is none of that name, or where a value
   // is not above 0, or not an integer >= 1 for a count.
   explicit Constants(const std::map<std::string, double>& changed);
   std::map<std::string, double> by_name() const;

@@ -59,7 +59,7 @@ class StaleFactor {
   FactorCost cost_;
 };
 
-// Factors for the lengths of step of late: one that is known again is not made again.
+// Factors for the lengths of step of late: a length that recurs is not factored again.
 class FactorPool {
  public:
   // `size`: factors that are kept.

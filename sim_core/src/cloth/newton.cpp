@@ -202,7 +202,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   return {norms.largest <= settings_.tolerance && arrived(x), norms.largest};
 }
 
-// The share of the change that takes no node further than is known of what is near.
+// The largest share of the change for which the list of near pairs is complete.
 double Newton::reach() const {
   double farthest = 0.0;
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {

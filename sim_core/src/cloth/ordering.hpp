@@ -15,7 +15,7 @@ struct Dissection {
   std::vector<int> parent;       // (fronts): -1 at the root
 };
 
-// Bisects along the longest side of what is left, by coordinates in the plane or in space [George 1973].
+// Bisects along the longest side of the remaining set, by coordinates in the plane or in space [George 1973].
 Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points);
 
 // Which nodes each row of a matrix has entries for, in compressed rows: those of row i are node[begin[i]] ... ,
@@ -25,7 +25,7 @@ struct Pattern {
 
   void add_row(const std::vector<int>& nodes);
   int rows() const { return static_cast<int>(begin.size()) - 1; }
-  // Place of (i, j) in `node`; -1 where there is none, as for held nodes.
+  // Place of (i, j) in `node`; -1 if there is none, as for held nodes.
   int slot(int i, int j) const;
 };
 

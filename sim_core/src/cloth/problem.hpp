@@ -107,7 +107,7 @@ struct FrontRun {
 // then the rows below, tile after tile, so that a solve reads memory from one end to the other.
 struct Factor {
   int fronts;
-  const char* due;         // (fronts): whether it is to be made anew; where a child is due, the parent is
+  const char* due;         // (fronts): whether it must be refactored; where a child is due, the parent is
   const int* pivot_begin;  // (fronts + 1)
   const int* row_begin;    // (fronts + 1)
   const int* rows;         // nodes

@@ -26,7 +26,7 @@ void Stepper::restart() {
   if (newton.pairs) newton.pairs->restart();
 }
 
-// Sets where inertia leads, and the ends of what is held, for the part from `begin` to `end` of the step.
+// Sets the inertial positions and the ends of held vertices, for the part from `begin` to `end` of the step.
 void Stepper::drive_nodes(double begin, double end, double part, const Drive& drive) {
   const Numbering& numbering = assembly_.numbering;
   start_ = x;

@@ -1,4 +1,4 @@
-// Steps in time: what drives them, and halving of those that do not converge.
+// Steps in time: driving forces, and halving of steps that do not converge.
 #pragma once
 
 #include <vector>

@@ -43,7 +43,7 @@ struct Leaves {
   double of(double distance) const;
 };
 
-// A share of the straight motion from x to `to` up to which the distance stays above what is to be left of that at x; 1
+// A share of the straight motion from x to `to` up to which the distance stays above the required share of that at x; 1
 // if it does to the end. Never too large, and too small by little [Li et al. 2021, additive CCD, Algorithm 1].
 double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, const Leaves& leaves);
 

@@ -57,7 +57,7 @@ int CreasedTriangles::corner_of(int t, int node) const {
 // Whether i comes before j in the triangle.
 bool CreasedTriangles::runs(int t, int i, int j) const { return triangles[t][next(corner_of(t, i))] == j; }
 
-// The triangle over the edge opposite a corner; -1 where there is none or more than one.
+// The triangle over the edge opposite a corner; -1 if there is none or more than one.
 int CreasedTriangles::other(const Sides& sides, int t, int k) const {
   const int i = triangles[t][next(k)], j = triangles[t][after_next(k)];
   const std::vector<int>& edge = sides.at({std::min(i, j), std::max(i, j)});

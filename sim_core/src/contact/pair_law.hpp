@@ -18,7 +18,7 @@
 // friction turns with the slip.
 //
 // Where this does not find which pairs bear and which slip, the law is smoothed over an energy epsilon, as by the
-// logarithms of what is left to r_N >= 0 and to |r_T| <= mu r_N: r_N g = epsilon and u = -2 epsilon r_T/((mu r_N)^2 -
+// logarithms of the slack in r_N >= 0 and to |r_T| <= mu r_N: r_N g = epsilon and u = -2 epsilon r_T/((mu r_N)^2 -
 // |r_T|^2). In the form above, which holds whatever sign g has [Chen & Harker 1993; Kanzow 1996],
 //
 //     r_N = R_N = (z + sqrt(z^2 + 4 k epsilon))/2,  z = r_N - k g,

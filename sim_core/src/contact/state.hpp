@@ -31,7 +31,7 @@ class ContactState {
   Buffer<float> normal, direction, mu, turning;
   Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
-  std::unique_ptr<SmoothContact> surfaces;  // null where there are none
+  std::unique_ptr<SmoothContact> surfaces;  // null if there are none
 
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method
   // may else go to and fro between the two ways of slipping, where the law has it that they stick.

@@ -12,7 +12,7 @@ from stickslip_services.queue.jobs import find_job
 
 
 class ManualClock:
-    """A clock that stands still until it is told otherwise."""
+    """A clock that stands still until it is set."""
 
     def __init__(self) -> None:
         self.now = 1_800_000_000.0

@@ -91,7 +91,7 @@ class Balance:
     """(3,): sum of their moments [N m]."""
 
     moment_of_friction: Floats
-    """(3,): what that is to be [N m]. A force along the normal has no moment; friction acts on both sides of the
+    """(3,): its required value [N m]. A force along the normal has no moment; friction acts on both sides of the
     distance, and turns by it."""
 
 

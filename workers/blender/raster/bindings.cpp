@@ -192,7 +192,7 @@ NB_MODULE(_raster, module) {
   module.attr("BUILD_HASH") = raster::build_hash;
   module.attr("TOLERANCE") = raster::tolerance;
   module.def("visible", &visible, "points"_a, "triangles"_a, "window"_a, "grid"_a,
-             "Return the triangle seen at each sample, shape (grid height, grid width), -1 where there is none.\n\n"
+             "Return the triangle seen at each sample, shape (grid height, grid width), -1 if there is none.\n\n"
              "Points (V, 3): column, row [px] and depth. The window: left, top, width, height [px].");
   module.def(
       "albedo", &albedo, "seen"_a, "points"_a, "triangles"_a, "coordinates"_a, "end"_a, "texels"_a, "count"_a,

@@ -88,7 +88,7 @@ LocalPlane local(const Plane& plane, int left, int top) {
   return {static_cast<float>(plane.along), static_cast<float>(plane.down), static_cast<float>(plane(left, top))};
 }
 
-// Samples so far: `stride` is the width and some cells that nobody looks at, so that whole registers can be written.
+// Samples so far: `stride` is the width and some unused cells, so that whole registers can be written.
 struct Buffer {
   std::vector<float> nearest;  // 1 / depth
   std::vector<std::int32_t> seen;

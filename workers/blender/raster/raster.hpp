@@ -1,7 +1,7 @@
 // Which triangle is seen at each of many samples a pixel, and the mean albedo that a pixel then has.
 //
-// Image coordinates are those of stickslip_schemas.spec.cameras: integer pixel coordinates are pixel centres. A pixel has
-// grid x grid samples, one in each of as many cells; inside its cell a sample sits at
+// Image coordinates are those of stickslip_schemas.spec.cameras: integer pixel coordinates are pixel centres. A pixel
+// has grid x grid samples, one in each of as many cells; inside its cell a sample sits at
 //
 //     x = ((5 j mod grid) + 1/2) / grid,   y = ((5 i mod grid) + 1/2) / grid      cell (i, j) = (column, row)
 //
@@ -41,7 +41,7 @@ struct Textures {
   int size, channels, count;
 };
 
-// Return the triangle seen at each sample, row by row, (grid height) x (grid width); -1 where there is none. The
+// Return the triangle seen at each sample, row by row, (grid height) x (grid width); -1 if there is none. The
 // nearest triangle wins, and of two at the same depth the first.
 std::vector<std::int32_t> visible(std::span<const Projected> vertices, std::span<const Triangle> triangles,
                                   Window window, int grid);

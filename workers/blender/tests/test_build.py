@@ -1,4 +1,4 @@
-"""The build digest is over what is rendered with, and nothing else."""
+"""The build digest covers the files of the renderer only."""
 
 import pytest
 from stickslip_blender import build

@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
     )
 
-    scene = commands.add_parser("scene", help="run a scene of your own, as `stickslip simulate` hands it over")
+    scene = commands.add_parser("scene", help="run a custom scene, as `stickslip simulate` hands it over")
     scene.add_argument("scene", type=Path, help="the scene as JSON")
     scene.add_argument("--folder", type=Path, required=True, help="where the files are that the scene names")
     scene.add_argument("--out", type=Path, required=True, help="a new directory for the trajectories")
@@ -91,7 +91,7 @@ def _store(place: str) -> str:
 
 def _dispatch(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
     if not options.blender_python.exists():
         logging.error("blender-python must be an interpreter; %s does not exist", options.blender_python)
         return 2
@@ -162,7 +162,7 @@ def run_for_ever(command: list[str], backoff: Backoff) -> int:
         # In a group of its own: what Ctrl-C sends is passed on once, and not also sent to it.
         child = subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
         status = child.wait()
-        if stopped or status in (0, 2):  # 2: what it was told makes no sense
+        if stopped or status in (0, 2):  # 2: its arguments make no sense
             return status
         if time.monotonic() - began > STEADY_SECONDS:
             backoff.succeeded()
@@ -205,7 +205,7 @@ def _certify(options: argparse.Namespace) -> int:
     """Return 0 if the preset passed, 1 if not, 2 if there was nothing to run."""
     from stickslip_workers.certify import certify
 
-    # Long protocols may tell of their progress, as logging.info.
+    # Long protocols may log their progress.
     logging.basicConfig(level=logging.INFO, format="    %(message)s")
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
 

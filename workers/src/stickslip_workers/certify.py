@@ -54,7 +54,7 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
             result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
             report = ProtocolReport.model_validate(_with_dense_curves(result))
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
-        except Exception as error:  # whatever it is, the certificate has to say so
+        except Exception as error:  # any error becomes part of the certificate
             report = _broken_off(name, error)
         else:
             results.append(result)
@@ -124,7 +124,7 @@ def _environment() -> dict[str, str]:
 
 
 def _protocol_sources() -> str:
-    """Return the digest of what measures and of what is measured against."""
+    """Return the digest of the protocols and their master curves."""
     return content_key("protocols", digests(sources(["stickslip_sim_core.protocols"])))
 
 

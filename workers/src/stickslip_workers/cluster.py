@@ -5,7 +5,7 @@ a signal or see their parent gone. Two of its agents take up to a minute to see 
 ends them at once.
 
 Ray itself takes minutes to notice that a part of it has died, and some of its calls then never return. So the processes
-of a cluster of our own are watched: where one is gone the dispatcher ends, and whoever has started it starts another
+of a cluster of our own are watched: where one is gone the dispatcher ends, and its supervisor starts another
 one, with another cluster.
 """
 
@@ -74,7 +74,7 @@ _QUIET = {
 as small tasks do."""
 
 _UNNEEDED = ("ray/_private/log_monitor.py", "ray/autoscaler/_private/monitor.py")
-"""Those of the processes that do nothing for us: output of workers stays in their files, and no node is to be added."""
+"""Those of the processes that do nothing for us: output of workers stays in their files, and no node is added."""
 
 
 class ClusterLostError(RuntimeError):
@@ -228,7 +228,7 @@ def _command_line(pid: int) -> str:
 
 
 def _parent_of(pid: int) -> int | None:
-    """Return the parent of a process that lives; None where there is none, or only its corpse."""
+    """Return the parent of a process that lives; None if there is none, or only its corpse."""
     try:
         state, parent = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:2]
     except OSError:

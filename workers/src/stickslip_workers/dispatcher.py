@@ -85,8 +85,8 @@ _PRECEDENCE = (Stage.publish, Stage.pack, Stage.simulate, Stage.render)
 """What goes first: the end of a job before its beginning, and simulations, while they are short, before renders."""
 
 LONG_SIMULATION = 2.0
-"""Simulations that take longer [s] go after renders: clips come out while others are simulated, and the time that is
-left can be told from both. Of such no more are leased than run soon, for another dispatcher may have nothing to do."""
+"""Simulations that take longer [s] go after renders: clips come out while others are simulated, and the time left
+is known for both. Of such no more are leased than run soon, for another dispatcher may have nothing to do."""
 
 _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
 _results = TypeAdapter(list[TaskResult])
@@ -299,7 +299,7 @@ class Dispatcher:
     def _has_queued_alone(self, assignment: Assignment) -> bool:
         """Queue the parts of a call that failed, to be done one by one; return False where there was only one.
 
-        A render that ends its process must not count as a failure of those that were given to the process with it.
+        A render that ends its process must not count as a failure of renders in the same process.
         """
         if len(assignment.parts) == 1:
             return False

@@ -1,4 +1,4 @@
-"""A scene of a user's own: from its file to trajectories, with the same rule for certificates as for datasets."""
+"""A custom scene: from its file to trajectories, with the same rule for certificates as for datasets."""
 
 import json
 import shutil
@@ -42,7 +42,7 @@ class NotCertifiedError(SceneError):
 def why_uncertified(scene: SceneFile, certificate: Certificate | None) -> str:
     """Return why a scene's trajectories are not certified, or an empty text.
 
-    All sheets feel themselves and each other, so the certificate has to have the protocols of contact.
+    All sheets have self-contact and contact with each other, so the certificate has to have the protocols of contact.
     """
     preset = scene.preset.value
     if certificate is None:
@@ -77,7 +77,7 @@ def simulate_scene(
         folder: Where the files are that it names.
         out: A directory that does not exist; it appears when all is written.
         certificate: Of the preset.
-        allow_uncertified: Run it even where no certificate vouches for it; the result says so.
+        allow_uncertified: Run it without a certificate; the result records that.
         obj: Write `SHEET/0000.obj` and so on, too.
         on_frame: Called with (frames done, frames) after every frame.
 

@@ -1,4 +1,4 @@
-"""How far the simulation is that runs in this process: a kind tells, and whoever holds the process asks."""
+"""Progress of the simulation that runs in this process."""
 
 _frames: tuple[int, int] | None = None
 

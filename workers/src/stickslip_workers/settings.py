@@ -14,7 +14,7 @@ RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What a dispatcher is told when it starts. Times are in seconds."""
+    """Options of a dispatcher. Times are in seconds."""
 
     url: str
     """Base URL of the coordinator."""

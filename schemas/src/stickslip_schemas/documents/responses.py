@@ -85,7 +85,7 @@ class Job(Document):
 
 
 class JobDetail(Job):
-    """A job with what was asked for."""
+    """A job with its spec."""
 
     spec: AnyJobSpec
 

@@ -1,4 +1,4 @@
-"""What the stages are told to do and what they answer. Bulk data is named by digest and never travels here."""
+"""Tasks of the stages and their results. Bulk data is named by digest and never part of a message."""
 
 from collections.abc import Callable
 from contextlib import suppress

@@ -286,7 +286,7 @@ def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
         if stated.get(name) != found:
             raise BrokenSealError(f"{name} has SHA-256 {found}, and {SEAL_NAME} says {stated.get(name)}")
     if seal != seal_text(*digests.values()):
-        raise BrokenSealError(f"{SEAL_NAME} must have a line each for {', '.join(digests)}, and nothing else")
+        raise BrokenSealError(f"{SEAL_NAME} must have one line each for {', '.join(digests)}, and no other line")
     try:
         named = json.loads(group)["attributes"][MANIFEST_ATTRIBUTE]
     except (ValueError, KeyError, TypeError) as error:

@@ -76,7 +76,7 @@ def png(picture: Pictures) -> bytes:
 
 
 def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) -> bytes:
-    """Return pictures (n, height, width, 3) as an animated WebP that repeats for ever, 120 ms a picture.
+    """Return pictures (n, height, width, 3) as an animated WebP that repeats forever, 120 ms a picture.
 
     With `side`, pictures are reduced to that width [px].
     """

@@ -93,7 +93,7 @@ class RodHangSpec(JobSpec):
         return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
 
     def picture_decibels(self) -> float | None:
-        """Return the PSNR of the pictures of this quality, as measured [dB]; None where there are none."""
+        """Return the PSNR of the pictures of this quality, as measured [dB]; None if there are none."""
         return None if self.views is None else PICTURE_DECIBELS[self.quality]
 
     def cameras(self) -> tuple[Camera, ...]:

@@ -118,7 +118,7 @@ def pack_key(spec: JobSpec, shard: int, members: Sequence[KeyedPoint], builds: B
 
 
 def publish_key(spec: JobSpec, pack_keys: Sequence[str], builds: Builds, certificate: str | None = None) -> str:
-    """Return the content key of a dataset version: what was asked for, its shards, and who vouches for them."""
+    """Return the content key of a dataset version: spec, shards and certificate."""
     content: dict[str, Any] = {"spec": spec.content_digest, "shards": list(pack_keys), "builds": builds.digest}
     if certificate is not None:
         content["certificate"] = certificate

@@ -113,7 +113,7 @@ def _long_form(value: Any) -> Any:
 
 
 class _Shorthand(BeforeValidator):
-    """Lets an axis be written in its short form, and says so in the JSON schema of what may be sent."""
+    """Accepts the short form of an axis, in validation and in the JSON schema."""
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         long = handler(core)

@@ -175,7 +175,7 @@ class JobSpec(Document):
         raise NotImplementedError
 
     def picture_decibels(self) -> float | None:
-        """Return the PSNR of the pictures of this quality, as measured [dB]; None where there are none."""
+        """Return the PSNR of the pictures of this quality, as measured [dB]; None if there are none."""
         raise NotImplementedError
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
@@ -207,7 +207,7 @@ class JobSpec(Document):
 
     @property
     def content_digest(self) -> str:
-        """Key of what is asked for, whatever it is called."""
+        """Key of the spec without its name."""
         return content_key("spec", self.model_dump(mode="json", exclude={"name"}))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A scene of a user's own, as a file: sheets of cloth, holders and bodies that move, and the friction of each two."""
+"""A custom scene, as a file: sheets of cloth, holders and bodies that move, and the friction of each two."""
 
 from collections.abc import Iterator
 from itertools import combinations_with_replacement, pairwise
@@ -167,7 +167,7 @@ class Pair(Document):
 
 
 class SceneFile(Document):
-    """A scene of your own. Lengths are in metres, z is up."""
+    """A custom scene. Lengths are in metres, z is up."""
 
     format: Literal["stickslip-scene/1"]
     duration: Float = Field(gt=0, le=10_000, description="[s]")

@@ -44,7 +44,7 @@ class ApiKey:
 def create_key(
     connection: Connection, name: str, scopes: Collection[Scope], now: float, *, project: str = ""
 ) -> tuple[ApiKey, str]:
-    """Make a key; return it and its secret, which nobody can be told again. Raise ValueError for a bad project."""
+    """Make a key; return it and its secret, which is not stored. Raise ValueError for a bad project."""
     secret = f"sk_{secrets.token_urlsafe(32)}"
     key = _insert(connection, name, scopes, secret, now, project=check_project(project))
     told = [scope for scope in Scope if scope in scopes]
@@ -78,7 +78,7 @@ def revoke_key(connection: Connection, key_id: str, now: float) -> None:
 
 
 def local_worker_key(path: Path) -> str:
-    """Return the secret in the file of the local workers; make it where there is none. Only its owner can read it."""
+    """Return the secret in the file of the local workers; make it if there is none. Only its owner can read it."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_durably(path, f"{secrets.token_urlsafe(32)}\n".encode(), mode=0o600)

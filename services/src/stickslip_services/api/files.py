@@ -74,7 +74,7 @@ def matches(header: str | None, etag: str) -> bool:
 
 
 def _span(header: str, size: int, headers: dict[str, str]) -> tuple[int, int] | None:
-    """Return the first and last byte of the range, or None where the whole file is to be sent.
+    """Return the first and last byte of the range, or None for the whole file.
 
     A range of another form, or several of them, may be ignored, and is.
     """

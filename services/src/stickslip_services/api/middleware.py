@@ -63,7 +63,7 @@ class BodyLimitMiddleware:
                 received += len(message.get("body", b""))
                 if received > self._limit:
                     refused = True
-                    return {"type": "http.disconnect"}  # whoever reads stops; the answer is given below
+                    return {"type": "http.disconnect"}  # the reader stops; the answer is given below
             return message
 
         async def limited_send(message: Message) -> None:

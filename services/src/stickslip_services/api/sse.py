@@ -78,7 +78,7 @@ class _News:
 
 
 class _Feed:
-    """What is known of a job, kept up to date while somebody watches."""
+    """State of a job, kept up to date while it is watched."""
 
     def __init__(self, context: Context, job: int, after: int) -> None:
         self._context = context
@@ -95,7 +95,7 @@ class _Feed:
         self.task = asyncio.create_task(self._follow())
 
     async def messages(self, cursor: int) -> AsyncIterator[bytes]:
-        """Yield what a watcher who has seen the events up to `cursor` is told."""
+        """Yield the events after `cursor`."""
         opening = f"retry: {RECONNECT_MILLISECONDS}\n".encode()  # goes with the first event
         told = ""
         while True:

@@ -44,7 +44,7 @@ class Database(ABC):
     def clock(self) -> float:
         """Return what all coordinators on this database call now, in seconds since 1970 [s].
 
-        When somebody sets this machine's clock, leases neither expire at once nor live for ever.
+        When somebody sets this machine's clock, leases neither expire at once nor live forever.
         """
         return self._ahead + time.monotonic()
 

@@ -36,7 +36,7 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
 
 @contextmanager
 def opened(settings: Settings, role: Role) -> Iterator[Database]:
-    """Open the database of a coordinator, brought up to date; make it where there is none.
+    """Open the database of a coordinator, brought up to date; make it if there is none.
 
     Raise DatabaseRefusedError where it is damaged, was made by a newer version, or cannot be had in this role.
     """
@@ -118,7 +118,7 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
     name = settings.database_name
     if settings.database_path.exists():
         raise DatabaseRefusedError(
-            f"the queue is to be in {name}, and {settings.database_path} holds another one: move that file away"
+            f"the queue must be in {name}, and {settings.database_path} holds another one: move that file away"
         )
     database = connect(settings, role)
     try:

@@ -24,7 +24,7 @@ from stickslip_services.errors import DatabaseRefusedError
 logger = logging.getLogger(__name__)
 
 _LOCKS = 0x736C6970
-"""First of the two numbers of our advisory locks: "slip". The second is 1 of whoever writes, 2 of whoever is there."""
+"""First of the two numbers of our advisory locks: "slip". The second is 1 for writers, 2 for connected coordinators."""
 
 _CHANNEL = "stickslip"
 
@@ -40,7 +40,7 @@ _CONNECT = {
 
 _WRITER_SETTINGS = (
     "lock_timeout = '30s'",
-    # Who stops in the middle of a write (a stopped process, a lost network) does not hold up the others for ever.
+    # Who stops in the middle of a write (a stopped process, a lost network) does not hold up the others forever.
     "idle_in_transaction_session_timeout = '60s'",
     "tcp_keepalives_idle = 30",
     "tcp_keepalives_interval = 10",

@@ -114,7 +114,7 @@ class Ledger:
         self.runs.append(run)
 
     def tell(self, task: int, event: TaskStateEvent) -> None:
-        """Note what all jobs of a task are to be told."""
+        """Note the events of all jobs of a task."""
         self.news.append((task, event))
 
     def end_job(self, job: int, ending: Ending) -> None:
@@ -142,7 +142,7 @@ def give_up_tasks(book: Ledger, job: int, *, ending: Collection[int] = ()) -> No
 
 
 def charge_waiting_tasks(connection: Connection, job: int) -> None:
-    """Charge each waiting task of a live job to the job that it is to run for: a runnable one where there is one.
+    """Charge each waiting task of a live job to the job that it is to run for: a runnable one if there is one.
 
     Called whenever a job starts or stops being runnable, or changes its priority, for a task is leased only on behalf
     of the job it is charged to.
@@ -175,7 +175,7 @@ def _charge(connection: Connection, job_of: dict[int, int]) -> None:
 
 
 def cancel_tasks(book: Ledger, rows: Collection[tuple[int, str, str]]) -> None:
-    """Cancel tasks (seq, stage, state), whoever has them on lease."""
+    """Cancel tasks (seq, stage, state), leased ones included."""
     if not rows:
         return
     book.connection.execute(

@@ -1,4 +1,4 @@
-"""How far jobs are, from the counters that the ledger keeps; of `tasks` only the rows that tell of frames are read."""
+"""How far jobs are, from the counters that the ledger keeps; of `tasks` only rows with numbers of frames are read."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple

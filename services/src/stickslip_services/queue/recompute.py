@@ -119,7 +119,7 @@ def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> 
         book.end_job(made.job, replace(ending, message=ending.message or "every result was cached"))
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
-    message = f"the dataset was made before, but {what} damaged or lost in the store; what is missing is made again"
+    message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
     set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
     reopen_task(book, made.publish_task)
     recompute(book, made.publish_task, damaged or frozenset())

@@ -165,7 +165,7 @@ class FailedTask:
 
 
 def failed_tasks(connection: Connection, job: int, settings: Settings, count: int) -> list[FailedTask]:
-    """Return the tasks of a job that have failed, or are to be tried again, newest first."""
+    """Return the tasks of a job that have failed or wait for a retry, newest first."""
     rows = connection.execute(
         select(tasks.c.key, tasks.c.stage, tasks.c.tries, tasks.c.reason, tasks.c.message)
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)

@@ -190,7 +190,7 @@ def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
 
 
 def _compression(connection: Connection, kind: str) -> float | None:
-    """Return stored bytes over raw bytes of the newest dataset of a kind; None where there is none."""
+    """Return stored bytes over raw bytes of the newest dataset of a kind; None if there is none."""
     row = connection.execute(
         select(jobs.c.spec, dataset_versions.c.bytes)
         .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)

@@ -39,7 +39,7 @@ _CLOTH_QUICK: Mapping[str, Mapping[str, Any]] = {
 }
 _CONTACT = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
 SCENE_PROTOCOLS = _CLOTH + _CONTACT
-"""What a certificate has to have for a scene in which cloth feels itself."""
+"""What a certificate has to have for a scene with self-contact."""
 
 _CONTACT_QUICK: Mapping[str, Mapping[str, Any]] = {
     "capstan": {"friction": (0.3,), "bending": (0.05,)},

@@ -266,7 +266,7 @@ class _BoundaryPoint:
 class _Boundary:
     """The boundary curve of one Poisson's ratio, (Lambda, phi(Lambda)), followed from an anchor along a ladder.
 
-    The ladder of Lambda is climbed from the anchor always, so that no point depends on what was asked before.
+    The ladder of Lambda is climbed from the anchor always, so that no point depends on earlier calls.
     """
 
     UP, DOWN = 1.1, 0.97  # ratios of neighbours on the ladder: below the anchor rods differ more
@@ -291,7 +291,7 @@ class _Boundary:
         return best
 
     def gamma_at(self, phi: float) -> float:
-        """Gamma on the upper side of the curve, NaN where there is none; a secant that keeps its bracket."""
+        """Gamma on the upper side of the curve, NaN if there is none; a secant that keeps its bracket."""
         if phi < self.onset.phi:
             return np.nan
         rung = 0

@@ -85,7 +85,7 @@ LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
 
 SHORTENED = 0.1
 """Share of each displacement that is taken once one is longer than half of the one before. A step has the stiffness of
-its start, so a fabric that stiffens fast would swing about its shape at rest for ever."""
+its start, so a fabric that stiffens fast would swing about its shape at rest forever."""
 
 FRAMES = 300
 """Frames of a whole drop-and-drag."""

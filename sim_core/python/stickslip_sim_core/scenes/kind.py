@@ -1,4 +1,4 @@
-"""Kinds of simulations: what the module of each kind offers to whoever runs its simulations."""
+"""Kinds of simulations: what the module of each kind offers to the workers."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -15,7 +15,7 @@ from stickslip_training.data.reader import DatasetReader
 
 _LOOKS = ("texture", "viewpoint", "lighting")
 _SHOWN = 3  # frames of a clip that are compared
-_BLOCK = 14  # pixels along a side of what is averaged before
+_BLOCK = 14  # pixels along a side of an averaged block
 
 
 class ClothTask(Task):

@@ -1,13 +1,13 @@
 """Which named test sets there are, and whether a dataset is one of them.
 
-A set is a spec, and the split of its dataset that is to be answered, or all of it. Builds of the code differ between
+A set is a spec, and the split of its dataset to answer, or all of it. Builds of the code differ between
 machines, and so do manifests. What identifies a set is therefore what its samples hold:
 
   * the labels that follow from the spec, slot by slot, to the last bit: a digest;
   * a little of what methods see, and of truths that are computed, to within a tolerance: an array.
 
 The manifests of versions that were published stand beside it, so that a table can tell entries on the published bytes
-from those on a set that was made again.
+from those on a set that was remade.
 """
 
 import json
@@ -57,11 +57,11 @@ class NamedSet:
 
     @property
     def task(self) -> Task:
-        """What is asked."""
+        """The questions."""
         return TASKS[str(self.parsed_spec.kind)]
 
     def check(self, reader: DatasetReader) -> tuple[Integers, Making]:
-        """Return the slots to answer, and whether the dataset is a published version or was made again.
+        """Return the slots to answer, and whether the dataset is a published version or was remade.
 
         Raises ValueError where the dataset is not this set.
         """
@@ -92,7 +92,7 @@ def set_names() -> tuple[str, ...]:
 
 
 def load_set(name: str) -> NamedSet:
-    """Return a set; raise ValueError where there is none of this name."""
+    """Return a set; raise ValueError if there is none of this name."""
     if name not in set_names():
         raise ValueError(f"the test set must be one of {', '.join(set_names())}, and is {name!r}")
     document = json.loads((_folder() / f"{name}.json").read_text(encoding="utf-8"))

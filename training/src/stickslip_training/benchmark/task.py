@@ -1,4 +1,4 @@
-"""What is asked of a method in test sets of one kind, and how its answers are scored."""
+"""Tasks of test sets of one kind: questions, and scoring of answers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

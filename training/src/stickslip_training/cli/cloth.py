@@ -69,7 +69,7 @@ def train(
         )
         first = None if start is None else load_friction(start)
         if first is not None and bool(first.quantities) == fabric:
-            # The order of mu is known: the network is told as sharply as it was in the end.
+            # The order of mu is known: the labels are as sharp as at the end of training.
             settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
         source, parts = _splits(runs, split_seed)
         source["split_seed"] = split_seed
@@ -176,7 +176,7 @@ def import_(
         ),
     ] = None,
 ) -> None:
-    """Put a video of your own on the stage's clock and register it to the holders."""
+    """Align a video with the drag scene in time, and register it to the holders."""
     from stickslip_training.cloth.video import import_video, load_calibration, save_clip
 
     with errors_told():
@@ -204,7 +204,7 @@ def predict(
     split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
-    """Tell material and friction of every clip of a dataset, or of a video of your own, with the interval that holds mu
+    """Predict material and friction of every clip of a dataset, or of a video, with the interval that holds mu
     with 80 %."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions

@@ -151,7 +151,7 @@ def _require(option: str) -> None:
 
 @contextmanager
 def _progress(content: Content) -> Iterator[OnBytes]:
-    """Show a bar on the terminal, where there is one."""
+    """Show a bar on the terminal, if there is one."""
     console = Console(stderr=True)
     columns = (BarColumn(bar_width=32), DownloadColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:

@@ -54,7 +54,7 @@ class Errors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """All that is told about the answers to some clips."""
+    """All results about the answers to some clips."""
 
     blind: Errors
     """Material not known."""

@@ -61,7 +61,7 @@ class ClothTraining:
     averaging: float = 0.99
     """Decay of the running average over steps that is the model's weights."""
     smoothing: tuple[float, float] = (0.2, 0.02)
-    """Standard deviation of mu about the truth in what the network is told, at the first and at the last step [1]: it
+    """Standard deviation of mu about the truth in the training labels, at the first and at the last step [1]: it
     learns an order first, and at the end bins."""
     gap: float = 0.3
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""

@@ -40,7 +40,7 @@ class Style:
     exposure: torch.Tensor
     """(B,)"""
     floor: torch.Tensor
-    """(B,): brightness of what is not cloth."""
+    """(B,): brightness of the background."""
     gamma: torch.Tensor
     """(B,): exponent of brightness to grey level."""
     blur: torch.Tensor

@@ -107,7 +107,7 @@ def _load(path: str | Path) -> Runs:
 def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
     """Return the simulations of a dataset that stores its meshes, and the slot of one sample of each.
 
-    Samples of one simulation are told by material, mu and the mesh at the last instant that is read.
+    Samples of one simulation are recognised by material, mu and the mesh at the last instant that is read.
     """
     for name in ("positions", "rest", "material", "mu"):
         if name not in reader.arrays:

@@ -45,7 +45,7 @@ PATCH_BELOW = 0.005
 """Their depth below the held edge [m]."""
 
 WINDOW = 0.012
-"""Side of what is followed [m]."""
+"""Side of the tracked patch [m]."""
 
 MATCH_MAX = 1.0
 """How far a match with a kept frame may be from where the steps since led; then another frame is kept [px]."""

@@ -5,7 +5,7 @@ DatasetError
 ├── MissingFileError       a file of the manifest is not there
 ├── CorruptDataError       bytes are not what a size, a checksum or a digest says they are
 ├── RejectedSampleError    the sample was rejected when the dataset was made: there is nothing to read
-└── SourceError            the server does not answer, or not with what was asked for
+└── SourceError            the server does not answer, or not with the requested data
 """
 
 from stickslip_schemas.format.codecs import CorruptChunkError
@@ -32,4 +32,4 @@ class RejectedSampleError(DatasetError, LookupError):
 
 
 class SourceError(DatasetError, OSError):
-    """The server does not answer, or not with what was asked for."""
+    """The server does not answer, or not with the requested data."""

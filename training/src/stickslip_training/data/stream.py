@@ -11,7 +11,7 @@ from stickslip_training.data.samples import Batch, Samples, collate
 
 
 class Stream:
-    """An epoch of batches each time it is iterated over, or what is left of one.
+    """An epoch of batches each time it is iterated over, or the rest of one.
 
     The samples of an epoch are in an order that `seed` and the number of the epoch decide. They are dealt out in rounds
     of `batch_size * world_size`, and process `rank` takes its part of each round. So no two processes see the same

@@ -1,7 +1,7 @@
 """Trajectories of cloth for programs that render or animate: USD, one file a sample, or OBJ, one file an instant.
 
 Both have the mesh in metres, z up, with the flat cloth as texture coordinates from 0 to 1. USD has all instants of a
-sample as time samples, with its labels beside them; numbers are those of the dataset to the bit. OBJ is text, and its
+sample as time samples, with its labels beside them; numbers are those of the dataset, bit by bit. OBJ is text, and its
 numbers, read as 32-bit floats, are the same bits, too.
 """
 

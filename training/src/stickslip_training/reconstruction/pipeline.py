@@ -70,7 +70,7 @@ class Reconstruction:
     radius: float
     """Of the rod, given or found."""
     misfit: float
-    """Sum of |seen - drawn| over the sum of what is seen."""
+    """Sum of |seen - drawn| over the sum of seen."""
     unexplained: float
     """Share of the silhouettes' area where nothing is drawn."""
     unsupported: float

@@ -36,7 +36,7 @@ class Shading:
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """The nearer or the farther part of the rod at each pixel; rows where there is none are zero."""
+    """The nearer or the farther part of the rod at each pixel; rows if there is none are zero."""
 
     sample: Integers
     """Sample of the curve nearest to the pixel, (n,)."""

@@ -67,7 +67,7 @@ class View:
 
 
 def shrink_image(image: Floats, factor: int) -> Floats:
-    """Average blocks of pixels of (y, x) or (y, x, channel); what is left over at the right and at the bottom goes."""
+    """Average blocks of pixels of (y, x) or (y, x, channel); the rest at the right and at the bottom is dropped."""
     height, width = (n // factor * factor for n in image.shape[:2])
     blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
     mean: Floats = blocks.mean(axis=(1, 3))

@@ -31,7 +31,7 @@ _TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apar
 
 @dataclass(frozen=True, kw_only=True)
 class CurvatureTraining:
-    """What a run is told. Exactly one of `minutes` and `epochs` says how long it takes."""
+    """Options of a run. Exactly one of `minutes` and `epochs` says how long it takes."""
 
     dataset: str
     """Directory or URL of a dataset of rods."""

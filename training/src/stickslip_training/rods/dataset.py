@@ -43,7 +43,7 @@ def load_splits(
 ) -> tuple[dict[str, Rods], list[str]]:
     """Read the three splits, of the test split no more than `evaluation_rods`; return them, and notes on them.
 
-    Where a split is empty, another one takes its place, and a note says so.
+    Where a split is empty, another one takes its place, with a note.
     """
     if reader.kind != KIND:
         raise ValueError(f"kind of the dataset must be {KIND} to train on curvature: it is {reader.kind}")

@@ -1,4 +1,4 @@
-"""Animated meshes from other programs, for scenes of the user's own.
+"""Animated meshes from other programs, for custom scenes.
 
 `python -m stickslip_blender.import_mesh IN OUT.npz` reads what Blender reads: Alembic, USD, OBJ, PLY and STL. The NPZ
 file has `positions` (frames, vertices, 3) [m], `triangles` (T, 3) and `times` (frames,) [s]. `stickslip simulate` takes

@@ -66,7 +66,7 @@ class Workshop:
             self._renderer = None
 
     def kept_shading(self, key: str) -> bytes | None:
-        """Return a shading that any process kept in the store; None where there is none, or a damaged one."""
+        """Return a shading that any process kept in the store; None if there is none, or a damaged one."""
         path = self._shading_path(key)
         if path is None:
             return None

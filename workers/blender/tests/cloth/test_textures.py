@@ -14,7 +14,7 @@ def test_a_texture_is_a_picture_with_contrast(texture: Texture) -> None:
     light = picture.astype(float).mean(axis=2)
     assert np.ptp(light) > 80
     assert light.std() > 20
-    # At 224 x 224 a cloth is some 70 pixels wide: what is left of the pattern there is most of it.
+    # At 224 x 224 a cloth is some 70 pixels wide: most of the pattern remains.
     coarse = light.reshape(64, SIZE // 64, 64, SIZE // 64).mean(axis=(1, 3))
     assert coarse.std() > 0.6 * light.std()
 

@@ -62,7 +62,7 @@ def _ground_truth_arrays(spec: ClothSpec, pixels: dict[str, int]) -> tuple[Array
     """Return the arrays per pixel that the spec asks for. Textures share them, and each of their samples has them."""
     arrays = (
         array("depth", "depth along the optical axis [m], infinite where nothing is", "float32", pixels),
-        array("segmentation", "code of what is seen", "uint8", pixels, attributes={"categories": list(SEGMENTS)}),
+        array("segmentation", "code of the visible object", "uint8", pixels, attributes={"categories": list(SEGMENTS)}),
         array(
             "normals",
             "normals towards the camera, in its axes (right, down, forward); 0 where nothing is",
@@ -72,7 +72,7 @@ def _ground_truth_arrays(spec: ClothSpec, pixels: dict[str, int]) -> tuple[Array
         array("uv", "place on the cloth, 0 to 1 along warp and weft, else NaN", "float16", pixels | {"uv": 2}),
         array(
             "flow",
-            "how far what is seen moves until the next frame of the clip [px], 0 in the last",
+            "motion of the visible point until the next frame of the clip [px], 0 in the last",
             "float16",
             pixels | {"xy": 2},
         ),

@@ -57,7 +57,7 @@ def post_job(
         Header(
             min_length=1,
             max_length=255,
-            description="a word that is yours alone; a request that comes twice with it makes one job. Kept for ever.",
+            description="a word that is yours alone; a request that comes twice with it makes one job. Kept forever.",
         ),
     ] = None,
     priority: Annotated[

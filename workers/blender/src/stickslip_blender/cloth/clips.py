@@ -161,7 +161,7 @@ class ClipRenderer:
         return videos, labels
 
     def ground_truth(self, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-        """Return arrays of what is known of every pixel (frames, height, width, ...), by name."""
+        """Return ground truth of every pixel (frames, height, width, ...), by name."""
         if not names:
             return {}
         points = [shot.points for shot in self.shots]

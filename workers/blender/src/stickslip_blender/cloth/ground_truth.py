@@ -1,4 +1,4 @@
-"""What is known of every pixel without rendering it: depth, segmentation, normals, texture coordinates, optical flow.
+"""Ground truth of every pixel: depth, segmentation, normals, texture coordinates, optical flow.
 
 All of it is what the ray through the middle of a pixel meets first: the cloth, a prop, or the floor.
 """
@@ -35,7 +35,7 @@ class GroundTruth:
     uv: Halves
     """Texture coordinates of the cloth, NaN elsewhere; shape (height, width, 2)."""
     flow: Halves
-    """How far what is seen moves until the next frame [px], columns and rows; shape (height, width, 2)."""
+    """Motion of the visible points until the next frame [px], columns and rows; shape (height, width, 2)."""
 
 
 def ground_truth(

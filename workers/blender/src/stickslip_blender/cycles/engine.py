@@ -24,7 +24,7 @@ class Sampling:
     Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even cloth is `plain`.
     """
     seed: int = 0
-    """Of the sampling noise, the same for every frame: what is left of it does not flicker, and clips compress."""
+    """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and clips compress."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ClothSampling:
     """Paths per pixel in the window that the cloth is in."""
 
 
-# Frozen: a change makes other pictures, and the build digest says so. benchmarks/render_rods.py measures them.
+# Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures them.
 SAMPLING = {
     Quality.preview: Sampling(samples=4),
     Quality.draft: Sampling(samples=8),

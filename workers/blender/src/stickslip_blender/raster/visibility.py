@@ -59,7 +59,7 @@ class Seen:
     grid: int
     """Samples across a pixel."""
     triangle: Indices
-    """By sample, -1 where there is none; shape (grid height, grid width)."""
+    """By sample, -1 if there is none; shape (grid height, grid width)."""
 
     def share_below(self, end: int) -> npt.NDArray[np.float32]:
         """Return the share of each pixel's samples that see one of the first `end` triangles, (height, width)."""
@@ -147,7 +147,7 @@ class Albedo:
     coverage: npt.NDArray[np.float32]
     """Share of each pixel, shape (height, width)."""
     mean: npt.NDArray[np.float32]
-    """Linear albedo of what is seen of the cloth, 0 where nothing is; shape (height, width, textures, 3)."""
+    """Linear albedo of the visible cloth, 0 elsewhere; shape (height, width, textures, 3)."""
     hits: npt.NDArray[np.int32]
     """Samples that see each of the cloth's triangles."""
     overall: npt.NDArray[np.float32]
@@ -157,7 +157,7 @@ class Albedo:
 
 
 def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
-    """Mean textures over what is seen of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
+    """Mean textures over the visible part of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
     return Albedo(
         *_raster.albedo(
             seen.triangle,

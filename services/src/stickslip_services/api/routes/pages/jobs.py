@@ -39,7 +39,7 @@ SHOWN_JOBS = 30
 SHOWN_LOST = 50
 
 CHANGE_SECONDS = 1.0
-"""A page is told of changes at most so often [s]."""
+"""Least time between two updates of a page [s]."""
 
 
 @router.get("/")
