@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from stickslip_sim_core import build_info
+from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult, Setting
