@@ -45,17 +45,17 @@ class TaskState(StrEnum):
 
     @property
     def is_settled(self) -> bool:
-        """True where the task has a result that others may build on."""
+        """True where the task has a result that others may use."""
         return self in (TaskState.succeeded, TaskState.rejected)
 
     @property
     def is_over(self) -> bool:
-        """True where nothing is left to do of it."""
+        """True where the task has ended."""
         return self.is_settled or self in (TaskState.failed, TaskState.cancelled)
 
 
 class Stage(StrEnum):
-    """What a task does, in the order of the data's way."""
+    """Steps of the pipeline, in order."""
 
     simulate = "simulate"
     render = "render"

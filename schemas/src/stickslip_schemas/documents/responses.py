@@ -1,4 +1,4 @@
-"""What the coordinator answers to users."""
+"""Answers and events of the coordinator for users."""
 
 from datetime import datetime
 from enum import StrEnum
@@ -20,9 +20,9 @@ class StageProgress(Document):
 
     counts: dict[TaskState, int]
     cached: int
-    cpu_seconds: float = Field(description="measured, of the tasks that this job had to run [s]")
+    cpu_seconds: float = Field(description="CPU time of the tasks that this job ran [s]")
     frames: tuple[int, int] | None = Field(
-        default=None, description="of the simulations that run and tell: frames done, and frames"
+        default=None, description="progress of the running simulations: frames done, frames in total"
     )
 
     @property
@@ -37,7 +37,7 @@ class StageProgress(Document):
 
 
 class Eta(Document):
-    """Time that is left, from measured durations; `low` to `high` covers about 80 % of jobs [s]."""
+    """Estimated remaining time, from measured durations; `low` to `high` covers about 80 % of jobs [s]."""
 
     seconds: float
     low: float
@@ -45,15 +45,13 @@ class Eta(Document):
 
 
 class Progress(Document):
-    """How far a job is."""
+    """Progress of a job."""
 
-    done: int = Field(description="tasks that are over, of all stages")
+    done: int = Field(description="ended tasks of all stages")
     total: int
-    planned: int = Field(
-        description="samples whose tasks are written down; `done` and `total` count the tasks of these only"
-    )
+    planned: int = Field(description="planned samples; `done` and `total` count only their tasks")
     stages: dict[Stage, StageProgress]
-    eta: Eta | None = Field(description="null until there is a measurement to go by, and when nothing is left")
+    eta: Eta | None = Field(description="null before the first measurement, and when nothing remains")
 
 
 class DatasetRef(Document):
@@ -73,8 +71,8 @@ class Job(Document):
     state: JobState
     reason: Reason | None
     message: str
-    project: str = Field(description="of the key that it was submitted with; empty: of none")
-    priority: int = Field(description="of the tasks of a project, those of the job with the highest number come first")
+    project: str = Field(description="project of the key that submitted it; empty: none")
+    priority: int = Field(description="within a project, tasks of the job with the highest number run first")
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -91,7 +89,7 @@ class JobDetail(Job):
 
 
 class Validation(Document):
-    """What a job would be, without making one. `refusal` says why it would be refused now; null: it would not."""
+    """Size and cost of a job that is not submitted."""
 
     spec: AnyJobSpec
     spec_digest: Sha256
@@ -100,17 +98,19 @@ class Validation(Document):
     render_count: int
     task_count: int = Field(description="tasks of all stages: simulations, renders, shards, and one that publishes")
     expected_splits: dict[str, int] = Field(
-        description="samples by split if each got exactly its share; the real numbers differ a little"
+        description="expected samples by split; splits are drawn, so the numbers of a dataset differ slightly"
     )
     cached_count: int | None = Field(
-        description="tasks that have a result already; null: no worker has registered, or the grid is too large to look"
+        description="tasks with a cached result; null: no worker has registered, or the grid is too large to search"
     )
     bytes_estimate: int = Field(description="size of the arrays before compression [bytes]")
     stored_bytes_estimate: int | None = Field(
-        description="size of the files, compressed as the newest dataset of the kind was [bytes]; null: there is none"
+        description="file size, compressed as the newest dataset of the kind [bytes]; null: there is none"
     )
-    certificate: Sha256 | None = Field(description="of the certificate that will vouch for the dataset; null: none")
-    refusal: str | None = Field(description="why a job of this spec would be refused now; null: it would be accepted")
+    certificate: Sha256 | None = Field(description="certificate that covers the dataset; null: none")
+    refusal: str | None = Field(
+        description="reason why a job of this spec would be refused now; null: it would be accepted"
+    )
 
 
 class Dataset(Document):
@@ -136,28 +136,28 @@ class DatasetVersion(Document):
 
 
 class TextureEntry(Document):
-    """A picture that the coordinator has taken as a texture."""
+    """An uploaded texture."""
 
-    texture: ArtifactRef = Field(description="what a spec writes under `textures`")
+    texture: ArtifactRef = Field(description="reference for `textures` in a spec")
     side: int = Field(description="width and height [px]")
     bytes: int
 
 
 class CertificateEntry(Document):
-    """A certificate that the coordinator has."""
+    """A certificate on the coordinator."""
 
     digest: Sha256
     preset: str
-    sim_core: Sha256 = Field(description="build of sim_core that was measured")
+    sim_core: Sha256 = Field(description="measured build of sim_core")
     extent: Literal["full", "quick"]
     passed: bool
     created_at: datetime
     href: str
-    page: str = Field(description="where the page for people is")
+    page: str = Field(description="URL of its page")
 
 
 class SampleState(Document):
-    """A sample of a job and how far it is; `labels` are its point of the grid."""
+    """State of a sample of a job; `labels` are its point of the grid."""
 
     slot: int
     sample_key: Sha256
@@ -169,9 +169,9 @@ class SampleState(Document):
 
 
 class JobPatch(Document):
-    """What can be changed of a job."""
+    """Changes to a job."""
 
-    priority: Int = Field(ge=-100, le=100, description="tasks of the job with the highest number come first")
+    priority: Int = Field(ge=-100, le=100, description="tasks of the job with the highest number run first")
 
 
 class RunningTask(Document):
@@ -180,8 +180,8 @@ class RunningTask(Document):
     task_id: str
     stage: Stage
     job: str | None
-    since: datetime | None = Field(description="when it was started; null: it waits at the worker")
-    frames: tuple[int, int] | None = Field(description="of a simulation that tells: frames done, and frames")
+    since: datetime | None = Field(description="start time; null while it waits at the worker")
+    frames: tuple[int, int] | None = Field(description="progress of a simulation: frames done, frames in total")
 
 
 class WorkerEntry(Document):
@@ -190,13 +190,13 @@ class WorkerEntry(Document):
     id: str
     name: str
     slots: int
-    builds: dict[str, Builds] = Field(description="of each kind that it makes")
+    builds: dict[str, Builds] = Field(description="builds by kind")
     versions: dict[str, str]
     registered_at: datetime
     last_seen_at: datetime
-    alive: bool = Field(description="it was heard of within the time that a lease lasts")
-    leased: int = Field(description="tasks that it holds")
-    running: tuple[RunningTask, ...] = Field(description="of these, the ones that have been started, the oldest first")
+    alive: bool = Field(description="its last heartbeat is no older than a lease")
+    leased: int = Field(description="number of leased tasks")
+    running: tuple[RunningTask, ...] = Field(description="started tasks, oldest first")
 
 
 class Preview(Document):
@@ -224,7 +224,7 @@ class EventName(StrEnum):
 
 
 class JobStateEvent(Document):
-    """The job is in another state. It is the last event where the state is terminal."""
+    """The job changed its state. A terminal state is the last event."""
 
     state: JobState
     reason: Reason | None
@@ -238,7 +238,7 @@ class JobProgressEvent(Document):
 
 
 class TaskStateEvent(Document):
-    """A task came to an end worth telling: soft_failed, failed or rejected."""
+    """A task was soft_failed, failed or rejected."""
 
     task_id: str
     stage: Stage

@@ -118,7 +118,7 @@ class PackOutput(Document):
 
 
 class PublishSection(ManifestSection):
-    """The same for the task that publishes, with the labels of each shard; it is an artifact, and nobody keeps it."""
+    """A section as the publish task reads it, with the labels of each shard; a temporary artifact."""
 
     labels: tuple[Sha256, ...] = Field(description="see `PackOutput`; by shard")
 
@@ -149,7 +149,7 @@ Output = Annotated[SimulateOutput | RenderOutput | PackOutput | PublishOutput, F
 
 
 class TaskResult(Document):
-    """How a task ended."""
+    """Outcome of a task."""
 
     outcome: Literal["succeeded", "rejected", "failed"]
     reason: Reason | None = None
@@ -161,7 +161,9 @@ class TaskResult(Document):
     cpu_seconds: Float = Field(default=0.0, ge=0)
     wall_seconds: Float = Field(default=0.0, ge=0)
     call_seconds: Float | None = Field(
-        default=None, ge=0, description="of the whole call that made it, perhaps with others; null: do not go by it [s]"
+        default=None,
+        ge=0,
+        description="duration of the call, which may include other tasks [s]; null: not usable for estimates",
     )
 
     @model_validator(mode="after")
@@ -184,7 +186,7 @@ task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = 
 def input_digests(
     task: SimulateTask | RenderTask | PackTask | PublishTask, read: Callable[[Sha256], bytes]
 ) -> tuple[Sha256, ...]:
-    """Return the artifacts that a task needs; `read` reads those that list others, which may be damaged or lost."""
+    """Return the artifacts that a task needs; `read` reads artifacts that list others, which may be damaged or lost."""
     if isinstance(task, RenderTask):
         pictures = map(referred, task.textures or (task.render.variant,))
         return tuple(dict.fromkeys([task.record.digest, *filter(None, pictures)]))

@@ -1,4 +1,4 @@
-"""What a dispatcher and the coordinator say to each other."""
+"""Messages between dispatcher and coordinator."""
 
 from typing import Literal
 
@@ -15,15 +15,15 @@ MAX_SLOTS = 100_000
 
 
 class WorkerRegistration(Document):
-    """A dispatcher presents itself. A second registration of a `name` takes the first one's leases away."""
+    """Registration of a dispatcher. A second one with the same `name` revokes the leases of the first."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
     builds: dict[str, Builds] = Field(
         min_length=1,
-        description="of each kind that it makes",
+        description="builds by kind",
         json_schema_extra={"propertyNames": {"enum": list(KINDS)}},
     )
-    slots: Int = Field(ge=1, le=MAX_SLOTS, description="how many tasks it runs at once")
+    slots: Int = Field(ge=1, le=MAX_SLOTS, description="number of tasks that run at once")
     versions: dict[str, str] = Field(default_factory=dict, description="for people: sim_core, blender, ray, ...")
 
     @field_validator("builds")
@@ -35,7 +35,7 @@ class WorkerRegistration(Document):
 
 
 class WorkerSession(Document):
-    """The coordinator's answer: who the dispatcher is, and how long a lease lasts without a heartbeat."""
+    """Answer to a registration: the worker's id, and the duration of a lease without a heartbeat."""
 
     worker_id: str
     lease_seconds: float = Field(gt=0)
@@ -47,7 +47,7 @@ class LeaseRequest(Document):
     worker_id: str
     wanted: dict[Stage, Int]
     at_most_seconds: Float | None = Field(
-        default=None, gt=0, description="leave out tasks of which it is known that they take longer [s]"
+        default=None, gt=0, description="exclude tasks that are known to take longer [s]"
     )
 
 
@@ -58,7 +58,7 @@ class Lease(Document):
     token: Int
     attempt: Int = Field(ge=1)
     limit_seconds: Float | None = Field(
-        default=None, gt=0, description="end the call after this time; null: nothing like it has been measured [s]"
+        default=None, gt=0, description="timeout of the call [s]; null: no similar task has been measured"
     )
     traceparent: str | None = Field(
         default=None,
@@ -68,19 +68,21 @@ class Lease(Document):
 
 
 class LeaseBatch(Document):
-    """What was granted, and when it makes sense to ask again if it is nothing."""
+    """Granted leases, and the delay before the next request where there are none."""
 
     leases: tuple[Lease, ...]
     retry_after_seconds: float = Field(ge=0)
 
 
 class LeaseState(Document):
-    """A lease that the dispatcher believes to hold, and whether the task has been started."""
+    """A lease that the dispatcher holds, and whether its task has started."""
 
     task_id: str
     token: Int
     started: Bool
-    frames: tuple[Int, Int] | None = Field(default=None, description="of a simulation: frames done, and frames")
+    frames: tuple[Int, Int] | None = Field(
+        default=None, description="progress of a simulation: frames done, frames in total"
+    )
 
 
 class Heartbeat(Document):
@@ -91,21 +93,21 @@ class Heartbeat(Document):
 
 
 class HeartbeatAnswer(Document):
-    """Which of the tasks to drop: cancelled by the user, or no longer the dispatcher's."""
+    """Tasks to drop: cancelled by the user, or leased to another worker."""
 
     drop: tuple[str, ...]
 
 
 class Report(Document):
-    """How one leased task ended; `released` gives it back untouched (a dispatcher that stops)."""
+    """Result of a leased task, or its return by a dispatcher that stops."""
 
     task_id: str
     token: Int
-    result: TaskResult | None = Field(description="null gives the lease back")
+    result: TaskResult | None = Field(description="null returns the lease")
 
 
 class ReportBatch(Document):
-    """Reports of several tasks; each is judged by itself."""
+    """Reports of several tasks; each has a verdict of its own."""
 
     worker_id: str
     reports: tuple[Report, ...] = Field(min_length=1)
@@ -119,6 +121,6 @@ class ReportVerdict(Document):
 
 
 class ReportAnswer(Document):
-    """One verdict a report, in their order."""
+    """One verdict for each report, in the same order."""
 
     verdicts: tuple[ReportVerdict, ...]

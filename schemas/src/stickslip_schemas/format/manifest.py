@@ -1,4 +1,4 @@
-"""The manifest of a dataset version: what is in it, what it was made from, and how to check it.
+"""The manifest of a dataset version: its contents, its origin, and the digests that verify it.
 
 Three files vouch for all others and for one another. `manifest.json` has the SHA-256 of every file but these three. In
 a version of many samples it has those of its **sections** instead, `manifest/0.json` and so on, each of which lists the
@@ -35,7 +35,7 @@ MANIFEST_ATTRIBUTE = "manifest_sha256"
 
 
 SECTION_SAMPLES = 10_000
-"""A section has so many samples, or a little fewer: whole shards. A version of no more has no sections."""
+"""Samples of a section, rounded down to whole shards. A smaller version has no sections."""
 
 
 def section_samples(spec: JobSpec) -> int:
@@ -97,7 +97,7 @@ class BrokenSealError(ValueError):
 
 
 class Pictures(Document):
-    """How good the pictures of a version are."""
+    """Quality of the pictures of a version."""
 
     quality: Quality
     psnr_db: float = Field(
@@ -105,7 +105,7 @@ class Pictures(Document):
         "measured when the quality was set [dB]"
     )
     gate_db: float | None = Field(
-        description="least of what the image gate found in this version [dB]; null: it has no composed pictures"
+        description="lowest result of the image gate in this version [dB]; null: it has no composed pictures"
     )
     frame_share: float | None = Field(
         default=None, description="share of the frame that is cloth, mean of the valid samples; null: no cloth"
@@ -134,7 +134,7 @@ class Manifest(Document):
     cameras: tuple[Camera, ...] = Field(
         description="of the array `views`, in its order, or of the viewpoints, by name; empty where nothing is rendered"
     )
-    pictures: Pictures | None = Field(default=None, description="how good the pictures are; null: there are none")
+    pictures: Pictures | None = Field(default=None, description="quality of the pictures; null: there are none")
     sample_count: int = Field(ge=1, description="slots, the rejected ones included")
     valid_count: int = Field(ge=0)
     split_counts: dict[str, int] = Field(description="valid samples by split")
@@ -179,7 +179,7 @@ class Contents:
     """
 
     KEPT = 2
-    """So many of the sections that were read last are kept."""
+    """Number of sections in memory, the ones that were read last."""
 
     def __init__(self, manifest: Manifest, read: Callable[[FileEntry], bytes]) -> None:
         self.manifest = manifest

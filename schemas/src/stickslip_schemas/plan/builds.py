@@ -1,4 +1,4 @@
-"""Which code makes the data: the builds that enter every content key."""
+"""Builds: digests of the code that makes data, part of every content key."""
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import Sha256, content_key
@@ -12,13 +12,13 @@ class Builds(Document):
     """
 
     sim_core: Sha256
-    """Of the solver alone: what a certificate vouches for."""
+    """The solver alone, which certificates cover."""
     simulate: Sha256
-    """Of all that makes a trajectory: the solver, the scene and the stage."""
+    """Solver, scene and simulate stage."""
     render: Sha256
-    """Of all that makes pictures: the renderer and the scene."""
+    """Renderer and scene."""
     pack: Sha256
-    """Of all that writes a dataset: the arrays, codecs and metadata."""
+    """Arrays, codecs and metadata of a dataset."""
 
     @property
     def digest(self) -> str:

@@ -1,4 +1,4 @@
-"""Which files of ours a piece of work is made with: the modules that it imports, found by reading their sources.
+"""Source files of a stage: the modules that it imports, found by reading their sources.
 
 A digest over these files is what enters a content key. So a change of a file that a result depends on changes its key,
 and a change of any other file does not. Four rules say what is followed:

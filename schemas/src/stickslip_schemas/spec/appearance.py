@@ -1,4 +1,4 @@
-"""How things look that a user brings along: pictures, cameras, lamps and floors, for a spec to name."""
+"""Custom lamps, floors and cameras, as numbers in a spec."""
 
 from typing import Annotated, Self
 
@@ -12,9 +12,9 @@ CLIP_SIZE = 224
 """Width and height of a clip [px]."""
 
 FARTHEST = 4.0
-"""How far a camera may be from the middle of the stage along each axis [m]: the floor ends at 8 m."""
+"""Largest distance of a camera from the middle of the scene along each axis [m]: the floor ends at 8 m."""
 LOWEST = 0.02
-"""How high a camera has to be above the floor [m]."""
+"""Least height of a camera above the floor [m]."""
 
 _TOLERANCE = 1e-9
 
@@ -110,7 +110,7 @@ class Calibration(Document):
         x, y, z = self.camera("own").position.tolist()
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
-                f"rvec and tvec must put the camera within {FARTHEST:g} m of the stage's middle and {LOWEST:g} m or "
+                f"rvec and tvec must put the camera within {FARTHEST:g} m of the scene's middle and {LOWEST:g} m or "
                 f"more above the floor, and it is at ({x:.3g}, {y:.3g}, {z:.3g}) m"
             )
         return self

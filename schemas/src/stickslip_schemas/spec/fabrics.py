@@ -1,4 +1,4 @@
-"""What cloth is made of: the ten measured materials by name, or numbers that a user gives.
+"""Materials of cloth: ten measured fabrics by name, custom fabrics as numbers; names of textures.
 
 The numbers of the measured materials live with the simulation core; a contract test compares the names.
 """
@@ -37,9 +37,9 @@ Stiffness = Annotated[Float, Field(ge=0, le=1e6)]
 Rigidity = Annotated[Float, Field(ge=1e-12, le=1)]
 
 MEMBRANE_MAX = 1e6
-"""Of the numbers of the stretching table, and of Young's modulus times thickness [N/m]."""
+"""Upper bound on membrane stiffness: entries of the stretching table, and E h [N/m]."""
 PLATE_BOUNDS = (1e-11, 1.0)
-"""Of the rigidity of a plate of `young` and `thickness` [N m]."""
+"""Bounds on the plate rigidity from `young`, `poisson` and `thickness` [N m]."""
 
 
 class FabricNumbers(Document):

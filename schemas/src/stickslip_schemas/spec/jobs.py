@@ -1,4 +1,4 @@
-"""What a user asks for: a JobSpec is a parameter grid of one kind.
+"""Specs: a `JobSpec` is a parameter grid of one kind.
 
 This module holds what all kinds have in common. A kind itself is one module of `stickslip_schemas.kinds`.
 """
@@ -141,7 +141,7 @@ class JobSpec(Document):
         axes: Document
         quality: Quality
 
-    # --- what every kind says of itself ---------------------------------------------------------------------------
+    # --- defined by each kind ---------------------------------------------------------------------------
 
     @property
     def certified_preset(self) -> str:
@@ -191,7 +191,7 @@ class JobSpec(Document):
         """Artifacts that the spec names and that have to be in the store, by JSON pointers into the spec."""
         return {}
 
-    # --- what follows from it -------------------------------------------------------------------------------------
+    # --- derived -------------------------------------------------------------------------------------
 
     @property
     def named_axes(self) -> dict[str, AnyAxis]:

@@ -1,4 +1,4 @@
-"""The store: artifacts whole or not at all, and never with other bytes than their name says."""
+"""The store of artifacts and dataset versions. Artifacts are atomic, and verified by digest."""
 
 from stickslip_schemas.store.base import (
     CorruptArtifactError,

@@ -21,7 +21,7 @@ R = TypeVar("R")
 ARTIFACTS = "artifacts"
 DATASETS = "datasets"
 VERSION = re.compile(r"v[1-9]\d{0,8}")
-"""How the directory of a version is called."""
+"""Name of the directory of a version."""
 AT_ONCE = 32
 """Requests to a store at once: a bucket answers each after a while, and all of them after little more."""
 
@@ -69,7 +69,7 @@ class ShownVersion:
 
 
 class Room(NamedTuple):
-    """How much a store can hold [bytes]."""
+    """Capacity of a store [bytes]."""
 
     total: int
     used: int
