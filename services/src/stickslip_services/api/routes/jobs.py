@@ -57,7 +57,7 @@ def post_job(
         Header(
             min_length=1,
             max_length=255,
-            description="a word that is yours alone; a request that comes twice with it makes one job. Kept forever.",
+            description="idempotency key: repeated requests with the same key make one job. Kept forever.",
         ),
     ] = None,
     priority: Annotated[
