@@ -23,6 +23,8 @@ CLOTH = {
 }
 NOBODY = "http://127.0.0.1:9"
 
+pytestmark = pytest.mark.real  # the workers' program measures in a process of its own
+
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:

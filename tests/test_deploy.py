@@ -1,5 +1,6 @@
 """The files of `deploy/`: what they run exists, and what can be checked without a cluster or an image holds."""
 
+import io
 import os
 import re
 import shlex
@@ -8,11 +9,16 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
 
 import pytest
 import yaml
+from stickslip_services.app import main as coordinator
+from stickslip_services.cli import app
+from stickslip_workers.__main__ import main as workers
+from typer.testing import CliRunner
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
@@ -23,15 +29,16 @@ SCRIPTS = [SBATCH, *sorted((ROOT / "tools").glob("*.sh")), *sorted((ROOT / "benc
 GUIDES = sorted((ROOT / "docs").glob("deploy-*.md"))
 COMPOSE = yaml.safe_load((DEPLOY / "compose" / "compose.yaml").read_text())
 
-PROGRAMS = ("stickslip_services.app", "stickslip_workers")
+PROGRAMS = {"stickslip_services.app": coordinator, "stickslip_workers": workers}
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 
 
 @cache
-def help_of(*command: str) -> str:
-    done = subprocess.run([*command, "--help"], capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"})
-    assert done.returncode == 0, (command, done.stderr)
-    return done.stdout
+def help_of(program: str, *verbs: str) -> str:
+    out = io.StringIO()
+    with redirect_stdout(out), suppress(SystemExit):
+        PROGRAMS[program]([*verbs, "--help"])
+    return out.getvalue()
 
 
 def python_commands() -> list[tuple[str, str]]:
@@ -41,7 +48,7 @@ def python_commands() -> list[tuple[str, str]]:
         text = path.read_text().replace("\\\n", " ").replace('", "', " ").replace('"', " ")
         found += [(path.name, line) for line in text.splitlines() if any(f"-m {name}" in line for name in PROGRAMS)]
     for name, service in COMPOSE["services"].items():
-        program = {"coordinator": PROGRAMS[0], "worker": PROGRAMS[1]}[name]
+        program = {"coordinator": "stickslip_services.app", "worker": "stickslip_workers"}[name]
         found.append(("compose.yaml", f"-m {program} {' '.join(service['command'])}"))
     return found
 
@@ -51,8 +58,7 @@ def test_programs_have_the_options_that_they_are_given(place: str, line: str) ->
     program = next(name for name in PROGRAMS if f"-m {name}" in line)
     rest = re.split(r" (?:&&|>|&)(?: |$)", line.split(f"-m {program}", 1)[1])[0]
     verb = re.match(r"\s*(dispatch|certify|describe|replay)\b", rest)
-    command = (sys.executable, "-m", program, *([verb[1]] if verb else []))
-    known = set(_OPTION.findall(help_of(*command)))
+    known = set(_OPTION.findall(help_of(program, *([verb[1]] if verb else []))))
     given = set(_OPTION.findall(rest))
     assert given <= known, (place, given - known)
 
@@ -74,7 +80,9 @@ def stickslip_commands() -> list[tuple[str, list[str]]]:
 def test_commands_of_the_guides_exist(place: str, words: list[str]) -> None:
     verbs = words[:2] if words[0] in ("keys", "datasets") else words[:1]
     verbs = [verb for verb in verbs if not verb.startswith("-")]
-    known = set(_OPTION.findall(help_of(sys.executable, "-m", "stickslip_services.cli", *verbs)))
+    shown = CliRunner().invoke(app, [*verbs, "--help"], env={"COLUMNS": "200"})
+    assert shown.exit_code == 0, shown.output
+    known = set(_OPTION.findall(shown.output))
     given = {word.split("=")[0] for word in words if word.startswith("--")}
     assert given <= known, (place, given - known)
 

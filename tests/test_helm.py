@@ -4,13 +4,14 @@ Kubernetes' own objects are checked against its schemas. Those of KubeRay, KEDA 
 against `CRDS` below, the fields that the chart sets, written down from the operators' own definitions.
 """
 
+import io
 import json
 import re
 import shlex
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,12 @@ import pytest
 import yaml
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_services.app import GRACE_SECONDS, make_app
+from stickslip_services.app import main as coordinator
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import HttpApi, serving
 from stickslip_testing.worker import PretendWorker, failure
+from stickslip_workers.__main__ import main as workers
 from stickslip_workers.settings import Settings as WorkerSettings
 
 ROOT = Path(__file__).parents[1]
@@ -264,9 +267,11 @@ def commands(name: str) -> Iterator[tuple[str, list[str]]]:
 
 @cache
 def options(program: str, *verb: str) -> set[str]:
-    command = [sys.executable, "-m", program, *verb, "--help"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True)
-    return set(re.findall(r"--[a-z][a-z-]+", said.stdout))
+    main = {"stickslip_services.app": coordinator, "stickslip_workers": workers}[program]
+    out = io.StringIO()
+    with redirect_stdout(out), suppress(SystemExit):
+        main([*verb, "--help"])
+    return set(re.findall(r"--[a-z][a-z-]+", out.getvalue()))
 
 
 @pytest.mark.parametrize("name", CI)

@@ -69,6 +69,7 @@ def certificate(**change: Any) -> Certificate:
     return Certificate(numbers={}, protocol_sources="b" * 64, protocols=protocols, passed=True, environment={}, **given)
 
 
+@pytest.mark.real
 def test_from_the_file_to_trajectories(folder: Path) -> None:
     program = [sys.executable, "-m", "stickslip_services.cli", "simulate", "scene.yaml", "out"]
     refused = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
@@ -99,6 +100,7 @@ def test_from_the_file_to_trajectories(folder: Path) -> None:
     assert "out: must not exist, and out does" in again.stderr
 
 
+@pytest.mark.real
 def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path) -> None:
     scene = deepcopy(SCENE)
     scene["sheets"]["cloth"]["mesh"]["cells"] = [0, 3]

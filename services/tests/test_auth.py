@@ -3,7 +3,6 @@
 import ssl
 import stat
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from pydantic import ValidationError
 from stickslip_services.access.keys import create_key, list_keys, revoke_key
 from stickslip_services.access.scopes import Scope
 from stickslip_services.api.auth import needed_scope
-from stickslip_services.app import make_app
+from stickslip_services.app import main, make_app
 from stickslip_services.cli import app as cli
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
@@ -267,6 +266,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return files
 
 
+@pytest.mark.real
 def test_a_coordinator_speaks_tls_and_wants_keys(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
     files = [str(path) for path in certificate]
     server = start_server(
@@ -287,8 +287,8 @@ def test_a_coordinator_speaks_tls_and_wants_keys(tmp_path: Path, certificate: tu
         server.stop()
 
 
-def test_a_coordinator_off_loopback_without_either_does_not_start(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(tmp_path), "--host", "0.0.0.0"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 2
-    assert "must be a loopback address unless" in ended.stderr
+def test_a_coordinator_off_loopback_without_either_does_not_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--data", str(tmp_path), "--host", "0.0.0.0"]) == 2
+    assert "must be a loopback address unless" in capsys.readouterr().err

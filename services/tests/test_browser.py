@@ -26,6 +26,8 @@ from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, rejection
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
 axe = pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python")
 
+pytestmark = pytest.mark.real
+
 AXE = Path(axe.__file__).with_name("axe.min.js").read_text()
 
 CHROMIUM = Path("/usr/bin/chromium")

@@ -120,6 +120,7 @@ def test_other_errors_are_words_too(cli: Any, tmp_path: Path) -> None:
     assert "loopback" in up.stderr
 
 
+@pytest.mark.real
 def test_watching_survives_a_restart_of_the_coordinator(tmp_path: Path) -> None:
     server = start_server(tmp_path / "data")
     port = int(server.url.rsplit(":", 1)[1])

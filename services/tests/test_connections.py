@@ -38,6 +38,7 @@ def server(tmp_path: Path) -> Iterator[ServerProcess]:
     running.stop()
 
 
+@pytest.mark.real
 def test_600_half_open_requests_are_closed_within_20_seconds(server: ServerProcess) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

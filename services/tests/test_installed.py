@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 SERVER_ONLY = (
     "alembic",
     "fastapi",
@@ -22,11 +24,13 @@ def run_without_server(code: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.real
 def test_the_client_needs_nothing_of_the_server() -> None:
     done = run_without_server("import stickslip_services.client, stickslip_services.client.pulling")
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.real
 def test_the_command_line_needs_nothing_of_the_server() -> None:
     run = "from stickslip_services.cli import app\nsys.argv = ['stickslip', {}]\napp()"
     done = run_without_server(run.format("'--help'"))

@@ -1,7 +1,5 @@
 """A lost database is built again from the datasets; one that is damaged or newer is refused in one sentence."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -50,11 +48,11 @@ def run(settings: Settings) -> Result:
     return CliRunner().invoke(app, ["reindex", "--data", str(settings.data)])
 
 
-def test_a_lost_database_is_not_taken_for_a_new_one(settings: Settings, made: dict[str, object]) -> None:
-    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(settings.data), "--port", "0"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 2
-    (sentence,) = ended.stderr.splitlines()
+def test_a_lost_database_is_not_taken_for_a_new_one(
+    settings: Settings, made: dict[str, object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--data", str(settings.data), "--port", "0"]) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
     assert "is gone: run `stickslip reindex --data" in sentence
     up = CliRunner().invoke(app, ["up", "--data", str(settings.data), "--port", "0"])
     assert (up.exit_code, "stickslip reindex" in up.stderr) == (1, True)
@@ -168,26 +166,26 @@ def test_it_does_not_write_beside_a_running_coordinator(settings: Settings, made
         assert [found.is_new for found in reindex(database, DirectoryStore(settings.store_place))] == [True, True]
 
 
-def one_sentence(settings: Settings) -> str:
+def one_sentence(settings: Settings, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the sentence with which a coordinator refuses its database."""
     with pytest.raises(DatabaseRefusedError) as raised:
         check(settings, Role.coordinator, with_store=True)
     assert "\n" not in str(raised.value)
-    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(settings.data), "--port", "0"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (ended.returncode, ended.stderr) == (2, f"error: {raised.value}\n")
+    assert main(["--data", str(settings.data), "--port", "0"]) == 2
+    assert capsys.readouterr().err == f"error: {raised.value}\n"
     return str(raised.value)
 
 
-def test_a_newer_database_is_refused(settings: Settings) -> None:
+def test_a_newer_database_is_refused(settings: Settings, capsys: pytest.CaptureFixture[str]) -> None:
     with opened(settings, Role.upkeep) as database, database.write() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9042'"))
-    sentence = one_sentence(settings)
+    sentence = one_sentence(settings, capsys)
     assert "has the schema 9042, and this version of stickslip knows 0001" in sentence
     assert "install the version that made it again" in sentence
 
 
 @pytest.mark.parametrize("how", ["overwritten", "truncated", "not one", "another's"])
-def test_a_damaged_database_is_refused(settings: Settings, how: str) -> None:
+def test_a_damaged_database_is_refused(settings: Settings, how: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = settings.database_path
     with opened(settings, Role.upkeep):
         pass
@@ -197,7 +195,7 @@ def test_a_damaged_database_is_refused(settings: Settings, how: str) -> None:
         with other.write() as connection:
             connection.execute(text("CREATE TABLE birds (name)"))
         other.close()
-        assert "is not a database of stickslip" in one_sentence(settings)
+        assert "is not a database of stickslip" in one_sentence(settings, capsys)
         return
     content = path.read_bytes()
     for beside in settings.data.glob("coordinator.sqlite3-*"):
@@ -208,6 +206,6 @@ def test_a_damaged_database_is_refused(settings: Settings, how: str) -> None:
         path.write_bytes(content[: len(content) // 2])
     else:
         path.write_text("no database at all, " * 500)
-    sentence = one_sentence(settings)
+    sentence = one_sentence(settings, capsys)
     assert "is damaged" in sentence
     assert "run `stickslip reindex --data" in sentence

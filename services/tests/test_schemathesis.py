@@ -24,6 +24,7 @@ EXAMPLES = 3
 """Generated for each operation, beside those that cover the document; a nightly run may ask for more."""
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("state", ["empty", "used"])
 def test_every_check_of_schemathesis_passes(state: str, tmp_path: Path) -> None:

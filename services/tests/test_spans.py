@@ -106,6 +106,7 @@ def collector(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, Any]]
         server.shutdown()
 
 
+@pytest.mark.real
 def test_spans_of_processes_arrive_as_one_tree(collector: list[tuple[str, Any]], tmp_path: Path) -> None:
     server = start_server(tmp_path / "data")
     tracing.start("worker")  # this process is the worker

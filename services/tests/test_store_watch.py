@@ -56,6 +56,7 @@ def job_of(server: RunningServer, job: str) -> dict[str, object]:
     return dict(answer.json())
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("left", [0, 6 * MIB])
 def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
     disk: Path, monkeypatch: pytest.MonkeyPatch, left: int

@@ -25,6 +25,8 @@ while True:
     time.sleep(0.05)
 """
 
+pytestmark = pytest.mark.real
+
 
 class Up:
     def __init__(self, directory: Path, *, stub: str | None = None, data: str = "data", port: str = "0") -> None:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from stickslip_schemas import tracing
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.submit import submit_job
@@ -23,6 +24,7 @@ def test_without_a_collector_nothing_is_traced(context: Context, worker: Pretend
         tracing.note(job="none")
 
 
+@pytest.mark.real
 def test_a_collector_without_the_packages_is_refused(tmp_path: Path) -> None:
     """The packages are hidden, so that it is tested where they are installed, too."""
     code = (

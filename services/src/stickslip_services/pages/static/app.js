@@ -1,9 +1,9 @@
-// What htmx does not do: telling parts of a page that something has changed, copying, clips and shapes.
+// What htmx does not do: change events for parts of a page, copying, clips and shapes.
 "use strict";
 
 if (document.body.hasAttribute("data-live")) {
   const source = new EventSource("/ui/changes");
-  source.addEventListener("change", () => document.body.dispatchEvent(new CustomEvent("change-told")));
+  source.addEventListener("change", () => document.body.dispatchEvent(new CustomEvent("server-change")));
 }
 
 document.addEventListener("click", async (event) => {

@@ -36,7 +36,7 @@ def get_datasets(context: ContextDep) -> Response:
 
 @router.get("/datasets/{dataset}")
 def get_dataset(dataset: str, context: ContextDep) -> Response:
-    """Go to the newest version of a dataset."""
+    """Redirect to the newest version of a dataset."""
     with context.database.read() as connection:
         versions = find_dataset(connection, dataset).versions
     if not versions:
@@ -67,7 +67,7 @@ def get_version(request: Request, dataset: str, version: Version, context: Conte
 
 
 def _listed(data: SampleData, path: str) -> str | None:
-    """Return the path of a file of a version, None where it has none of that name."""
+    """Return the path of a file if the version has it, else None."""
     return None if data.contents.file(path) is None else path
 
 
@@ -79,7 +79,7 @@ def get_thumbs(
     context: ContextDep,
     start: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> Response:
-    """Show the samples that the sliders leave."""
+    """Show the samples within the sliders."""
     found, committed, data = _open(context, dataset, version)
     return html_page("thumbs.html", dataset=found, version=committed, **thumbs(data, request.query_params, start))
 
@@ -97,7 +97,7 @@ def _sample_data(store: Store, manifest: str) -> SampleData:
 
 @router.get("/datasets/{dataset}/v{version}/samples/{slot}")
 def get_sample(dataset: str, version: Version, slot: int, context: ContextDep) -> Response:
-    """Show a sample: its pictures, curves, shape and labels."""
+    """Show the pictures, curves, shapes and labels of a sample."""
     found, committed, data = _open(context, dataset, version)
     manifest = data.manifest
     if not 0 <= slot < manifest.sample_count:
@@ -125,7 +125,7 @@ def get_picture(
     context: ContextDep,
     step: Annotated[int, Query(ge=1, le=8)] = 1,
 ) -> Response:
-    """Return one picture of a sample; with `step`, every so many pixels."""
+    """Return a picture of a sample as PNG; `step` takes every `step`-th pixel."""
     _, _, data = _open(context, dataset, version)
     values = _value(data, array, slot)
     if values.ndim != 4 or index >= len(values):
@@ -138,7 +138,7 @@ def get_picture(
 def get_values(
     dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, context: ContextDep
 ) -> Response:
-    """Return the points of a shape by step, (step, point, xyz), and the triangles where there are any."""
+    """Return the points of a shape, (step, point, xyz), and its triangles, if it has some, as JSON."""
     _, _, data = _open(context, dataset, version)
     values = np.asarray(_value(data, array, slot), dtype=np.float32)
     steps = values if values.ndim == 3 else values[None]

@@ -50,7 +50,7 @@ def get_jobs(context: ContextDep) -> Response:
 
 @router.get("/ui/jobs")
 def get_jobs_part(context: ContextDep) -> Response:
-    """Show the list of jobs alone."""
+    """Show the list of jobs without its page."""
     return html_page("jobs_list.html", **_jobs(context))
 
 
@@ -75,7 +75,7 @@ def get_job(job_id: str, context: ContextDep) -> Response:
 
 
 def _short_form(axis: dict[str, Any]) -> Any:
-    """Return an axis as people write it: a list, or its only value."""
+    """Return an axis in its short form: a list, or its only value."""
     if axis["type"] != "list":
         return axis
     return axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
@@ -83,7 +83,7 @@ def _short_form(axis: dict[str, Any]) -> Any:
 
 @router.get("/ui/jobs/{job_id}")
 def get_job_part(job_id: str, context: ContextDep) -> Response:
-    """Show what changes of a job."""
+    """Show the part of a job's page that changes."""
     with context.database.read() as connection:
         return html_page("job_state.html", **_job(context, connection, job_id))
 
@@ -113,7 +113,7 @@ def _elapsed(job: JobDetail, context: Context) -> float | None:
 
 @router.get("/ui/jobs/{job_id}/map")
 def get_job_map(job_id: str, context: ContextDep) -> Response:
-    """Show the grid of a job as maps that fill."""
+    """Show the states of a job's samples as maps of its grid."""
     with context.database.read() as connection:
         row = find_job(connection, job_id)
         spec = job_spec_adapter.validate_json(row.spec)
@@ -129,12 +129,12 @@ def get_job_map(job_id: str, context: ContextDep) -> Response:
 
 @router.post("/ui/jobs/{job_id}/{verb}")
 def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
-    """Pause, resume or cancel a job, or submit its spec again; answer with where to go."""
+    """Pause, resume or cancel a job, or submit its spec again; redirect to the job."""
     if verb == "resubmit":
         with context.database.read() as connection:
             spec = job_spec_adapter.validate_json(find_job(connection, job_id).spec)
         made = submit_job(context, spec)
-        assert isinstance(made, JobDetail)  # there is no key, and so no replay
+        assert isinstance(made, JobDetail)  # without an idempotency key there is no replay
         job_id = made.id
     elif verb in ("pause", "resume", "cancel"):
         {"pause": pause_job, "resume": resume_job, "cancel": cancel_job}[verb](context, job_id)
@@ -145,16 +145,16 @@ def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
 
 @router.get("/ui/changes")
 def get_changes(context: ContextDep) -> StreamingResponse:
-    """Tell a page that something has changed, at most once a second; nothing is read for it."""
+    """Send an event to a page after each change of the database, at most once a second, without reading it."""
     return StreamingResponse(_changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
 
 
 async def _changes(context: Context) -> AsyncIterator[bytes]:
     yield b"retry: 2000\n\n"
-    told = -1  # the first message comes at once: something may have changed since the page was made
+    sent = -1  # the first event comes at once, because the database may have changed since the page was rendered
     while True:
-        await context.notifier.wait(told, 15.0)
+        await context.notifier.wait(sent, 15.0)
         count = context.notifier.count
-        yield b": still here\n\n" if count == told else b"event: change\ndata: {}\n\n"
-        told = count
+        yield b": still here\n\n" if count == sent else b"event: change\ndata: {}\n\n"
+        sent = count
         await asyncio.sleep(CHANGE_SECONDS)

@@ -31,7 +31,7 @@ def get_certificates(context: ContextDep) -> Response:
 
 @router.get("/certificates/{digest}")
 def get_certificate(digest: str, context: ContextDep) -> Response:
-    """Show a certificate: a row for each protocol."""
+    """Show a certificate with its protocols and curves."""
     with context.database.read() as connection:
         stored = find_certificate(connection, digest)
         builds = _builds(context, connection)
@@ -72,7 +72,7 @@ def get_workers(context: ContextDep) -> Response:
 
 @router.get("/ui/workers")
 def get_workers_part(context: ContextDep) -> Response:
-    """Show the list of workers alone."""
+    """Show the list of workers without its page."""
     return html_page("workers_list.html", **_workers(context))
 
 
@@ -90,16 +90,16 @@ def _workers(context: Context) -> dict[str, Any]:
 
 
 def _memory() -> dict[str, int] | None:
-    """Return bytes of memory of this machine, `MemTotal` and `MemAvailable`; None where Linux does not tell."""
+    """Return the memory of this machine, `MemTotal` and `MemAvailable` [B]; None without Linux's /proc."""
     try:
         lines = [line.split() for line in pathlib.Path("/proc/meminfo").read_text().splitlines()]
     except OSError:
         return None
-    told = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
-    return told if {"MemTotal", "MemAvailable"} <= told.keys() else None
+    found = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
+    return found if {"MemTotal", "MemAvailable"} <= found.keys() else None
 
 
 @router.get("/docs")
 def get_docs(request: Request) -> Response:
-    """Show the interface; everything that it needs is here."""
+    """Show the HTTP interface."""
     return html_page("docs.html", here="docs", api=request.app.openapi())
