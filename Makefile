@@ -80,6 +80,7 @@ check: setup
 	$(PY) -m ruff check .
 	.venv/bin/clang-format --dry-run --Werror $(CPP_FILES)
 	$(PY) -m codespell_lib
+	$(PY) tools/prose.py
 	PYTHONPATH=workers/blender/src .venv/bin/lint-imports --no-logo
 	@for distribution in $(DISTRIBUTIONS); do (cd $$distribution && $(CURDIR)/$(PY) -m deptry --no-ansi .) || exit 1; done
 	@$(MAKE) --no-print-directory size
