@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
 from stickslip_schemas.spec.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
+from stickslip_testing.cameras import looking_at
 
 LEVEL = Camera(  # three units in front of the origin on the x axis, looking back at it
     name="level",
@@ -67,7 +68,7 @@ def test_one_point_outside_is_enough() -> None:
 
 
 def test_looking_at_puts_the_target_in_the_middle_and_up_on_top() -> None:
-    camera = Camera.looking_at(
+    camera = looking_at(
         (0.1, -0.2, 0.3), azimuth=30.0, elevation=20.0, distance=2.0, name="a", width=64, height=48, focal=80.0
     )
     (middle, above), depth = camera.project([[0.1, -0.2, 0.3], [0.1, -0.2, 0.4]])

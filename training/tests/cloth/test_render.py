@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from stickslip_schemas.spec.cameras import Camera
+from stickslip_testing.cameras import looking_at
 from stickslip_training.cloth.clips import INSTANTS, frames_at, training_cameras
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, stage
 from stickslip_training.cloth.render import (
@@ -13,7 +13,7 @@ from stickslip_training.cloth.render import (
 )
 
 RIG = training_cameras()
-FACING = Camera.looking_at(
+FACING = looking_at(
     (0.0, 0.0, 0.0), azimuth=0, elevation=0, distance=1.0, name="facing", width=64, height=48, focal=100.0
 )
 
@@ -54,7 +54,7 @@ def test_what_is_nearer_hides_what_is_behind():
     points = torch.stack([x, torch.linspace(-0.05, 0.05, 30).expand(30, 30), z], dim=-1)[None, None]
     colors = (x > 0).float()[None, None]
     for azimuth, expected in ((0, 1.0), (180, 0.0)):
-        camera = FACING.looking_at(
+        camera = looking_at(
             (0, 0, 0), azimuth=azimuth, elevation=0, distance=1.0, name="c", width=64, height=48, focal=100.0
         )
         whole = Crops(torch.zeros(1, 1, 2), torch.ones(1, 1), (0.0, 0.0))

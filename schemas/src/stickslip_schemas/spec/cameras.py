@@ -17,7 +17,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,6 @@ from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import content_key
-
-__all__ = ["Camera", "Matrix3", "Vector3", "load_rig", "read_rigs", "rig_digest", "rig_names"]
 
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows
@@ -67,41 +65,6 @@ class Camera(Document):
                 f"R R^T is off by {error:.2g}, det R = {np.linalg.det(R):.6g}"
             )
         return rotation
-
-    @classmethod
-    def looking_at(
-        cls,
-        target: Vector3,
-        *,
-        azimuth: float,
-        elevation: float,
-        distance: float,
-        name: str,
-        width: int,
-        height: int,
-        focal: float,
-    ) -> Self:
-        """Place a camera around a target, upright, the target in the middle of its image.
-
-        Azimuth is the camera's direction seen from the target, from +x towards +y [degree]; elevation is above the
-        horizon [degree], within (-90, 90); distance [scene units]; focal [px].
-        """
-        a, e = np.radians(azimuth), np.radians(elevation)
-        outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        right = np.array([-np.sin(a), np.cos(a), 0.0])
-        R = np.stack([right, np.cross(-outward, right), -outward])
-        t = -R @ (np.asarray(target) + distance * outward)
-        return cls(
-            name=name,
-            width=width,
-            height=height,
-            fx=focal,
-            fy=focal,
-            cx=(width - 1) / 2,
-            cy=(height - 1) / 2,
-            rotation=tuple(map(tuple, R.tolist())),
-            translation=tuple(t.tolist()),
-        )
 
     @property
     def position(self) -> npt.NDArray[np.float64]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.cloth.shading import ALBEDOS, TOLERANCE
 from stickslip_blender.raster import Window, _raster
-from stickslip_schemas.spec.cameras import Camera
+from stickslip_testing.cameras import looking_at
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
@@ -145,7 +145,7 @@ def test_blurring_is_a_box_twice() -> None:
 
 def test_a_tiled_picture_repeats_over_the_plane() -> None:
     """Of a picture that is a wave, with one sample a pixel: the wave at the place that the pixel sees."""
-    camera = Camera.looking_at(
+    camera = looking_at(
         (0.1, 0.0, 0.0), azimuth=20.0, elevation=35.0, distance=1.0, name="a", width=40, height=30, focal=60.0
     )
     size, density = 256, 512.0

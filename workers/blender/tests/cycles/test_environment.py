@@ -10,7 +10,7 @@ from stickslip_blender.cycles.engine import Sampling, new_scene, set_sampling
 from stickslip_blender.cycles.environment import SoftBox, panorama, set_environment
 from stickslip_blender.cycles.objects import add_view, set_view
 from stickslip_blender.cycles.pixels import FrameReader
-from stickslip_schemas.spec.cameras import Camera
+from stickslip_testing.cameras import looking_at
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_a_ball_is_lit_from_where_the_soft_box_stands(
     add_view(scene)
     set_view(  # from -y, so that +x is on the right
         scene,
-        Camera.looking_at(
+        looking_at(
             (0.0, 0.0, 0.0), azimuth=270.0, elevation=0.0, distance=10.0, name="a", width=33, height=33, focal=130.0
         ),
     )

@@ -12,9 +12,10 @@ from stickslip_blender.cycles.engine import Sampling, new_scene, set_sampling
 from stickslip_blender.cycles.objects import add_view, set_view
 from stickslip_blender.cycles.pixels import FrameReader
 from stickslip_schemas.spec.cameras import Camera, load_rig
+from stickslip_testing.cameras import looking_at
 
 _SKEWED = Camera.model_validate(  # rolled, off-centre, not square, pixels not square either
-    Camera.looking_at(
+    looking_at(
         (0.0, 0.0, -0.5), azimuth=25.0, elevation=30.0, distance=3.0, name="skewed", width=200, height=120, focal=300.0
     ).model_dump()
     | {"fx": 310.0, "fy": 260.0, "cx": 83.0, "cy": 71.5}

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.raster import GRID, Textures, Window, _raster, projected, see, see_albedo, window_about
 from stickslip_blender.raster.visibility import barycentric
-from stickslip_schemas.spec.cameras import Camera
+from stickslip_testing.cameras import looking_at
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
@@ -119,7 +119,7 @@ def test_decoding_is_within_its_bound() -> None:
 
 
 def test_values_at_centers_are_interpolated_in_perspective() -> None:
-    camera = Camera.looking_at(
+    camera = looking_at(
         (0.0, 0.0, 0.0), azimuth=10.0, elevation=25.0, distance=2.0, name="a", width=64, height=48, focal=90.0
     )
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
