@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from httpx_sse import ServerSentEvent, connect_sse
 from stickslip_services.api import sse
 from stickslip_services.app import make_app
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods
@@ -128,14 +129,13 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     """Twenty watchers, each from another event on, while old events have left the feed's memory."""
     monkeypatch.setattr(sse, "KEPT_EVENTS", 2)
     looks: list[int] = []
-    feeds = app.state.feeds
-    show = feeds._show
+    show = sse.show_job
 
-    def look(connection: Any, job: int) -> Any:
+    def look(context: Context, connection: Any, job: int) -> Any:
         looks.append(job)
-        return show(connection, job)
+        return show(context, connection, job)
 
-    monkeypatch.setattr(feeds, "_show", look)
+    monkeypatch.setattr(sse, "show_job", look)
     job = submit(client, gamma=(1.0, 2.0, 3.0))
     for _ in range(2):  # events of failed tries
         worker.report(*((lease, failure()) for lease in worker.lease(simulate=6)))
@@ -161,4 +161,4 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     for last_id, ids in heard.items():
         assert ids == [number for number in everything if int(number) > int(last_id or 0)]
     assert len(looks) < len(threads) * 3
-    assert feeds._feeds == {}  # nobody watches any more
+    assert app.state.feeds._feeds == {}  # nobody watches any more

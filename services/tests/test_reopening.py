@@ -151,7 +151,7 @@ def test_big_datasets_are_checked_by_the_coordinator_itself(
         connection.execute(update(dataset_versions).values(bytes=CHECKED_AT_ONCE + 1))
     job = submit(context)
     shown = show_job(context, job)
-    assert (shown.state, shown.message) == (JobState.queued, "all of it was made before: checking it")
+    assert (shown.state, shown.message) == (JobState.queued, "the dataset exists already: its files are being checked")
     sweep(context)
     assert show_job(context, job).state is JobState.queued
     check_made_datasets(context)

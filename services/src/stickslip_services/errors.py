@@ -1,4 +1,4 @@
-"""What may go wrong when a request is perfectly well-formed. api/problems.py turns each into a problem document.
+"""Errors of well-formed requests, which api/problems.py maps to problem documents, and of commands.
 
 StickslipError
 ├── NotFoundError               404
@@ -13,29 +13,32 @@ StickslipError
 └── MissingArtifactError        500
 """
 
+import json
 from collections.abc import Sequence
 
 from stickslip_schemas.documents.problems import FieldError
 
 
 class StickslipError(Exception):
-    """Base of the errors of the coordinator."""
+    """Base of the errors of the coordinator; `fields` are the fields of the request that break a rule."""
+
+    fields: Sequence[FieldError] = ()
 
 
 class NotFoundError(StickslipError):
-    """There is no such thing."""
+    """The requested thing does not exist."""
 
 
 class ConflictError(StickslipError):
-    """The state does not allow it."""
+    """The state of the thing does not allow the request."""
 
 
 class PreconditionFailedError(StickslipError):
-    """The thing has changed since the client saw it."""
+    """The thing has changed since the client read it."""
 
 
 class IdempotencyKeyReusedError(StickslipError):
-    """The key came with another document before."""
+    """The idempotency key was used with another document."""
 
 
 class KindNotAvailableError(StickslipError):
@@ -43,32 +46,33 @@ class KindNotAvailableError(StickslipError):
 
 
 class PresetNotCertifiedError(StickslipError):
-    """No certificate vouches for the preset with the workers' build."""
+    """The preset has no passing certificate for the workers' build."""
 
     def __init__(self, preset: str, sim_core: str, missing: Sequence[str] = ()) -> None:
-        self.preset = preset
-        self.rule = (
+        rule = (
             f"run `stickslip certify --preset {preset}` with the workers' build {sim_core[:12]} (a few minutes; quick "
             "certificates do not count), or write `allow_uncertified: true` in the spec"
         )
         if missing:
-            self.rule = (
-                f"it must have {', '.join(missing)}, since cloth touches cloth: {self.rule}. Certificates of the "
+            rule = (
+                f"it must have {', '.join(missing)}, since cloth touches cloth: {rule}. Certificates of the "
                 "thesis's presets have no protocols of contact: take another preset, or in a spec of `cloth_drag` "
                 "write `self_friction: null`"
             )
-        super().__init__(f"preset {preset!r} has no passing certificate: {self.rule}")
+        self.fields = [FieldError(pointer="/preset", rule=rule, value=json.dumps(preset))]
+        super().__init__(f"preset {preset!r} has no passing certificate: {rule}")
 
 
 class QuotaExceededError(StickslipError):
-    """A project has as many jobs or samples as it may have."""
+    """A job would exceed the quota of its project."""
 
     def __init__(self, project: str, what: str, limit: int, *, taken: int, asked: int) -> None:
-        self.value = taken + asked
+        value = taken + asked
         whose = f"the project {project!r}" if project else "requests without a project"
-        self.rule = f"{what} of {whose} that have not ended must be at most {limit}"
+        rule = f"{what} of {whose} that have not ended must be at most {limit}"
+        self.fields = [FieldError(pointer="", rule=rule, value=str(value))]
         super().__init__(
-            f"{self.rule}: there are {taken}, and with the {asked} of this job there would be {self.value}. Wait until "
+            f"{rule}: there are {taken}, and with the {asked} of this job there would be {value}. Wait until "
             "some of them have ended, or cancel some"
         )
 
@@ -86,7 +90,7 @@ class UnknownWorkerError(StickslipError):
 
 
 class MissingArtifactError(StickslipError):
-    """The store does not have what the database says it has, or not all of it."""
+    """An artifact that the database refers to is missing or damaged in the store."""
 
 
 class CommandError(Exception):

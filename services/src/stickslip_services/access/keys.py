@@ -1,6 +1,6 @@
-"""API keys: secrets that programs and people show. The database has their digests only.
+"""API keys. The database stores only the SHA-256 digests of their secrets.
 
-A secret has 256 random bits, so a plain SHA-256 cannot be reversed by guessing, and no salt is needed.
+A secret has 256 random bits, so its digest cannot be reversed by guessing, and needs no salt.
 """
 
 import secrets
@@ -26,7 +26,7 @@ LOCAL_WORKER = "local-worker"
 """Name of the key in the file `worker-key` of the data directory."""
 
 FRESH_SECONDS = 1.0
-"""A key that was made or revoked counts so long after that, at the latest [s]."""
+"""Delay until a new or revoked key takes effect, at most [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def list_keys(connection: Connection) -> list[ApiKey]:
 
 
 def revoke_key(connection: Connection, key_id: str, now: float) -> None:
-    """Let a key open nothing any more; one that is revoked stays so. Raise NotFoundError."""
+    """Revoke a key; raise NotFoundError."""
     known = api_keys.c.id == key_id
     if connection.scalar(select(api_keys.c.seq).where(known)) is None:
         raise NotFoundError(f"there is no key {key_id[:100]!r}")
@@ -78,7 +78,7 @@ def revoke_key(connection: Connection, key_id: str, now: float) -> None:
 
 
 def local_worker_key(path: Path) -> str:
-    """Return the secret in the file of the local workers; make it if there is none. Only its owner can read it."""
+    """Return the secret in the key file of local workers; make the file where it is missing, readable by its owner."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_durably(path, f"{secrets.token_urlsafe(32)}\n".encode(), mode=0o600)
@@ -86,7 +86,7 @@ def local_worker_key(path: Path) -> str:
 
 
 def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
-    """Let the secret in the file of the local workers be a key of the scope `work`; replace one that was revoked."""
+    """Register the secret of the local workers as a key of the scope `work`; replace a revoked one."""
     digest = sha256(local_worker_key(path).encode())
     row = connection.execute(select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)).one_or_none()
     if row is not None and row.revoked_at is not None:
@@ -98,7 +98,7 @@ def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who shows a key, as far as the key says."""
+    """The identity that a key stands for."""
 
     name: str
     """The id and the name of the key."""
@@ -107,7 +107,7 @@ class Holder:
 
 
 class KeyRing:
-    """The keys that open something, as they were a moment ago. Thread-safe."""
+    """Cache of the valid keys. Thread-safe."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -117,11 +117,11 @@ class KeyRing:
 
     @property
     def is_fresh(self) -> bool:
-        """True where `holder_of` answers without a look at the database."""
+        """True where `holder_of` does not need the database."""
         return time.monotonic() < self._read_at + FRESH_SECONDS
 
     def holder_of(self, secret: str) -> Holder | None:
-        """Return who shows a secret; None where it is no key, or one that was revoked."""
+        """Return the holder of a secret; None where it is unknown or revoked."""
         with self._lock:
             if not self.is_fresh:
                 with self._database.read() as connection:

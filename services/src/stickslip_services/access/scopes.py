@@ -1,4 +1,4 @@
-"""What a key lets its holder do: its scopes, and the name of the project that it is for."""
+"""Scopes of keys, and names of projects."""
 
 import re
 from collections.abc import Collection
@@ -6,10 +6,10 @@ from enum import StrEnum
 
 
 class Scope(StrEnum):
-    """What a key is for. `submit` includes `read`; `admin` includes everything."""
+    """What a key permits. `submit` includes `read`; `admin` includes everything."""
 
     read = "read"
-    """Look at everything: jobs, datasets, certificates, pages, metrics."""
+    """Read everything: jobs, datasets, certificates, pages, metrics."""
     submit = "submit"
     """Submit jobs, and pause, resume, cancel and prioritise them."""
     work = "work"
@@ -27,12 +27,12 @@ _IMPLIED = {
 
 
 def allows(granted: Collection[Scope], needed: Scope) -> bool:
-    """Tell whether scopes that were granted include the one that is needed."""
+    """Return whether the granted scopes include the needed one."""
     return any(needed in _IMPLIED[scope] for scope in granted)
 
 
 def check_project(name: str) -> str:
-    """Return the name of a project; raise ValueError where it is none."""
+    """Return the name of a project; raise ValueError where it is malformed."""
     if re.fullmatch(r"([a-z0-9][a-z0-9-]{0,62})?", name) is None:
         raise ValueError(f"project must be lower-case letters, digits and '-', at most 63 of them; got {name[:100]!r}")
     return name

@@ -1,4 +1,4 @@
-"""Request bodies: JSON documents, read strictly, refused with pointers to what is wrong."""
+"""Request bodies: strictly parsed JSON documents, refused with pointers to the wrong fields."""
 
 import json
 from typing import Any, Generic, TypeVar
@@ -32,7 +32,7 @@ class JsonBody(Generic[T]):
         return document
 
     async def received(self, request: Request) -> bytes:
-        """Return the body as it came; raise ProblemError where it is not said to be JSON."""
+        """Return the raw body; raise ProblemError where its Content-Type is not JSON."""
         media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if media_type != "application/json" and not media_type.endswith("+json"):
             detail = f"Content-Type must be application/json, and it is {media_type[:100]!r}"
@@ -47,7 +47,7 @@ class JsonBody(Generic[T]):
         document = parse_json(body)
         try:
             valid = self._adapter.validate_python(document)
-            json.dumps(document, allow_nan=False)  # models refuse NaN with its place; this is for what is free in form
+            json.dumps(document, allow_nan=False)  # models refuse NaN with its place; this covers free-form parts
             return valid
         except ValidationError as error:
             fields = field_errors(error, document, self._of)
@@ -61,7 +61,7 @@ class JsonBody(Generic[T]):
 
 
 def parse_json(body: bytes) -> Any:
-    """Parse JSON as RFC 8259 has it, UTF-8 and no key twice, but let NaN and infinities pass; raise ProblemError."""
+    """Parse JSON [RFC 8259]: UTF-8, no duplicate keys, but NaN and infinities pass; raise ProblemError."""
     try:
         text = body.decode("utf-8")
         document = json.loads(text, object_pairs_hook=_no_key_twice)
@@ -69,7 +69,7 @@ def parse_json(body: bytes) -> Any:
             json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
     except RecursionError as error:
         raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
-    except ValueError as error:  # also of bytes that are no UTF-8, and of integers of more than 4300 digits
+    except ValueError as error:  # also bytes that are not UTF-8, and integers of more than 4300 digits
         raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}"[:500]) from error
     return document
 
@@ -84,13 +84,13 @@ def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def body_schema(name: str) -> dict[str, Any]:
-    """Return what OpenAPI says of a route that reads the document `name`."""
+    """Return the OpenAPI attributes of a route that reads the document `name`."""
     reference = {"$ref": f"#/components/schemas/{name}"}
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": reference}}}}
 
 
 def body_components(models: dict[str, TypeAdapter[Any] | type[BaseModel]]) -> dict[str, Any]:
-    """Return the OpenAPI components of the documents that routes read, by name."""
+    """Return the OpenAPI components of request documents by name."""
     adapters = [
         (name, "validation", model if isinstance(model, TypeAdapter) else TypeAdapter(model))
         for name, model in models.items()

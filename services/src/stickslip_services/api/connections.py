@@ -1,7 +1,7 @@
-"""Connections: how long a client may take to send a request, and how many of them there may be.
+"""Limits on connections: their number, and the time that a client may take to send a request.
 
-While a client sends a request, headers or body, it is the client's turn. A turn may last `TURN_SECONDS`, and longer
-only as far as the client has sent data at `LEAST_RATE`. Answers have no limit: event streams last as long as jobs.
+A request, headers and body, must arrive within `TURN_SECONDS` plus the time that its bytes take at `LEAST_RATE`.
+Answers have no limit: event streams last as long as jobs.
 """
 
 import asyncio
@@ -15,21 +15,21 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from stickslip_services.api.problems import problem_document
 
 TURN_SECONDS = 10.0
-"""How long a client may take to send a request [s]..."""
+"""Time to send a request [s]..."""
 LEAST_RATE = 64 * 2**10
-"""...plus the time that what it has sent takes at this rate [bytes/s]."""
+"""...plus the time that its bytes take at this rate [bytes/s]."""
 MOST_CONNECTIONS = 2000
 
 
 class PatientProtocol(H11Protocol):
-    """HTTP/1.1 with limits on what a client may take."""
+    """HTTP/1.1 with limits on the duration of requests."""
 
     _timer: asyncio.TimerHandle | None = None
     _since = 0.0
     _received = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, or refuse it where there are too many."""
+        """Accept a connection, or refuse it where there are too many."""
         super().connection_made(transport)
         if len(self.connections) > MOST_CONNECTIONS:
             self._refuse(503, ProblemCode.busy, f"there are more than {MOST_CONNECTIONS} connections; try again later")
@@ -37,7 +37,7 @@ class PatientProtocol(H11Protocol):
             self._start_turn()
 
     def data_received(self, data: bytes) -> None:
-        """Take data, and see whose turn it is then."""
+        """Process data, and start or stop the timer of the request."""
         super().data_received(data)
         self._received += len(data)
         if not self._is_clients_turn:
@@ -46,7 +46,7 @@ class PatientProtocol(H11Protocol):
             self._start_turn(len(data))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Let go of a connection."""
+        """Stop the timer."""
         self._end_turn()
         super().connection_lost(exc)
 
@@ -81,7 +81,7 @@ class PatientProtocol(H11Protocol):
 
 
 def allow_many_files() -> None:
-    """Let this process have as many open files as it may: each connection is one."""
+    """Raise the limit of open files to its maximum: each connection is one."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

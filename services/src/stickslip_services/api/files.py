@@ -28,7 +28,7 @@ OPENAPI_HEADERS = {
 
 
 def picture_format(store: Store, digest: Sha256) -> str:
-    """Return the format of a picture, png or webp, from its first bytes; of a file that cannot be read, png."""
+    """Return the format of a picture, png or webp, from its first bytes; png for an unreadable file."""
     try:
         head = store.read(digest, length=12)
     except OSError:
@@ -37,7 +37,7 @@ def picture_format(store: Store, digest: Sha256) -> str:
 
 
 def serve(request: Request, store: Store, digest: Sha256, *, name: str, size: int | None = None) -> Response:
-    """Answer with an artifact, of `size` bytes where that is known, or the part of it that the request asks for."""
+    """Answer with an artifact, or with the requested range of it; `size` in bytes saves a look-up."""
     etag = f'"{digest}"'
     headers = {
         "ETag": etag,
@@ -67,7 +67,7 @@ def serve(request: Request, store: Store, digest: Sha256, *, name: str, size: in
 
 
 def matches(header: str | None, etag: str) -> bool:
-    """Tell whether an entity tag is among those of `If-None-Match` [RFC 9110, 13.1.2]."""
+    """Return whether an entity tag is among those of `If-None-Match` [RFC 9110, 13.1.2]."""
     if header is None:
         return False
     return header.strip() == "*" or etag in (item.strip().removeprefix("W/") for item in header.split(","))
@@ -76,7 +76,7 @@ def matches(header: str | None, etag: str) -> bool:
 def _span(header: str, size: int, headers: dict[str, str]) -> tuple[int, int] | None:
     """Return the first and last byte of the range, or None for the whole file.
 
-    A range of another form, or several of them, may be ignored, and is.
+    Other forms, and multiple ranges, are ignored, as the RFC permits.
     """
     match = _RANGE.fullmatch(header.strip())
     if match is None or match.group() == "bytes=-":

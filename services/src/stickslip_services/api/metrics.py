@@ -1,4 +1,4 @@
-"""Metrics for Prometheus: the queue and the store, read when somebody asks, and what went by since the start."""
+"""Prometheus metrics: the queue and the store, read at each scrape, and counters since the start."""
 
 from collections.abc import Iterable
 
@@ -22,8 +22,8 @@ class _QueueCollector(Collector):
         tasks = GaugeMetricFamily("stickslip_tasks", "Tasks by stage and state", labels=["stage", "state"])
         by_state = GaugeMetricFamily("stickslip_jobs", "Jobs by state", labels=["state"])
         leases = GaugeMetricFamily("stickslip_leases", "Tasks on lease by worker", labels=["worker"])
-        workers = GaugeMetricFamily("stickslip_workers", "Workers that were heard of lately")
-        slots = GaugeMetricFamily("stickslip_worker_slots", "Slots of the workers that were heard of lately")
+        workers = GaugeMetricFamily("stickslip_workers", "Workers with a recent message")
+        slots = GaugeMetricFamily("stickslip_worker_slots", "Slots of workers with a recent message")
         with self._context.database.read() as connection:
             alive = alive_workers(self._context, connection)
             for stage, state, count in connection.execute(select(task_counts)):
@@ -45,7 +45,7 @@ class _QueueCollector(Collector):
         slots.add_metric([], sum(worker.slots for worker in alive))
         etas = CounterMetricFamily(
             "stickslip_eta_predictions",
-            "Intervals of the time left that were noted every 5 s, by whether the job ended within; 80 % should hold",
+            "ETA intervals, recorded every 5 s, by whether the job ended within; 80 % should hold",
             labels=["kind", "held"],
         )
         for (kind, held_true), count in self._context.eta_watch.held.items():
@@ -81,11 +81,11 @@ class Metrics:
         )
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Note that a request was answered."""
+        """Count an answered request."""
         self._requests.labels(method, route, str(status)).observe(seconds)
 
     def count_reports(self, batch: ReportBatch, answer: ReportAnswer) -> None:
-        """Note how tasks ended, as far as their reports were accepted."""
+        """Count the outcomes of accepted reports."""
         for report, verdict in zip(batch.reports, answer.verdicts, strict=True):
             result = report.result
             if verdict.verdict != "accepted" or result is None:
@@ -96,5 +96,5 @@ class Metrics:
                 self._failures.labels(stage, result.outcome, result.reason).inc()
 
     def text(self) -> bytes:
-        """Return all metrics as Prometheus reads them."""
+        """Return all metrics in the text format of Prometheus."""
         return generate_latest(self._registry)

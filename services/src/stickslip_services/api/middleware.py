@@ -1,4 +1,4 @@
-"""What happens around every request: an id, a size limit, a measurement."""
+"""Middleware of every request: an id, a size limit, a timing."""
 
 import re
 import secrets
@@ -63,7 +63,7 @@ class BodyLimitMiddleware:
                 received += len(message.get("body", b""))
                 if received > self._limit:
                     refused = True
-                    return {"type": "http.disconnect"}  # the reader stops; the answer is given below
+                    return {"type": "http.disconnect"}  # the reader stops; the answer follows below
             return message
 
         async def limited_send(message: Message) -> None:

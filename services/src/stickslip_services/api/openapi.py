@@ -31,7 +31,7 @@ _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document of `app`, with the documents that bodies.py reads instead of FastAPI."""
+    """Return the OpenAPI document of `app`, with the request documents that bodies.py reads."""
     if not app.openapi_schema:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = document.setdefault("components", {}).setdefault("schemas", {})
@@ -42,7 +42,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
                 "description": "an API key, as `stickslip keys create` makes it",
             }
         }
-        # What may be sent is more than what is answered (short forms of axes), so its schema holds for both.
+        # Requests allow more forms than answers (short forms of axes), so their schema holds for both.
         components.update(body_components(_DOCUMENTS))
         _drop_foreign_errors(document)
         _name_by_title(document)
@@ -56,7 +56,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
 
 
 def _summarise(document: dict[str, Any]) -> None:
-    """Take the first sentence of an operation's description as its summary, in place of its function's name."""
+    """Use the first sentence of an operation's description as its summary."""
     for methods in document["paths"].values():
         for operation in methods.values():
             if "description" in operation:
@@ -65,7 +65,7 @@ def _summarise(document: dict[str, Any]) -> None:
 
 
 def _drop_null_parameters(document: dict[str, Any]) -> None:
-    """Let no parameter be null: one that is not required is left out."""
+    """Remove null from parameters: an optional one is omitted."""
     for methods in document["paths"].values():
         for operation in methods.values():
             for parameter in operation.get("parameters", ()):
@@ -75,7 +75,7 @@ def _drop_null_parameters(document: dict[str, Any]) -> None:
 
 
 def _require_tags(node: Any, components: dict[str, Any]) -> None:
-    """Require the field that tells the members of a union apart, also where it has a default."""
+    """Make the discriminator of a union required, even if it has a default."""
     if isinstance(node, dict):
         discriminator = node.get("discriminator")
         if isinstance(discriminator, dict) and "mapping" in discriminator:
@@ -90,7 +90,7 @@ def _require_tags(node: Any, components: dict[str, Any]) -> None:
 
 
 def _name_by_title(document: dict[str, Any]) -> None:
-    """Call a component by its title where pydantic made a name of its parameters: `ListAxisMu`."""
+    """Rename components to their titles where pydantic derived a name from parameters: `ListAxisMu`."""
     components = document["components"]["schemas"]
     for name in list(components):
         title = components[name].get("title", name)
@@ -112,7 +112,7 @@ def _refer(node: Any, old: str, new: str) -> None:
 
 
 def _drop_foreign_errors(document: dict[str, Any]) -> None:
-    """Drop what FastAPI says of invalid parameters where the route does not: there they cannot be invalid."""
+    """Drop FastAPI's 422 answers from routes whose parameters cannot be invalid."""
     foreign = {"$ref": "#/components/schemas/HTTPValidationError"}
     for methods in document["paths"].values():
         for operation in methods.values():

@@ -1,6 +1,5 @@
-"""Errors to problem documents: one table."""
+"""Errors as problem documents [RFC 9457], mapped by one table."""
 
-import json
 import logging
 from collections.abc import Mapping
 from typing import Any
@@ -65,7 +64,7 @@ def problem_document(
     request_id: str | None = None,
     fields: list[FieldError] | None = None,
 ) -> Problem:
-    """Return a problem document, whose type and title follow from its code."""
+    """Return a problem document; its type and title follow from the code."""
     return Problem(
         type=f"urn:stickslip:problem:{code}",
         title=code.replace("_", " ").capitalize(),
@@ -90,13 +89,13 @@ def problem_response(
 ) -> Response:
     """Return a problem document as a response."""
     problem = problem_document(status, code, detail, path=path, request_id=request_id, fields=fields)
-    # What came with the request may hold what has no UTF-8 form; the answer must be readable all the same.
+    # The request may contain text without a UTF-8 form; the answer must be valid UTF-8.
     content = problem.model_dump_json(ensure_ascii=True)
     return Response(content, status, dict(headers or {}), MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
-    """Let `app` answer every error with a problem document."""
+    """Make `app` answer every error with a problem document."""
     app.add_exception_handler(ProblemError, _problem)
     app.add_exception_handler(errors.StickslipError, _stickslip_error)
     app.add_exception_handler(RequestValidationError, _invalid_parameters)
@@ -118,14 +117,9 @@ def _problem(request: Request, error: Exception) -> Response:
 def _stickslip_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, errors.StickslipError)
     status, code = _STATUS[type(error)]
-    fields = error.fields if isinstance(error, errors.UnknownTextureError) else []
-    if isinstance(error, errors.PresetNotCertifiedError):
-        fields = [FieldError(pointer="/preset", rule=error.rule, value=json.dumps(error.preset))]
-    if isinstance(error, errors.QuotaExceededError):
-        fields = [FieldError(pointer="", rule=error.rule, value=str(error.value))]
     if status >= 500:
         logger.error("%s %s: %s", request.method, request.url.path, error)
-    return _answer(request, status, code, str(error), fields=fields)
+    return _answer(request, status, code, str(error), fields=list(error.fields))
 
 
 def _invalid_parameters(request: Request, error: Exception) -> Response:
@@ -157,7 +151,7 @@ def _http_error(request: Request, error: Exception) -> Response:
 
 
 def _allowed_methods(request: Request) -> str:
-    """Return the methods of a resource: those of the routes with the longest template that fits its path."""
+    """Return the methods of a resource: those of the routes with the longest matching template."""
     fitting = [
         route
         for route in request.app.state.routes

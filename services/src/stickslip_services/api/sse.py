@@ -24,11 +24,11 @@ PROGRESS_SECONDS = 1.0
 LOOK_SECONDS = 0.2
 BATCH = 200
 KEPT_EVENTS = 1000
-"""So many of the last events a feed keeps in memory; who wants older ones reads them from the database."""
+"""Number of events that a feed keeps in memory; older ones are read from the database."""
 
 
 OPENAPI = {
-    # Each event of the stream; OpenAPI 3.2 calls it `itemSchema`.
+    # The schema of one event; OpenAPI 3.2 has `itemSchema` for it.
     "schema": {
         "type": "object",
         "properties": {
@@ -43,7 +43,7 @@ OPENAPI = {
 
 
 class Feeds:
-    """The feeds of the jobs that are being watched. For one event loop."""
+    """The feeds of watched jobs, for one event loop."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -51,7 +51,7 @@ class Feeds:
 
     def stream(self, job: int, *, after: int) -> StreamingResponse:
         """Answer with the events of a job after the one with the id `after`."""
-        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # no proxy is to hold events back
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # no proxy may buffer events
         return StreamingResponse(self._watch(job, after), headers=headers, media_type="text/event-stream")
 
     async def _watch(self, job: int, cursor: int) -> AsyncIterator[bytes]:
@@ -78,31 +78,31 @@ class _News:
 
 
 class _Feed:
-    """State of a job, kept up to date while it is watched."""
+    """Events and progress of a job, kept up to date while it is watched."""
 
     def __init__(self, context: Context, job: int, after: int) -> None:
         self._context = context
         self._job = job
         self._after = after
-        """The events after this one, up to the last that there is, are in `_events`."""
+        """`_events` has all events after this id."""
         self._events: list[StoredEvent] = []
         self._progress = ""
         self._is_complete = False
-        """Whether there is nothing more to come: the job has ended, and all of its events are known."""
+        """True when the job has ended and all of its events are in `_events`."""
         self._version = 0
         self._changed = asyncio.Event()
         self.watchers = 0
         self.task = asyncio.create_task(self._follow())
 
     async def messages(self, cursor: int) -> AsyncIterator[bytes]:
-        """Yield the events after `cursor`."""
+        """Yield the messages for a watcher that has the events up to `cursor`."""
         opening = f"retry: {RECONNECT_MILLISECONDS}\n".encode()  # goes with the first event
         told = ""
         while True:
             version, changed = self._version, self._changed
             events = await self._events_after(cursor)
             messages: list[bytes] = []
-            last: list[bytes] = []  # the end of the job is the last event, also after the progress that goes with it
+            last: list[bytes] = []  # the end of the job comes after the progress that goes with it
             for event in events:
                 cursor = event.id
                 (last if event.is_last else messages).append(_message(event.name, event.data, cursor))
@@ -118,7 +118,7 @@ class _Feed:
             if ended:
                 return
             if self.task.done():
-                self.task.result()  # raises what has gone wrong; the client comes back
+                self.task.result()  # raises the error of the feed; the client reconnects
                 return
             if version == self._version and is_up_to_date:
                 try:
@@ -134,7 +134,7 @@ class _Feed:
         if cursor >= self._after:
             return [event for event in self._events if event.id > cursor]
         older = await run_in_threadpool(self._read, cursor)
-        return [event for event in older if event.id <= self._newest]  # what is newer comes with its progress
+        return [event for event in older if event.id <= self._newest]  # newer ones come with their progress
 
     def _read(self, after: int) -> list[StoredEvent]:
         with self._context.database.read() as connection:
@@ -150,7 +150,7 @@ class _Feed:
         return _News(events, progress, ended)
 
     async def _follow(self) -> None:
-        """Look for news until the job ends or nobody watches any more."""
+        """Read new events until the job ends or nobody watches."""
         looked_at = -PROGRESS_SECONDS
         try:
             while not self._is_complete:

@@ -67,7 +67,7 @@ def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
 def read_contents(store: Store, manifest: Sha256) -> Contents:
     """Return what a manifest lists; raise MissingArtifactError where it is damaged or lost.
 
-    A manifest never changes, so it is read once. A section is read when a file of it is asked for.
+    A manifest never changes, so it is cached. A section is read with the first request for one of its files.
     """
     try:
         document = Manifest.model_validate_json(store.read(manifest))

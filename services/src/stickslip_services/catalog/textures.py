@@ -1,4 +1,4 @@
-"""Textures of users: pictures in the store, which specs name by their digests."""
+"""Uploaded textures: pictures in the store, which specs name by their digests."""
 
 from stickslip_schemas.base.keys import ARTIFACT
 from stickslip_schemas.documents.problems import FieldError
@@ -11,13 +11,13 @@ from stickslip_services.errors import UnknownTextureError
 
 
 def store_texture(store: Store, data: bytes) -> TextureEntry:
-    """Put a picture file into the store; raise UnfitPictureError where a cloth cannot be printed with it."""
+    """Store a picture file; raise UnfitPictureError where it cannot be a texture."""
     side = len(read_picture(data))
     return TextureEntry(texture=f"{ARTIFACT}{store.publish(data)}", side=side, bytes=len(data))
 
 
 def check_textures(store: Store, spec: JobSpec) -> None:
-    """Raise UnknownTextureError where a spec names pictures that are not in the store, whole."""
+    """Raise UnknownTextureError where a spec names pictures that are missing or damaged in the store."""
     wrong = []
     for pointer, digest in spec.artifacts.items():
         try:

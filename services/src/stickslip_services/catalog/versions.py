@@ -1,4 +1,4 @@
-"""Versions as they are made. A version exists when its manifest's digest is in the database, and not before."""
+"""Making of versions. A version exists as soon as the digest of its manifest is in the database."""
 
 from dataclasses import dataclass
 
@@ -21,12 +21,12 @@ from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is
 from stickslip_services.database.tables import dataset_versions, datasets
 
 HEADS_AT_ONCE = 128
-"""How many files are looked for at once; a worker waits for the answer."""
+"""Number of parallel requests to the store; a worker waits for the answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class ManifestSummary:
-    """What the coordinator keeps of a manifest."""
+    """The part of a manifest that the database stores."""
 
     dataset: str
     version: int
@@ -49,9 +49,9 @@ class CommittedVersion:
 
 
 def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
-    """Read a manifest that a worker says it has published; raise ValueError or OSError where it is not one.
+    """Read a manifest that a worker has published, and check that all its files are in the store.
 
-    A version whose files are not all there must not come to be, so they are looked for, too.
+    Raises ValueError or OSError.
     """
     content, group = store.read(output.manifest), store.read(output.group)
     check_seal(content, group, store.read(sha256(seal_text(output.manifest, output.group))))
@@ -78,7 +78,7 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
 
 
 def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutput) -> None:
-    """Raise CorruptArtifactError where an artifact that a worker says it has made is not in the store."""
+    """Raise CorruptArtifactError where an artifact of a worker's output is not in the store."""
     named: dict[Sha256, int] = {}
     if isinstance(output, SimulateOutput):
         named[output.record.digest] = 1
@@ -93,28 +93,28 @@ def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutpu
 
 
 def find_reserved(connection: Connection, publish_task: int) -> tuple[str, int] | None:
-    """Return the dataset and the number of the version that a publish task is to make."""
+    """Return the dataset and the version number reserved for a publish task."""
     query = select(dataset_versions.c.dataset, dataset_versions.c.version)
     row = connection.execute(query.where(dataset_versions.c.publish_task == publish_task)).one_or_none()
     return None if row is None else (row.dataset, row.version)
 
 
 def version_exists(connection: Connection, dataset: str, version: int) -> bool:
-    """Tell whether a number of a dataset is taken."""
+    """Return whether a version number of a dataset is taken."""
     columns = dataset_versions.c
     query = select(columns.version).where(columns.dataset == dataset, columns.version == version)
     return connection.scalar(query) is not None
 
 
 def reserve_number(connection: Connection, dataset: str, version: int, publish_task: int) -> None:
-    """Give a publish task this number of a version."""
+    """Reserve a version number for a publish task."""
     connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task))
 
 
 def commit_version(
     connection: Connection, publish_task: int, summary: ManifestSummary, *, name: str | None, now: float
 ) -> None:
-    """Let a version exist; its dataset is called `name` if this is its first version."""
+    """Commit a version; with its first version a dataset gets its `name`."""
     if connection.scalar(select(datasets.c.seq).where(datasets.c.id == summary.dataset)) is None:
         connection.execute(
             insert(datasets).values(id=summary.dataset, name=name, kind=summary.kind, spec_digest=summary.spec_digest)
@@ -141,10 +141,10 @@ def find_committed(connection: Connection, publish_task: int) -> CommittedVersio
 
 
 def damaged_files(store: Store, manifest: Sha256, group: Sha256) -> frozenset[Sha256] | None:
-    """Return the digests of the files of a version that are not whole, in the store or in the version's directory.
+    """Return the digests of the damaged files of a version, in the store or in the version's directory.
 
-    None where the files that vouch for the others are not whole, so that nobody can tell. Reads all of it.
-    Raises OSError where the store is out of reach.
+    None where the manifest, the root's metadata or the seal is damaged, so that the others are unknown. All files are
+    read. Raises OSError where the store is out of reach.
     """
     seal = sha256(seal_text(manifest, group))
     try:

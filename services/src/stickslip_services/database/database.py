@@ -1,7 +1,7 @@
-"""Transactions on the database, whichever it is: SQLite in the data directory, or PostgreSQL by a URL.
+"""Transactions on the database: SQLite in the data directory, or PostgreSQL at a URL.
 
-There is one way to read and one to write. A write is alone in writing from its first statement on: it never finds at
-its end that somebody else was faster, so nothing has to be tried again.
+A write transaction excludes other writers from its first statement on, so it never conflicts at its end, and needs no
+retries.
 """
 
 import threading
@@ -19,16 +19,16 @@ from sqlalchemy.pool import ConnectionPoolEntry
 T = TypeVar("T")
 
 BATCH = 5000
-"""How many values go into one IN (...) and how many rows into one executemany."""
+"""Number of values in one IN (...), and a twentieth of the rows of one executemany."""
 
 
 class Role(Enum):
-    """Who opens a database. Any number of coordinators may share one; upkeep has it for itself."""
+    """The purpose of a connection. Any number of coordinators may share a database; upkeep needs it exclusively."""
 
     coordinator = auto()
     upkeep = auto()
     visitor = auto()
-    """One who reads and writes a row or two beside the others."""
+    """A command that reads and writes a few rows beside the others."""
 
 
 class Database(ABC):
@@ -37,37 +37,37 @@ class Database(ABC):
     def __init__(self, reader: Engine, writer: Engine) -> None:
         self._reader = reader
         self._writer = writer
-        # The database's own waiting is unfair, or takes a connection; threads of this process queue up here.
+        # The database's own waiting is unfair, or takes a connection, so threads of this process wait here.
         self._writing = threading.Lock()
         self._ahead = time.time() - time.monotonic()
 
     def clock(self) -> float:
-        """Return what all coordinators on this database call now, in seconds since 1970 [s].
+        """Return the current time that all coordinators on this database share [s since 1970].
 
-        When somebody sets this machine's clock, leases neither expire at once nor live forever.
+        It is monotonic: setting the clock of this machine neither expires leases nor extends them.
         """
         return self._ahead + time.monotonic()
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
-        """Open a transaction that sees one state of the database."""
+        """Open a read transaction on a snapshot of the database."""
         with self._reader.begin() as connection:
             yield connection
 
     @abstractmethod
     def write(self) -> AbstractContextManager[Connection]:
-        """Open a transaction that is alone in writing; it is durable when the block has been left."""
+        """Open a transaction that excludes other writers; it is durable after the block."""
 
     def is_alone(self, connection: Connection) -> bool:
-        """Tell, in a write, whether no other coordinator uses the database."""
+        """Return whether no other coordinator uses the database; call it in a write transaction."""
         return True
 
-    async def listen(self, ring: Callable[[], None]) -> None:
-        """Call `ring` whenever another coordinator has written, until cancelled."""
+    async def listen(self, notify: Callable[[], None]) -> None:
+        """Call `notify` whenever another coordinator has written, until cancelled."""
         return
 
     def close(self) -> None:
-        """Close all connections; one that a thread still uses, as soon as the thread has done with it."""
+        """Close all connections; one that a thread still uses is closed when it is returned."""
         for engine in (self._reader, self._writer):
             event.listen(engine, "checkin", _close_returned)
             engine.dispose()
@@ -85,7 +85,7 @@ def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
 
 
 def insert_rows(connection: Connection, table: Table, columns: Sequence[str], rows: Iterable[tuple[Any, ...]]) -> None:
-    """Insert many rows by the driver's own executemany: an SQL expression per row would cost five times as much."""
+    """Insert many rows with the driver's executemany, at a fifth of the cost of SQL expressions."""
     mark = {"qmark": "?", "format": "%s"}[connection.dialect.paramstyle]
     statement = f"INSERT INTO {table.name} ({', '.join(columns)}) VALUES ({', '.join([mark] * len(columns))})"
     for batch in batches(rows, 20 * BATCH):

@@ -1,4 +1,4 @@
-"""Bringing a database up to date, and telling whether tables and migrations agree."""
+"""Migration of a database, and the check that tables and migrations agree."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def config(connection: Connection) -> Config:
 
 
 def upgrade(connection: Connection) -> None:
-    """Apply all migrations that the database has not had yet: all of them or, where one fails, none."""
+    """Apply all pending migrations; if one fails, none is applied."""
     command.upgrade(config(connection), "head")
 
 

@@ -1,4 +1,4 @@
-"""Opening a coordinator's database, or refusing it in one sentence that says what to do."""
+"""Opening a coordinator's database, or refusing it with one sentence on what to do."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from stickslip_services.settings import Settings
 
 
 def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
-    """Return the database of a coordinator, as it is. Raise DatabaseRefusedError where its driver is missing."""
+    """Return the database of a coordinator, unchanged. Raise DatabaseRefusedError where its driver is missing."""
     url = settings.database_url
     if url is None:
         return SqliteDatabase(settings.database_path, durable=settings.durable)
@@ -36,9 +36,9 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
 
 @contextmanager
 def opened(settings: Settings, role: Role) -> Iterator[Database]:
-    """Open the database of a coordinator, brought up to date; make it if there is none.
+    """Open the database of a coordinator, and migrate it, or make it where there is none.
 
-    Raise DatabaseRefusedError where it is damaged, was made by a newer version, or cannot be had in this role.
+    Raises DatabaseRefusedError where it is damaged, has an unknown schema, or refuses the role.
     """
     check(settings, role)
     database = connect(settings, role)
@@ -51,9 +51,9 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
 
 
 def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
-    """Return whether there is a database; raise DatabaseRefusedError where it cannot be used in a role.
+    """Return whether the database exists; raise DatabaseRefusedError where it cannot be used in a role.
 
-    One that is not there can be made, unless there are datasets in the store, `with_store`: then it was lost.
+    With `with_store`, a missing database is refused where the store holds datasets: it was lost.
     """
     if settings.database_url is None:
         revision = _sqlite_revision(settings.database_path)
@@ -77,7 +77,7 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
 
 
 def _has_versions(settings: Settings) -> bool:
-    """Tell whether a store holds datasets; raise DatabaseRefusedError where it cannot be asked."""
+    """Return whether a store holds datasets; raise DatabaseRefusedError where it is out of reach."""
     try:
         return next(open_store(settings.store_place).versions(MANIFEST_NAME), None) is not None
     except OSError as error:
@@ -88,7 +88,7 @@ def _has_versions(settings: Settings) -> bool:
 
 
 def _sqlite_revision(path: Path) -> str | None:
-    """Return the last migration that a file has had; None where there is no file, or an empty one."""
+    """Return the schema revision of a file; None where it is missing or empty."""
     if not path.exists():
         return None
     revision = None
@@ -114,7 +114,7 @@ def _sqlite_revision(path: Path) -> str | None:
 
 
 def _postgresql_revision(settings: Settings, role: Role) -> str | None:
-    """Return the last migration that a database has had; None where it is empty."""
+    """Return the schema revision of a database; None where it is empty."""
     name = settings.database_name
     if settings.database_path.exists():
         raise DatabaseRefusedError(
@@ -122,7 +122,7 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
         )
     database = connect(settings, role)
     try:
-        with database.write() as connection:  # which is refused where others have the database for themselves
+        with database.write() as connection:  # it is refused where another role has the database exclusively
             tables = inspect(connection).get_table_names()
             encoding = connection.scalar(text("SHOW server_encoding"))
             if encoding != "UTF8":

@@ -1,4 +1,4 @@
-"""Pages of lists. A token names the last item seen, so that a page stays what it is while the list grows."""
+"""Pages of lists. A token names the last item, so that a page does not change while the list grows."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from stickslip_schemas.documents.responses import Page
 MAX_PAGE_SIZE = 1000
 
 TOKEN_PATTERN = r"^[0-9]{1,18}$"
-"""Of page tokens; what has this form and is none of ours is a place in the list all the same."""
+"""Pattern of page tokens; every number is a valid position in a list."""
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class PageRequest:
-    """Which page is asked for: at most `size` items beyond the position `after`."""
+    """The requested page: at most `size` items beyond the position `after`."""
 
     size: int
     after: int | None
@@ -31,7 +31,7 @@ class PageRequest:
 def make_page(
     rows: Sequence[S], request: PageRequest, *, position: Callable[[S], int], item: Callable[[S], T]
 ) -> Page[T]:
-    """Return the page of `rows`, of which one more than a page was read to see whether there are more."""
+    """Return the page of `rows`; one row more than a page tells that there is a next page."""
     shown = rows[: request.size]
     more = len(rows) > request.size
     token = str(position(shown[-1])) if more else None

@@ -1,9 +1,8 @@
 """PostgreSQL: one database for any number of coordinators.
 
-Writers exclude each other by one advisory lock, as they do on SQLite: the queue's rules never see a half-done change
-of another coordinator, and a thousand cores need no more than one writer at a time can do. The statement that takes
-the lock also reads the database's clock and announces the change to the other coordinators; PostgreSQL delivers that
-with the commit.
+Writers exclude each other by one advisory lock, as on SQLite, so the queue never sees an unfinished change of another
+coordinator. One writer at a time suffices for a thousand cores. The statement that takes the lock also reads the
+database's clock and announces the change to the other coordinators; PostgreSQL delivers that with the commit.
 """
 
 import asyncio
@@ -24,7 +23,7 @@ from stickslip_services.errors import DatabaseRefusedError
 logger = logging.getLogger(__name__)
 
 _LOCKS = 0x736C6970
-"""First of the two numbers of our advisory locks: "slip". The second is 1 for writers, 2 for connected coordinators."""
+"""First number of our advisory locks, "slip". The second is 1 for the writer, 2 for every connected process."""
 
 _CHANNEL = "stickslip"
 
@@ -32,7 +31,7 @@ _CONNECT = {
     "application_name": "stickslip",
     "client_encoding": "utf8",
     "connect_timeout": 10,
-    # A coordinator whose machine is gone, or a server that is, is noticed within a minute.
+    # The loss of a peer machine is detected within a minute.
     "keepalives_idle": 30,
     "keepalives_interval": 10,
     "keepalives_count": 3,
@@ -40,7 +39,7 @@ _CONNECT = {
 
 _WRITER_SETTINGS = (
     "lock_timeout = '30s'",
-    # Who stops in the middle of a write (a stopped process, a lost network) does not hold up the others forever.
+    # A process that stops in a write (SIGSTOP, a lost network) must not block the others for ever.
     "idle_in_transaction_session_timeout = '60s'",
     "tcp_keepalives_idle = 30",
     "tcp_keepalives_interval = 10",
@@ -70,14 +69,14 @@ _OTHERS = (
 class PostgresqlDatabase(Database):
     """Transactions on one PostgreSQL database.
 
-    Reads see one state (REPEATABLE READ). Writes go through one connection, which also holds the lock that tells that
-    this coordinator is there. Raises DatabaseRefusedError where the role cannot be had, with the first write.
+    Reads see a snapshot (REPEATABLE READ). Writes go through one connection, which also holds the lock of the role. The
+    first write raises DatabaseRefusedError where the role is refused.
     """
 
     def __init__(self, url: URL, *, durable: bool = True, role: Role = Role.coordinator) -> None:
         self._name = url.set(drivername="postgresql", query={}).render_as_string(hide_password=True)
         self._token = secrets.token_hex(8)
-        """Tells this process's announcements from those of others."""
+        """Identifies the announcements of this process."""
         self._role = role
         self._durable = durable
         given = {name: value for name, value in _CONNECT.items() if name not in url.query}
@@ -92,7 +91,7 @@ class PostgresqlDatabase(Database):
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """Open a transaction that is alone in writing; it is durable when the block has been left."""
+        """Open a transaction that excludes other writers; it is durable after the block."""
         with self._writing, self._writer.begin() as connection:
             _, _, now = connection.exec_driver_sql(_BEGIN, (self._token,)).one()
             # Leases are granted, renewed and taken back in writes: all coordinators do it by the same clock.
@@ -100,20 +99,20 @@ class PostgresqlDatabase(Database):
             yield connection
 
     def is_alone(self, connection: Connection) -> bool:
-        """Tell, in a write, whether no other coordinator uses the database."""
+        """Return whether no other coordinator uses the database; call it in a write transaction."""
         return not connection.exec_driver_sql(_OTHERS).scalar_one()
 
-    async def listen(self, ring: Callable[[], None]) -> None:
-        """Call `ring` whenever another coordinator has written, until cancelled."""
+    async def listen(self, notify: Callable[[], None]) -> None:
+        """Call `notify` whenever another coordinator has written, until cancelled."""
         while True:
             try:
                 connection = await psycopg.AsyncConnection.connect(**self._arguments, autocommit=True)
                 async with connection:
                     await connection.execute(f"LISTEN {_CHANNEL}")
-                    ring()  # for what was announced while nobody listened
+                    notify()  # for writes before this connection listened
                     async for notice in connection.notifies():
                         if notice.payload != self._token:
-                            ring()
+                            notify()
             except psycopg.Error as error:
                 logger.warning("no news of other coordinators from %s: %s", self._name, error)
                 await asyncio.sleep(1.0)
@@ -131,7 +130,7 @@ class PostgresqlDatabase(Database):
 
 
 def _leave(connection: Any, _record: Any) -> None:
-    """Let the locks go at once: the server ends a session only some time after its connection has."""
+    """Release the locks at once: the server ends a session some time after its connection."""
     with suppress(psycopg.Error):
         connection.execute("SELECT pg_advisory_unlock_all()")
 
@@ -147,7 +146,7 @@ def _prepare(connection: Any) -> None:
 
 
 class _TextDumper(StrDumper):
-    """Text as PostgreSQL can keep it: it has no character 0, which messages of workers and paths of URLs may bring."""
+    """Replaces the character 0, which PostgreSQL cannot store, and which messages and URLs may contain."""
 
     def dump(self, obj: str) -> Any:
         return super().dump(obj.replace("\0", "\N{REPLACEMENT CHARACTER}"))

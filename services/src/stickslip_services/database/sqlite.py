@@ -23,8 +23,8 @@ class SqliteDatabase(Database):
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # FULL: what was answered with 202, or accepted as a dataset version, is there after a power cut, too. A
-        # commit costs an fsync; leases and reports come in batches, so that is a handful a second.
+        # FULL: accepted jobs and dataset versions survive a power cut. A commit costs an fsync; leases and reports
+        # come in batches, so there are only a few a second.
         self._pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
         url = URL.create("sqlite+pysqlite", database=str(path))
         engine = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
@@ -34,7 +34,7 @@ class SqliteDatabase(Database):
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """Open a transaction that is alone in writing; it is durable when the block has been left."""
+        """Open a transaction that excludes other writers; it is durable after the block."""
         with self._writing, self._writer.connect() as connection:
             connection.execution_options(stickslip_write=True)
             with connection.begin():
