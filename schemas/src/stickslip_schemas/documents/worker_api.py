@@ -68,7 +68,7 @@ class Lease(Document):
 
 
 class LeaseBatch(Document):
-    """Granted leases, and the delay before the next request where there are none."""
+    """Granted leases, and the delay before the next request if there are none."""
 
     leases: tuple[Lease, ...]
     retry_after_seconds: float = Field(ge=0)
