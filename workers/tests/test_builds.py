@@ -4,6 +4,7 @@ import ast
 import json
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,7 @@ def _python(script: str, *arguments: str) -> str:
     return done.stdout
 
 
+@cache
 def _files(stage: str, name: str) -> set[Path]:
     return {path.resolve() for path in sources(builds.roots(stage, name), cut=UNCOUNTED).values()}
 
@@ -93,6 +95,7 @@ def _decides_on_nothing(path: Path) -> bool:
     return path.parts[-2:] == ("kinds", "__init__.py") or path.parts[-3:-1] == ("stickslip_schemas", "store")
 
 
+@pytest.mark.physics
 @pytest.mark.parametrize("name", KINDS)
 def test_every_function_that_runs_is_in_the_build(name: str, tmp_path: Path) -> None:
     """But for what decides on nothing: the list of kinds finds a class by its name, and a store by its digest."""

@@ -22,7 +22,7 @@ from stickslip_workers.lease_client import SupersededError
 from stickslip_workers.processes import StartError
 from stickslip_workers.settings import Settings
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves its log files open
+pytestmark = [pytest.mark.real, pytest.mark.filterwarnings("ignore::ResourceWarning")]  # Ray leaves its log files open
 
 
 class Running:

@@ -17,7 +17,11 @@ from stickslip_workers.cluster import OWNER
 from stickslip_workers.settings import default_blender_python
 
 pytest.importorskip("stickslip_services")
-pytestmark = pytest.mark.skipif(not default_blender_python().exists(), reason="there is no Blender environment")
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.slow,  # tests/test_chaos.py ends dispatchers of a whole service, too
+    pytest.mark.skipif(not default_blender_python().exists(), reason="there is no Blender environment"),
+]
 
 T = TypeVar("T")
 

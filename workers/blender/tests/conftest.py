@@ -44,7 +44,7 @@ def _sheet(side: int = 9, *, reach: float = 0.3) -> Sheet:
     return Sheet(triangles.astype(np.int32), rest.astype(np.float32), track.astype(np.float32))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_sheet() -> Callable[..., Sheet]:
     return _sheet
 

@@ -33,8 +33,10 @@ LOOK = {
 Clip = npt.NDArray[np.uint8]
 
 
-@pytest.fixture
-def renderer(sheet: Any) -> Iterator[ClothRenderer]:
+@pytest.fixture(scope="module")
+def renderer(make_sheet: Callable[..., Any]) -> Iterator[ClothRenderer]:
+    """One scene for all tests that need no other; the last test of this module builds others."""
+    sheet = make_sheet()
     made = ClothRenderer(sheet.triangles, sheet.rest, Holders)
     yield made
     made.close()
@@ -79,7 +81,7 @@ print(hashlib.sha256(video.tobytes()).hexdigest(), labels["composed"])
 """
 
 
-@pytest.mark.parametrize("gate", [clips.GATE, 99.0], ids=["composed", "direct"])
+@pytest.mark.parametrize("gate", [clips.GATE, pytest.param(99.0, marks=pytest.mark.slow)], ids=["composed", "direct"])
 def test_a_fresh_process_with_two_threads_makes_the_same_bytes(
     renderer: ClothRenderer, sheet: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gate: float
 ) -> None:
@@ -105,46 +107,6 @@ def test_what_stands_still_has_the_same_bytes_in_every_frame(renderer: ClothRend
     clip = renderer.clip(look, load_rig("drag")[0], np.repeat(sheet.track[:1], 2, axis=0))
     (video,), _ = clip.clips(clip.shading(), [picture])
     assert np.array_equal(video[0], video[1])
-
-
-@pytest.mark.parametrize("view", [0, 1, 2])
-def test_the_silhouette_is_that_of_cycles(make_sheet: Callable[..., Any], view: int) -> None:
-    """The cloth shines by itself before black in Cycles: what a pixel then has of its light is its coverage."""
-    from stickslip_blender.cycles.engine import Sampling
-
-    sheet = make_sheet(17)
-    renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
-    stage, geometry = renderer.scene, renderer.geometry
-    camera: Camera = load_rig("drag")[view]
-    renderer.clip(ClothDragRender.model_validate(LOOK), camera, sheet.track[[2, 2]])
-    shot = stage.shot(sheet.track[2].astype(np.float64), 2)
-    light = _glowing(stage, shot, Sampling(samples=256))
-    renderer.close()
-    window = window_about(projected(camera, shot.points[: geometry.cloth_vertices]), camera, 2)
-    coverage = see(projected(camera, shot.points), geometry.triangles, window).share_below(geometry.cloth_triangles)
-    error = np.abs(light[window.slices][..., 0] - coverage)
-    edge = (coverage > 0.0) & (coverage < 1.0)
-    assert edge.sum() > 200
-    assert error[edge].mean() < 0.025  # 256 random samples: 0.02 by chance
-    assert error.mean() < 0.002
-    assert (light[window.slices][..., 0] - coverage).mean() == pytest.approx(0.0, abs=5e-4)
-
-
-def _glowing(stage: Any, shot: Any, sampling: Any) -> npt.NDArray[np.float32]:
-    from stickslip_blender.cycles.blender import import_bpy
-
-    data = import_bpy().data
-    tree = data.materials["fabric"].node_tree
-    glow = tree.nodes.new("ShaderNodeEmission")
-    glow.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    tree.links.new(glow.outputs["Emission"], tree.nodes["Material Output"].inputs["Surface"])
-    data.objects["lamp"].hide_render = True
-    data.objects["floor"].hide_render = True
-    for prop in ("holder-1", "holder-2"):
-        black = data.materials[prop].node_tree.nodes["Principled BSDF"]
-        black.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-        black.inputs["Specular IOR Level"].default_value = 0.0
-    return np.asarray(stage.direct(shot, np.full((8, 8, 3), 255, np.uint8), sampling), dtype=np.float32)
 
 
 def test_the_stage_is_dark_and_the_cloth_is_not(renderer: ClothRenderer, sheet: Any) -> None:
@@ -185,3 +147,43 @@ def test_what_is_not_the_cloth_is_refused(renderer: ClothRenderer, sheet: Any) -
         renderer.clip(look, camera, sheet.track[:, 1:])
     with pytest.raises(ValueError, match="positions must be finite"):
         renderer.clip(look, camera, sheet.track * np.nan)
+
+
+@pytest.mark.parametrize("view", [0, *(pytest.param(view, marks=pytest.mark.slow) for view in (1, 2))])
+def test_the_silhouette_is_that_of_cycles(make_sheet: Callable[..., Any], view: int) -> None:
+    """The cloth shines by itself before black in Cycles: what a pixel then has of its light is its coverage."""
+    from stickslip_blender.cycles.engine import Sampling
+
+    sheet = make_sheet(17)
+    renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
+    stage, geometry = renderer.scene, renderer.geometry
+    camera: Camera = load_rig("drag")[view]
+    renderer.clip(ClothDragRender.model_validate(LOOK), camera, sheet.track[[2, 2]])
+    shot = stage.shot(sheet.track[2].astype(np.float64), 2)
+    light = _glowing(stage, shot, Sampling(samples=256))
+    renderer.close()
+    window = window_about(projected(camera, shot.points[: geometry.cloth_vertices]), camera, 2)
+    coverage = see(projected(camera, shot.points), geometry.triangles, window).share_below(geometry.cloth_triangles)
+    error = np.abs(light[window.slices][..., 0] - coverage)
+    edge = (coverage > 0.0) & (coverage < 1.0)
+    assert edge.sum() > 200
+    assert error[edge].mean() < 0.025  # 256 random samples: 0.02 by chance
+    assert error.mean() < 0.002
+    assert (light[window.slices][..., 0] - coverage).mean() == pytest.approx(0.0, abs=5e-4)
+
+
+def _glowing(stage: Any, shot: Any, sampling: Any) -> npt.NDArray[np.float32]:
+    from stickslip_blender.cycles.blender import import_bpy
+
+    data = import_bpy().data
+    tree = data.materials["fabric"].node_tree
+    glow = tree.nodes.new("ShaderNodeEmission")
+    glow.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    tree.links.new(glow.outputs["Emission"], tree.nodes["Material Output"].inputs["Surface"])
+    data.objects["lamp"].hide_render = True
+    data.objects["floor"].hide_render = True
+    for prop in ("holder-1", "holder-2"):
+        black = data.materials[prop].node_tree.nodes["Principled BSDF"]
+        black.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+        black.inputs["Specular IOR Level"].default_value = 0.0
+    return np.asarray(stage.direct(shot, np.full((8, 8, 3), 255, np.uint8), sampling), dtype=np.float32)
