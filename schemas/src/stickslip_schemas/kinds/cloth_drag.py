@@ -9,12 +9,19 @@ from stickslip_schemas.base.document import Float
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, forces, mesh_arrays, physical_arrays, solver_arrays
 from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, DragSceneSpec, LampAxis, ViewpointAxis
-from stickslip_schemas.kinds.cloth.names import Custom, Substrate, SubstrateAxis, TextureAxis
-from stickslip_schemas.kinds.cloth.spec import PHYSICAL_AXES, SELF_FRICTION, ClothAxes, ClothRender, ClothSimulation
+from stickslip_schemas.kinds.cloth.names import Custom, Substrate, SubstrateAxis, TextureAxis, definitions
+from stickslip_schemas.kinds.cloth.spec import (
+    PHYSICAL_AXES,
+    SELF_FRICTION,
+    ClothAxes,
+    ClothRender,
+    ClothSimulation,
+    seed_rules,
+)
 from stickslip_schemas.spec.appearance import FloorNumbers
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.fabrics import CustomName
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
 
 class ClothDragAxes(ClothAxes):
@@ -46,11 +53,7 @@ class ClothDragSpec(DragSceneSpec):
 
     simulation_type = ClothDragSimulation
     render_type = ClothDragRender
-    simulation_seeds = (SeedRule("seed", "bias", PHYSICAL_AXES),)
-    render_seeds = (
-        SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint", "lighting", "substrate")),
-        SeedRule("crease_seed", "creases", PHYSICAL_AXES),
-    )
+    simulation_seeds, render_seeds = seed_rules(PHYSICAL_AXES, "viewpoint", "lighting", "substrate")
     custom = DragSceneSpec.custom | {"substrate": Custom("substrates", "finish", tuple(Substrate))}
 
     kind: Literal["cloth_drag"]
@@ -64,12 +67,7 @@ class ClothDragSpec(DragSceneSpec):
             "x-cost": "1.1 to 1.2 times the CPU time of null, up to 1.7 times where the cloth folds over itself"
         },
     )
-    substrates: dict[CustomName, FloorNumbers] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="custom floors, by the names that the axis `substrate` uses",
-        json_schema_extra={"additionalProperties": False},
-    )
+    substrates: dict[CustomName, FloorNumbers] = definitions("floors", "substrate")
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:

@@ -22,10 +22,11 @@ from stickslip_schemas.kinds.cloth.spec import (
     ClothRender,
     ClothSimulation,
     MuAxis,
+    seed_rules,
 )
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
 
 class ClothOnClothAxes(ClothAxes):
@@ -65,11 +66,7 @@ class ClothOnClothSpec(DragSceneSpec):
 
     simulation_type = ClothOnClothSimulation
     render_type = ClothOnClothRender
-    simulation_seeds = (SeedRule("seed", "bias", _PHYSICAL_AXES),)
-    render_seeds = (
-        SeedRule("light_seed", "light", (*_PHYSICAL_AXES, "viewpoint", "lighting")),
-        SeedRule("crease_seed", "creases", _PHYSICAL_AXES),
-    )
+    simulation_seeds, render_seeds = seed_rules(_PHYSICAL_AXES, "viewpoint", "lighting")
     custom = DragSceneSpec.custom | {"substrate_material": Custom("materials", "substrate_fabric", tuple(Material))}
 
     kind: Literal["cloth_on_cloth"]

@@ -21,11 +21,11 @@ from stickslip_schemas.kinds.cloth.spec import (
     ClothSimulation,
     ClothSpec,
     MuAxis,
+    seed_rules,
 )
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, name_schema
-from stickslip_schemas.spec.jobs import SeedRule
 
 AngularSpeed = Annotated[
     float,
@@ -83,11 +83,7 @@ class ClothSphereSpec(ClothSpec):
 
     simulation_type = ClothSphereSimulation
     render_type = ClothSphereRender
-    simulation_seeds = (SeedRule("seed", "bias", (*PHYSICAL_AXES, "angular_speed")),)
-    render_seeds = (
-        SeedRule("light_seed", "light", (*PHYSICAL_AXES, "angular_speed", "viewpoint")),
-        SeedRule("crease_seed", "creases", (*PHYSICAL_AXES, "angular_speed")),
-    )
+    simulation_seeds, render_seeds = seed_rules((*PHYSICAL_AXES, "angular_speed"), "viewpoint")
     instants = 150
     instants_per_second = 15.0
     rig = "sphere-3"

@@ -22,11 +22,12 @@ from stickslip_schemas.kinds.cloth.spec import (
     ClothSimulation,
     ClothSpec,
     MuAxis,
+    seed_rules,
 )
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, name_schema
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
 BONES, SKIN_VERTICES, SKIN_TRIANGLES = 5, 1442, 2880
 """Of the figure, as the simulation core makes it; a contract test compares the numbers."""
@@ -87,11 +88,7 @@ class ShawlSpec(ClothSpec):
 
     simulation_type = ShawlSimulation
     render_type = ShawlRender
-    simulation_seeds = (SeedRule("seed", "bias", _PHYSICAL_AXES),)
-    render_seeds = (
-        SeedRule("light_seed", "light", (*_PHYSICAL_AXES, "viewpoint")),
-        SeedRule("crease_seed", "creases", _PHYSICAL_AXES),
-    )
+    simulation_seeds, render_seeds = seed_rules(_PHYSICAL_AXES, "viewpoint")
     instants = 150
     instants_per_second = 15.0
     rig = "shawl-3"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, Lighting, LightingAxis
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, Lighting, LightingAxis, definitions
 from stickslip_schemas.kinds.cloth.spec import ClothSpec
 from stickslip_schemas.spec.appearance import LampNumbers
 from stickslip_schemas.spec.arrays import array
@@ -61,12 +61,7 @@ class DragSceneSpec(ClothSpec):
         "lighting": Custom("lamps", "lamp", tuple(Lighting)),
     }
 
-    lamps: dict[CustomName, LampNumbers] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="custom lamps, by the names that the axis `lighting` uses",
-        json_schema_extra={"additionalProperties": False},
-    )
+    lamps: dict[CustomName, LampNumbers] = definitions("lamps", "lighting")
 
 
 DROP_LABELS = (

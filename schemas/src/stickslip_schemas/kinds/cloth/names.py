@@ -71,30 +71,27 @@ CUSTOM_LOOKS = {
 """What specs of all kinds of cloth may add: see `NamingSpec.custom`."""
 
 
+def definitions(what: str, axis: str, more: str = "", *, at_most: int | None = 64) -> Any:
+    """Return the field of a spec that defines custom names of an axis."""
+    return Field(
+        default_factory=dict,
+        max_length=at_most,
+        description=f"custom {what}, by the names that the axis `{axis}` uses{more}",
+        json_schema_extra={"additionalProperties": False},
+    )
+
+
 class NamingSpec(JobSpec):
     """A spec whose axes of names take custom names, which the spec defines."""
 
     custom: ClassVar[Mapping[str, Custom]]
     """By axis of names, what the user may add to it."""
 
-    materials: dict[CustomName, FabricNumbers] = Field(
-        default_factory=dict,
-        description="custom fabrics, by the names that the axis `material` uses",
-        json_schema_extra={"additionalProperties": False},
+    materials: dict[CustomName, FabricNumbers] = definitions("fabrics", "material", at_most=None)
+    textures: dict[CustomName, ArtifactRef] = definitions(
+        "textures", "texture", ": `sha256:` and the digest that `stickslip upload` prints"
     )
-    textures: dict[CustomName, ArtifactRef] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="custom textures, by the names that the axis `texture` uses: `sha256:` and the digest that "
-        "`stickslip upload` prints",
-        json_schema_extra={"additionalProperties": False},
-    )
-    viewpoints: dict[CustomName, Calibration] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="custom cameras, by the names that the axis `viewpoint` uses",
-        json_schema_extra={"additionalProperties": False},
-    )
+    viewpoints: dict[CustomName, Calibration] = definitions("cameras", "viewpoint")
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         """Return the fields that a value of an axis sets: what the user has defined brings its numbers along."""

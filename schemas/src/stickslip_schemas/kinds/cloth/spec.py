@@ -14,7 +14,7 @@ from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, shown_f
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.spec.fabrics import FabricNumbers
-from stickslip_schemas.spec.jobs import PresetName, Quality, Render, Simulation
+from stickslip_schemas.spec.jobs import PresetName, Quality, Render, SeedRule, Simulation
 
 Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
 Factor = Annotated[
@@ -56,6 +56,12 @@ class ClothAxes(Document):
 
 PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
 """The axes that a trajectory of dragged cloth depends on."""
+
+
+def seed_rules(physical: tuple[str, ...], *seen: str) -> tuple[tuple[SeedRule, ...], tuple[SeedRule, ...]]:
+    """Return the seeds of simulations and of renders, from the physical axes and those of what is seen."""
+    light = SeedRule("light_seed", "light", (*physical, *seen))
+    return (SeedRule("seed", "bias", physical),), (light, SeedRule("crease_seed", "creases", physical))
 
 
 class ClothSimulation(Simulation):
