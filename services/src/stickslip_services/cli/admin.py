@@ -14,10 +14,9 @@ import typer
 from rich.markup import escape
 
 from stickslip_services.access.scopes import Scope
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, require_server, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
-from stickslip_services.installed import require_server
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection

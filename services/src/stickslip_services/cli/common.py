@@ -2,6 +2,7 @@
 
 import json
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +10,8 @@ import typer
 from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
+
+from stickslip_services.errors import ServerNotInstalledError
 
 UrlOption = Annotated[str, typer.Option("--url", envvar="STICKSLIP_URL", help="where the coordinator is")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
@@ -22,6 +25,7 @@ StoreOption = Annotated[
 ]
 DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
 DEFAULT_DATA = Path("stickslip-data")
+_SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
 
 
@@ -49,3 +53,13 @@ def table(*columns: str, no_wrap: tuple[str, ...] = ()) -> Table:
     for column in columns:
         made.add_column(column, overflow="fold", no_wrap=column in no_wrap)
     return made
+
+
+def require_server() -> None:
+    """Raise ServerNotInstalledError if a package of the server is missing."""
+    missing = [name for name in _SERVER_MODULES if find_spec(name) is None]
+    if missing:
+        raise ServerNotInstalledError(
+            f"this command needs the server, and {', '.join(missing)} is not installed: "
+            "pip install 'stickslip-services[server]'"
+        )

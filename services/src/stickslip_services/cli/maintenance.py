@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, say
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, require_server, say
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.errors import CommandError, DatabaseRefusedError
-from stickslip_services.installed import require_server
 
 if TYPE_CHECKING:
     from stickslip_schemas.store import Store

@@ -18,11 +18,11 @@ from stickslip_services.cli.common import (
     UrlOption,
     console,
     print_json,
+    require_server,
     table,
 )
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.http import Client
-from stickslip_services.installed import require_server
 from stickslip_services.units import duration
 
 if TYPE_CHECKING:
