@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_training.arrays import Array, Floats, SingleFloats
-from stickslip_training.cloth.crop import stage
+from stickslip_training.cloth.crop import holder_path
 from stickslip_training.cloth.runs import Runs
 from stickslip_training.cloth.video import RATE
 
@@ -23,7 +23,7 @@ def meshes_at(run: Runs, seconds: Array) -> SingleFloats:
     share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)[:, None, None, None]
 
     def moved(instants: Array) -> Floats:
-        x, z = stage(instants)
+        x, z = holder_path(instants)
         return np.stack([x, np.zeros(len(x)), z], axis=-1)[:, None, None]
 
     first, second = (run.positions[0, frame] - moved(known[frame]) for frame in (after - 1, after))

@@ -88,5 +88,5 @@ def test_both_a_time_and_epochs_is_a_mistake(rods, tmp_path):
 def test_a_device_that_torch_cannot_use_is_said_in_a_line(rods, tmp_path):
     result = runner.invoke(app, ["curvature", str(rods.root), "--out", str(tmp_path / "out"), "--device", "cuda"])
     assert result.exit_code == 1
-    assert "device must be one that this torch can use" in result.output
+    assert "device must be one that torch can use here" in result.output
     assert "Traceback" not in result.output

@@ -7,7 +7,7 @@ import pytest
 import torch
 from stickslip_training.cli import app
 from stickslip_training.cloth.clips import render_clips
-from stickslip_training.cloth.fabric import FABRIC, fabric_numbers, score_fabric, told_fabric
+from stickslip_training.cloth.fabric import FABRIC, fabric_intervals, fabric_numbers, score_fabric
 from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
 from stickslip_training.cloth.model import load_friction, save_friction
 from stickslip_training.cloth.nets import PosteriorNet
@@ -80,7 +80,7 @@ def test_scores_of_known_histograms():
     assert found.guess.value == pytest.approx(np.log(10) * 0.2 / 4, rel=0.05)  # the materials' mean is known, not more
     assert found.coverage.value == pytest.approx(0.8, abs=0.03)
     assert found.width.value == pytest.approx(np.log(10) * 2 * 1.2816 * deviation, rel=0.05)
-    told = told_fabric((LENGTH,), {LENGTH.name: histogram})[LENGTH.name]
+    told = fabric_intervals((LENGTH,), {LENGTH.name: histogram})[LENGTH.name]
     assert told[0]["low"] < told[0]["median"] < told[0]["high"]
     assert told[5]["median"] == pytest.approx(10 ** seen[5], rel=0.02)
 

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 from stickslip_training.cli import app
-from stickslip_training.cli.cloth import SHARES
 from stickslip_training.cloth.calibration import covering_temperature, likeliest_temperatures
-from stickslip_training.cloth.clips import INSTANTS, Clips, RenderedClips, clips_of_file, jittered, render_clips
+from stickslip_training.cloth.clips import INSTANTS, SHARES, Clips, RenderedClips, clips_of_file, jittered, render_clips
 from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
 from stickslip_training.cloth.model import WEIGHTS, load_friction, save_friction
 from stickslip_training.cloth.posterior import MU_BINS

@@ -3,7 +3,7 @@ import pytest
 import torch
 from stickslip_testing.cameras import looking_at
 from stickslip_training.cloth.clips import INSTANTS, frames_at, training_cameras
-from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, stage
+from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
 from stickslip_training.cloth.render import (
     POINTS,
     _refined,
@@ -64,8 +64,8 @@ def test_what_is_nearer_hides_what_is_behind():
         assert (seen == expected).float().mean() > 0.99
 
 
-def test_the_stage_moves_as_the_simulations_say(runs):
-    x, z = stage(runs.instants)
+def test_the_holders_move_as_in_the_simulations(runs):
+    x, z = holder_path(runs.instants)
     held = runs.positions[:, :, -1, [0, -1]].mean(axis=2)
     expected = torch.stack([x, torch.zeros_like(x), z], dim=-1).numpy()
     assert np.abs(held - expected).max() < 3e-5
@@ -86,7 +86,7 @@ def test_crops_of_a_picture_are_what_is_rendered_into_them(runs, camera):
     assert (solid[0] & solid[1]).sum() / (solid[0] | solid[1]).sum() > 0.97
 
 
-def test_turning_a_camera_turns_it_about_the_stage():
+def test_turning_a_camera_turns_it_about_the_scene():
     cameras = Cameras.of(RIG)
     still = turned(cameras, torch.zeros(3), torch.zeros(3))
     torch.testing.assert_close(still.rotation, cameras.rotation)

@@ -1,1 +1,1 @@
-"""Named test sets that anybody can enter: what they are, how entries are scored, and the table of results."""
+"""Named test sets that are open to all: their identity, the scores of entries, and the table of results."""

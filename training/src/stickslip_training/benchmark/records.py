@@ -52,11 +52,11 @@ def enter(
     name: str, answers: Path, dataset: str, *, method: str, by: str, trained_on: str, link: str | None = None
 ) -> Record:
     """Score a file of answers to the test set `name`; raise ValueError where the dataset is not that set."""
-    told, digest = read_answers(answers)
+    answered, digest = read_answers(answers)
     chosen = load_set(name)
     with DatasetReader(dataset) as reader:
         slots, making = chosen.check(reader)
-        scores = chosen.task.score(reader, slots, told)
+        scores = chosen.task.score(reader, slots, answered)
         manifest = reader.manifest_digest
     return Record(
         set=name,

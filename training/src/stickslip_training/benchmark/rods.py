@@ -57,14 +57,14 @@ class RodTask(Task):
 
     def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
         truth, gamma = _truth(reader, slots), reader.label("gamma")[slots]
-        told, weights = _parsed(answers, slots, truth.shape[1])
+        estimated, weights = _parsed(answers, slots, truth.shape[1])
         found = {}
         for place, noise in enumerate(NOISES):
             given = np.isfinite(weights[place])
             found[f"{noise:g}"] = {
                 "rods": len(slots),
-                "failed": int(np.isnan(told[place, :, 0]).sum()),
-                "bending": _quantiles(relative_rms_error(told[place], truth)),
+                "failed": int(np.isnan(estimated[place, :, 0]).sum()),
+                "bending": _quantiles(relative_rms_error(estimated[place], truth)),
                 "gamma": _quantiles(np.abs(weights[place] / gamma - 1.0)) if given.any() else None,
             }
         return found
@@ -93,7 +93,7 @@ def _noisy(centerline: Array) -> SingleFloats:
 def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Floats, Floats]:
     """Return |kappa| L, (noises, rods, points), and gamma, (noises, rods); NaN where a method gives none."""
     rows = {int(slot): row for row, slot in enumerate(slots)}
-    told, gamma = np.full((len(NOISES), len(slots), points), np.nan), np.full((len(NOISES), len(slots)), np.nan)
+    estimated, gamma = np.full((len(NOISES), len(slots), points), np.nan), np.full((len(NOISES), len(slots)), np.nan)
     answered = np.zeros(gamma.shape, dtype=bool)
     for place, answer in enumerate(answers):
         try:
@@ -116,7 +116,7 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
         if values is not None:
             if values.shape != (points,) or not (np.isfinite(values).all() and (values >= 0).all()):
                 raise ValueError(f"bending of answer {place} must be {points} finite numbers of 0 or more, or null")
-            told[where] = values
+            estimated[where] = values
         if weight is not None:
             if not 0 < weight < np.inf:
                 raise ValueError(f"gamma of answer {place} must be more than 0 and finite, and is {weight}")
@@ -127,7 +127,7 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
             f"every slot of the test set must be answered at every noise, and {(~answered).sum()} are not, "
             f"{slots[row]} at {NOISES[noise]:g} first"
         )
-    return told, gamma
+    return estimated, gamma
 
 
 def _quantiles(errors: Floats) -> dict[str, Any]:

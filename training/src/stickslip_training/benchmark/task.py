@@ -18,7 +18,7 @@ class Task(ABC):
 
     @abstractmethod
     def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
-        """Return what the spec says of slots: plain values that every making of the set has to the last bit."""
+        """Return the labels of slots that follow from the spec: plain values, with equal bits in every making."""
 
     @abstractmethod
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:

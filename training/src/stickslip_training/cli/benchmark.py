@@ -1,4 +1,4 @@
-"""The commands `stickslip-train benchmark ...`: named test sets that anybody can enter."""
+"""The commands `stickslip-train benchmark ...`: named test sets that are open to all."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from stickslip_schemas.store import write_durably
 
-from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 
 benchmark = typer.Typer(no_args_is_help=True, help="Named test sets: enter yours, and compare.")
@@ -36,7 +36,7 @@ def spec(name: SetArgument) -> None:
     """Print the spec of a test set, for `stickslip submit`."""
     from stickslip_training.benchmark.sets import load_set
 
-    with errors_told():
+    with readable_errors():
         typer.echo(json.dumps(load_set(name).spec, indent=2))
 
 
@@ -45,7 +45,7 @@ def check(name: SetArgument, dataset: DatasetArgument) -> None:
     """Say whether a dataset is the test set, and which making of it."""
     from stickslip_training.benchmark.sets import load_set
 
-    with errors_told(), DatasetReader(dataset) as reader:
+    with readable_errors(), DatasetReader(dataset) as reader:
         slots, making = load_set(name).check(reader)
     typer.echo(f"{dataset} is {name}, {making}: {len(slots)} samples to answer")
 
@@ -61,7 +61,7 @@ def inputs(
 
     from stickslip_training.benchmark.sets import load_set
 
-    with errors_told(), DatasetReader(dataset) as reader:
+    with readable_errors(), DatasetReader(dataset) as reader:
         chosen = load_set(name)
         given = chosen.task.inputs(reader, chosen.check(reader)[0])
         with out.open("wb") as file:
@@ -84,7 +84,7 @@ def score(
     """Score a file of predictions on a test set; the dataset is compared with the set first."""
     from stickslip_training.benchmark.records import enter, table
 
-    with errors_told():
+    with readable_errors():
         entry = enter(name, predictions, dataset, method=method, by=by, trained_on=trained_on, link=link)
         if record is not None:
             entry.write(record)
@@ -99,7 +99,7 @@ def table_(
     """Print the tables of records, best first, or put them into a page."""
     from stickslip_training.benchmark.records import read_record, table, with_tables
 
-    with errors_told():
+    with readable_errors():
         read = [read_record(path) for path in records]
         if page is not None:
             write_durably(page, with_tables(page.read_text(encoding="utf-8"), read).encode())

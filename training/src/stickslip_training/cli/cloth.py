@@ -9,14 +9,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import DatasetArgument, check_device, errors_told
+from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
-    from stickslip_training.cloth.clips import RenderedClips
     from stickslip_training.cloth.evaluation import Errors, Scores
     from stickslip_training.cloth.fabric import FabricErrors
-    from stickslip_training.cloth.runs import Runs
 
 cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
 
@@ -24,9 +22,6 @@ RunsArgument = Annotated[
     str, typer.Argument(metavar="RUNS", help="a dataset that stores positions, or a packed file of simulations (.npz)")
 ]
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.safetensors of `cloth train`")]
-
-SHARES = (0.12, 0.25)
-"""Of the simulations of a packed file, for validation and test; a dataset has splits of its own."""
 
 
 @cloth.command()
@@ -49,9 +44,10 @@ def train(
     rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
-    """Train a network that tells material and friction, on pictures rendered from simulations while it trains."""
+    """Train a network that estimates material and friction, on pictures rendered from simulations while it trains."""
     from stickslip_schemas.base.keys import sha256
 
+    from stickslip_training.cloth.clips import training_clips, training_runs
     from stickslip_training.cloth.learner import ClothTraining, train_friction
     from stickslip_training.cloth.model import load_friction, save_friction
     from stickslip_training.engine.fit import EpochReport
@@ -59,22 +55,22 @@ def train(
 
     console = Console()
 
-    def tell(epoch: EpochReport) -> None:
+    def show(epoch: EpochReport) -> None:
         validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
-    with errors_told(), joined(check_device(device)) as own_device:
+    with readable_errors(), joined(device) as own_device:
         settings = ClothTraining(
             steps=steps, learning_rate=rate, fabric=fabric, seed=seed, threads=threads, device=own_device
         )
         first = None if start is None else load_friction(start)
         if first is not None and bool(first.quantities) == fabric:
-            # The order of mu is known: the labels are as sharp as at the end of training.
+            # The network knows the order of mu: its targets are as narrow as at the end.
             settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
-        source, parts = _splits(runs, split_seed)
+        source, parts = training_runs(runs, split_seed)
         source["split_seed"] = split_seed
         source["start"] = None if start is None else sha256(start.read_bytes())
-        source["clips"], rendered = _clips(clips, runs, parts["train"], split_seed) if clips else (None, None)
+        source["clips"], rendered = training_clips(clips, runs, parts["train"], split_seed) if clips else (None, None)
         model = train_friction(
             parts["train"],
             parts["validation"],
@@ -84,7 +80,7 @@ def train(
             out=out,
             identity=source,
             resume=resume,
-            on_epoch=tell,
+            on_epoch=show,
         )
         if not current_rank().is_first:
             return
@@ -104,19 +100,19 @@ def evaluate(
     seed: Annotated[int, typer.Option(help="of the looks of clips of a packed file")] = 99,
     split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
 ) -> None:
-    """Measure how good a model is on simulations that it has not seen, and write a page about it."""
+    """Measure the errors of a model on simulations that it was not trained on, and write a page about them."""
     import numpy as np
 
-    from stickslip_training.cloth.clips import read_clips, render_clips
+    from stickslip_training.cloth.clips import read_clips, render_clips, training_runs
     from stickslip_training.cloth.evaluation import predictions, score
     from stickslip_training.cloth.fabric import score_fabric
     from stickslip_training.cloth.model import load_friction
     from stickslip_training.cloth.report import write_html
 
-    with errors_told():
+    with readable_errors():
         friction = load_friction(model)
         if runs.endswith(".npz"):
-            source, parts = _splits(runs, split_seed)
+            source, parts = training_runs(runs, split_seed)
             clips, slots = render_clips(parts[_split(split)].named(friction.materials), renders, seed), None
             notes = [
                 f"Pictures were rendered by the renderer that the network was trained with, {renders} a simulation."
@@ -165,10 +161,10 @@ def evaluate(
 
 @cloth.command("import")
 def import_(
-    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="of the stage, from before it starts on")],
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="of the drag scene, from before the holders move")],
     camera: Annotated[Path, typer.Option(help="the calibrated camera, TOML: see the README of training")],
     out: Annotated[Path, typer.Option(help="file for the clip (.npz), for `cloth predict`")],
-    start: Annotated[str, typer.Option(help="when the stage starts in the video [s], or auto")] = "auto",
+    start: Annotated[str, typer.Option(help="when the holders start in the video [s], or auto")] = "auto",
     holders: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
@@ -176,10 +172,10 @@ def import_(
         ),
     ] = None,
 ) -> None:
-    """Align a video with the drag scene in time, and register it to the holders."""
+    """Align a video of your own with the clock of the drag scene, and register it to the holders."""
     from stickslip_training.cloth.video import import_video, load_calibration, save_clip
 
-    with errors_told():
+    with readable_errors():
         try:
             began = None if start == "auto" else float(start)
         except ValueError as error:
@@ -188,7 +184,7 @@ def import_(
         crops, instants, found = import_video(video, calibration, start=began, holders=holders)
         save_clip(out, crops, instants, calibration, found)
     Console().print(
-        f"The stage starts at {found.start:.2f} s (the halves differ by {found.timing:.2f} s); the holders are "
+        f"The holders start at {found.start:.2f} s (the halves differ by {found.timing:.2f} s); the holders are "
         f"({found.offset[0]:+.1f}, {found.offset[1]:+.1f}) px from the calibration, the camera shakes by "
         f"{found.shake:.2f} px, the residual is {found.residual:.2f} px.\n{out}: {len(instants)} pictures",
         soft_wrap=True,
@@ -204,15 +200,14 @@ def predict(
     split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
-    """Predict material and friction of every clip of a dataset, or of a video, with the interval that holds mu
-    with 80 %."""
+    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of a video of your own."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
-    from stickslip_training.cloth.fabric import told_fabric
+    from stickslip_training.cloth.fabric import fabric_intervals
     from stickslip_training.cloth.model import WEIGHTS, load_friction
     from stickslip_training.cloth.video import load_clip
 
-    with errors_told():
+    with readable_errors():
         friction = load_friction(model or WEIGHTS)
         true: list[str] = []
         if dataset.endswith(".npz"):
@@ -228,7 +223,7 @@ def predict(
         answers = predictions(posterior, slots)
         for answer, far in zip(answers, ood_score.tolist(), strict=True):
             answer["ood_score"] = round(far, 3)
-        for name, intervals in told_fabric(friction.quantities, friction.fabric(clips)).items():
+        for name, intervals in fabric_intervals(friction.quantities, friction.fabric(clips)).items():
             for answer, interval in zip(answers, intervals, strict=True):
                 answer.setdefault("fabric", {})[name] = interval
     if as_json:
@@ -240,8 +235,8 @@ def predict(
     for place, answer in enumerate(answers):
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
-        told = f"{mu['low']:.2f} to {mu['high']:.2f}"
-        cells = [str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", told]
+        bounds = f"{mu['low']:.2f} to {mu['high']:.2f}"
+        cells = [str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
         table.add_row(*cells, *true[place : place + 1], _warning(answer))
     Console().print(table)
 
@@ -257,7 +252,7 @@ def score(
     from stickslip_training.cloth.clips import check_kind, truth_of_slots
     from stickslip_training.cloth.evaluation import score_predictions
 
-    with errors_told(), DatasetReader(dataset) as reader:
+    with readable_errors(), DatasetReader(dataset) as reader:
         check_kind(reader)
         slots = reader.slots(_split(split))
         scores = score_predictions(
@@ -268,59 +263,6 @@ def score(
 
 def _warning(answer: dict[str, Any]) -> str:
     return f"unlike the training clips: {answer['ood_score']:.1f} of 1" if answer["ood_score"] > 1 else ""
-
-
-def _splits(source: str, seed: int) -> "tuple[dict[str, Any], dict[str, Runs]]":
-    """Return what names the runs, and the runs of each split."""
-    from stickslip_schemas.base.keys import sha256
-
-    from stickslip_training.cloth.clips import INSTANTS
-    from stickslip_training.cloth.runs import load_runs, runs_of_dataset, split_runs
-
-    if source.endswith(".npz"):
-        parts = split_runs(load_runs(source), SHARES, seed)
-        named: dict[str, Any] = {"runs": sha256(Path(source).read_bytes())}
-        return named, dict(zip(("train", "validation", "test"), parts, strict=True))
-    with DatasetReader(source) as reader:
-        named = {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}
-        missing = [split for split in ("train", "validation") if not len(reader.slots(_split(split)))]
-        if missing:
-            raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
-        splits = {
-            split: runs_of_dataset(reader, _split(split), INSTANTS)[0]
-            for split in ("train", "validation", "test")
-            if len(reader.slots(_split(split)))
-        }
-        return named, splits
-
-
-def _clips(sources: list[str], runs: str, train: "Runs", seed: int) -> "tuple[list[str], RenderedClips]":
-    """Return what names the clips, and those of the splits train and validation."""
-    import numpy as np
-    from stickslip_schemas.base.keys import sha256
-
-    from stickslip_training.cloth.clips import Clips, RenderedClips, clips_of_file, read_clips
-    from stickslip_training.cloth.runs import load_runs, split_of_runs
-
-    if not all(source.endswith(".npz") for source in sources):
-        if len(sources) > 1:
-            raise ValueError(f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}")
-        with DatasetReader(sources[0]) as reader:
-            learned, judged = (read_clips(reader, _split(part), train.materials)[0] for part in ("train", "validation"))
-            # Simulations have numbers by split.
-            return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
-    if not runs.endswith(".npz"):
-        raise ValueError(f"runs must be the packed file that the clips are of, and are {runs}")
-    split = split_of_runs(load_runs(runs), SHARES, seed)
-    files = []
-    for source in sources:
-        shown, _ = clips_of_file(Path(source), train.materials)
-        if shown.run.max() >= len(split) or (split[shown.run] == 2).any():
-            raise ValueError(f"{source} must not show simulations to test with: it has some of the test split")
-        files.append(shown)
-    known = Clips.joined(files)
-    learned, judged = (known[np.flatnonzero(split[known.run] == part)] for part in (0, 1))
-    return [sha256(Path(source).read_bytes()) for source in sources], RenderedClips(learned, judged)
 
 
 def _split(name: str) -> Any:
@@ -344,8 +286,8 @@ def _fabric(found: "dict[str, FabricErrors]") -> Table:
 
 def _scores(scores: "Scores") -> Table:
     top = "" if scores.top_1 is None else f"Material: {scores.top_1.value:.1%} right. "
-    told = f"{scores.blind.clips} clips of {scores.blind.simulations} simulations"
-    table = Table(title=told, caption=f"{top}In brackets: 90 % intervals over simulations.", caption_justify="left")
+    title = f"{scores.blind.clips} clips of {scores.blind.simulations} simulations"
+    table = Table(title=title, caption=f"{top}In brackets: 90 % intervals over simulations.", caption_justify="left")
     table.add_column("")
     for title in ("mean error", "< 0.1", "< 0.2", "in 80 %"):
         table.add_column(title, justify="right")

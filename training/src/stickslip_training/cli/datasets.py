@@ -14,7 +14,7 @@ from rich.table import Table
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import SPLITS
 
-from stickslip_training.cli.errors import DatasetArgument, errors_told
+from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
 from stickslip_training.export import huggingface, meshes, webdataset
@@ -28,7 +28,7 @@ def info(
     verify: Annotated[bool, typer.Option("--verify", help="check the SHA-256 of every file first")] = False,
 ) -> None:
     """Say what is in a dataset."""
-    with errors_told(), DatasetReader(dataset, verify=verify) as reader:
+    with readable_errors(), DatasetReader(dataset, verify=verify) as reader:
         console = Console()
         manifest = reader.manifest
         facts = Table.grid(padding=(0, 2))
@@ -38,8 +38,8 @@ def info(
         counts = ", ".join(f"{manifest.split_counts.get(split, 0)} {split}" for split in SPLITS)
         facts.add_row("samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {counts}")
         reasons = Counter(str(rejection.reason) for rejection in reader.rejections())
-        told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
-        facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {told}" if told else ""))
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {counts}" if counts else ""))
         files = list(reader.files())
         size = _megabytes(sum(file.size for file in files))
         facts.add_row("files", f"{len(files)}, {size}" + (", verified" if verify else ""))
@@ -71,7 +71,7 @@ def coco(
     """Write frames and segments of cloth in COCO's format; the spec must ask for `ground_truth: [segmentation]`."""
     if split is not None and split not in SPLITS:
         raise typer.BadParameter(f"must be one of {', '.join(SPLITS)}; got {split!r}", param_hint="--split")
-    with errors_told(), DatasetReader(dataset) as reader:
+    with readable_errors(), DatasetReader(dataset) as reader:
         images, annotations = export_coco(reader, out, every=every, split=cast(Split | None, split))
         Console().print(f"{images} images, {annotations} segments in {out}")
 
@@ -107,7 +107,7 @@ def export(
         "--usd": to_usd,
         "--obj": to_obj,
     }
-    with errors_told():
+    with readable_errors():
         given = {option: path for option, path in targets.items() if path is not None}
         if len(given) != 1:
             raise ValueError(f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}")

@@ -14,20 +14,8 @@ DatasetArgument = Annotated[
 ]
 
 
-def check_device(name: str) -> str:
-    """Return the name of a device of torch; raise ValueError where this torch cannot use it."""
-    import torch
-
-    try:
-        torch.empty(0, device=name)
-    except (AssertionError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"device must be one that this torch can use, such as cpu; {name!r}: {reason}") from error
-    return name
-
-
 @contextmanager
-def errors_told() -> Iterator[None]:
+def readable_errors() -> Iterator[None]:
     """Turn what a user can do something about into one line and the exit status 1."""
     try:
         yield

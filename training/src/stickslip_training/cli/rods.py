@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import DatasetArgument, check_device, errors_told
+from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
@@ -40,17 +40,17 @@ def curvature(
     from stickslip_training.rods.curvature import CurvatureTraining, train_curvature
 
     console = Console()
-    told = -math.inf
+    shown_at = -math.inf
 
-    def tell(epoch: EpochReport) -> None:
-        nonlocal told
-        if epoch.seconds < told + _SECONDS_BETWEEN_LINES:
+    def show(epoch: EpochReport) -> None:
+        nonlocal shown_at
+        if epoch.seconds < shown_at + _SECONDS_BETWEEN_LINES:
             return
-        told = epoch.seconds
+        shown_at = epoch.seconds
         validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
         console.print(f"epoch {epoch.epoch}: loss {epoch.train_loss:.3f}{validation} rad, {epoch.seconds:.0f} s")
 
-    with errors_told():
+    with readable_errors():
         config = CurvatureTraining(
             dataset=dataset,
             out=out,
@@ -60,9 +60,9 @@ def curvature(
             seed=seed,
             batch_size=batch_size,
             threads=threads,
-            device=check_device(device),
+            device=device,
         )
-        report = train_curvature(config, resume=resume, on_epoch=tell)
+        report = train_curvature(config, resume=resume, on_epoch=show)
         console.print(_results(report))
         for note in report.notes:
             console.print(f"Note: {note}")
@@ -99,10 +99,10 @@ def local_global(
 
     console = Console()
 
-    def tell(report: EpochReport) -> None:
+    def show(report: EpochReport) -> None:
         console.print(f"step {report.step}: loss {report.train_loss:.3f}, {report.seconds:.0f} s")
 
-    with errors_told():
+    with readable_errors():
         settings = LocalGlobalTraining(steps=steps, noise=noise, seed=seed, threads=threads)
         measured = None if reconstruction is None else ReconstructionNoise.load(reconstruction)
         with DatasetReader(dataset) as reader:
@@ -115,7 +115,7 @@ def local_global(
             reconstruction=measured,
             out=out,
             resume=resume,
-            on_epoch=tell,
+            on_epoch=show,
         )
         methods, loss = evaluate(net, test, noisy_test_centerline(test, judged_at, seed))
         save_local_global(out / "local-global.pt", net, settings)
@@ -174,7 +174,7 @@ def reconstruct(
     # Heavy, and not needed by the other commands.
     from stickslip_training.reconstruction.photographs import reconstruct_folder, write_results
 
-    with errors_told():
+    with readable_errors():
         result = reconstruct_folder(
             folder,
             calibration,

@@ -6,13 +6,14 @@ They are rendered from simulations (`render_clips`), or read from a dataset (`re
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.spec.cameras import Camera, load_rig
 
 from stickslip_training.arrays import Array, Floats, Integers
@@ -20,7 +21,7 @@ from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
-from stickslip_training.cloth.runs import Runs, landed_side
+from stickslip_training.cloth.runs import Runs, landed_side, load_runs, runs_of_dataset, split_of_runs, split_runs
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
 from stickslip_training.engine.fit import seed_of_step
@@ -42,6 +43,11 @@ CHUNK = 32
 
 TRAINING, VALIDATION = 0, 1
 """Streams of random numbers."""
+
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+
+SHARES = (0.12, 0.25)
+"""Of the simulations of a packed file, for validation and test."""
 
 _READ_CHUNK = 8  # clips of full pictures in memory at once
 
@@ -233,8 +239,50 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
     return clips, about
 
 
+def training_runs(source: str, seed: int) -> tuple[dict[str, Any], dict[Split, Runs]]:
+    """Return what identifies the simulations of a packed file (.npz) or of a dataset, and those of each split.
+
+    `seed` parts those of a packed file; a dataset has its own splits.
+    """
+    if source.endswith(".npz"):
+        parts = split_runs(load_runs(source), SHARES, seed)
+        return {"runs": sha256(Path(source).read_bytes())}, dict(zip(SPLITS, parts, strict=True))
+    with DatasetReader(source) as reader:
+        named = {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}
+        splits = [split for split in SPLITS if len(reader.slots(split))]
+        if missing := [split for split in SPLITS[:2] if split not in splits]:
+            raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
+        return named, {split: runs_of_dataset(reader, split, INSTANTS)[0] for split in splits}
+
+
+def training_clips(sources: list[str], runs: str, train: Runs, seed: int) -> tuple[list[str], RenderedClips]:
+    """Return what identifies clips of the simulations `runs`, and the clips of the splits train and validation.
+
+    `sources` are one dataset, or files of the simulations of a packed file, which `seed` parts.
+    """
+    if not all(source.endswith(".npz") for source in sources):
+        if len(sources) > 1:
+            raise ValueError(f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}")
+        with DatasetReader(sources[0]) as reader:
+            learned, judged = (read_clips(reader, split, train.materials)[0] for split in SPLITS[:2])
+            # Simulations have numbers by split.
+            return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
+    if not runs.endswith(".npz"):
+        raise ValueError(f"runs must be the packed file that the clips are of, and are {runs}")
+    split = split_of_runs(load_runs(runs), SHARES, seed)
+    files = []
+    for source in sources:
+        shown, _ = clips_of_file(Path(source), train.materials)
+        if shown.run.max() >= len(split) or (split[shown.run] == 2).any():
+            raise ValueError(f"{source} must not show simulations to test with: it has some of the test split")
+        files.append(shown)
+    known = Clips.joined(files)
+    learned, judged = (known[np.flatnonzero(split[known.run] == part)] for part in (0, 1))
+    return [sha256(Path(source).read_bytes()) for source in sources], RenderedClips(learned, judged)
+
+
 def check_kind(reader: DatasetReader) -> None:
-    """Raise ValueError where the stage is not the one whose motion the crops know."""
+    """Raise ValueError for kinds other than the drag scene: crops follow the path of its holders."""
     if reader.kind != "cloth_drag":
         raise ValueError(f"kind of the dataset must be cloth_drag to measure friction: it is {reader.kind}")
 
@@ -242,8 +290,8 @@ def check_kind(reader: DatasetReader) -> None:
 def simulations(reader: DatasetReader, slots: Integers) -> Integers:
     """Return a number for each slot that is the same for the clips of one simulation: one fabric, mu and bias."""
     names = [name for name in ("material", "mu", "bias", "areal_density", "bending_rigidity") if name in reader.arrays]
-    told: list[Array] = [reader.label(name)[slots].reshape(len(slots), -1).astype(np.float64) for name in names]
-    return np.unique(np.concatenate(told, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    columns: list[Array] = [reader.label(name)[slots].reshape(len(slots), -1).astype(np.float64) for name in names]
+    return np.unique(np.concatenate(columns, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def truth_of_slots(reader: DatasetReader, slots: Integers) -> Truth:

@@ -1,9 +1,8 @@
 """The holder-registered crop: every frame is seen from where the two holders are, at one scale.
 
-The stage's motion is known, and so is the camera: the middle of the two holders lands on a known pixel, at a known
+The path of the holders is known, and so is the camera: the middle of the two holders lands on a known pixel, at a known
 depth. A crop puts that pixel at one place of the picture and shows `SCALE` pixels a metre at that depth, whatever the
-camera. What is off by a pixel or by a few parts of a thousand in a real recording is so taken out before a network sees
-it.
+camera. This removes errors of a pixel, or of a few parts of a thousand in scale, of a real recording.
 """
 
 from collections.abc import Sequence
@@ -89,7 +88,7 @@ class Crops:
         return (pixels - origin) * self.scale.reshape(*self.scale.shape, *extra, 1) + anchor
 
 
-def stage(instants: Sequence[int] | Array) -> tuple[torch.Tensor, torch.Tensor]:
+def holder_path(instants: Sequence[int] | Array) -> tuple[torch.Tensor, torch.Tensor]:
     """Return where the middle of the holders is at instants, of 2.4 a second and whole or not: x and z (F,) [m]
     [thesis, 4.2.3].
 
@@ -111,7 +110,7 @@ def stage(instants: Sequence[int] | Array) -> tuple[torch.Tensor, torch.Tensor]:
 
 def holder_crops(cameras: Cameras, instants: Sequence[int]) -> Crops:
     """Return where the crops of clips by `cameras` lie, at each of the instants."""
-    x, z = stage(instants)
+    x, z = holder_path(instants)
     middle = torch.stack([x, torch.zeros_like(x), z], dim=-1).expand(len(cameras.focal), -1, -1)
     origin, depth = cameras.project(middle)
     return Crops(origin, SCALE * depth / cameras.focal.mean(dim=1)[:, None])

@@ -1,7 +1,7 @@
-"""How good answers about friction are: the thesis's shares, and what it does not tell: calibration, bands, simulations.
+"""Scores of estimates of friction: the thesis's shares, calibration, bands of mu, and intervals over simulations.
 
-Clips of one simulation are not independent. Every uncertainty here is over simulations: those are drawn again with
-replacement [bootstrap], and all their clips with them.
+Clips of one simulation are not independent. So intervals are over simulations, which are drawn again with replacement
+[bootstrap] together with all their clips.
 """
 
 from collections.abc import Sequence
@@ -54,12 +54,12 @@ class Errors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """All results about the answers to some clips."""
+    """Scores of the answers to some clips."""
 
     blind: Errors
     """Material not known."""
     given: Errors | None
-    """Material known; None where the answers do not say what mu is then."""
+    """Material known; None where the answers have no mu for it."""
     top_1: Measure | None
     """Share of the clips whose likeliest material is the true one."""
     top_2: Measure | None
@@ -191,10 +191,10 @@ def score_predictions(answers: Sequence[Any], materials: Sequence[str], slots: S
     missing = sorted(set(slots) - set(found))
     if missing:
         raise ValueError(f"every slot of the test set must be answered, and {len(missing)} are not, {missing[0]} first")
-    told = Estimates(*np.array([found[slot][1] for slot in slots]).T)
-    inside = (told.low <= truth.mu) & (truth.mu <= told.high)
+    estimated = Estimates(*np.array([found[slot][1] for slot in slots]).T)
+    inside = (estimated.low <= truth.mu) & (truth.mu <= estimated.high)
     return _scores(
-        told,
+        estimated,
         np.array([found[slot][0] for slot in slots]),
         truth,
         given=None,

@@ -1,4 +1,4 @@
-"""Continuous numbers of a fabric, told as friction is: a histogram for each, over its decimal logarithm.
+"""Continuous numbers of a fabric, estimated as friction is: a histogram for each, over its decimal logarithm.
 
 With rho the mass per area, B the mean of the plate rigidities along warp and weft, and g gravity, a cloth bends under
 its weight over the length
@@ -6,8 +6,8 @@ its weight over the length
     L_gb = (B / (rho g))^(1/3)
 
 Inextensible cloth on a plane with dry friction moves the same for all rho and B of one L_gb and mu: forces are all in
-proportion to the weight. So a clip shows L_gb. It shows rho and B as far as stretching tells them, and as far as one
-fabric has another weight than the next.
+proportion to the weight. So a clip shows L_gb. It shows rho and B only as far as the cloth stretches, and as far
+as weights differ between fabrics.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def fabric_numbers(density: Array, rigidity: Array) -> Floats:
 
 
 def numbers_of_runs(about: list[dict[str, object]]) -> Floats:
-    """Return log10 of `FABRIC` of runs, (runs, 3), as `cloth_runs.py` tells them; NaN where it did not yet."""
+    """Return log10 of `FABRIC` of runs, (runs, 3), as `cloth_runs.py` writes them; NaN where they are missing."""
     unknown = float("nan")
     density = [run.get("areal_density", unknown) for run in about]
     rigidity = [run.get("bending_rigidity", [unknown] * 3) for run in about]
@@ -78,28 +78,30 @@ def score_fabric(
     """Compare histograms (clips, bins) of quantities with log10 of the truth, (clips, 3), clip by clip."""
     scale, found = float(np.log(10.0)), {}
     for quantity in quantities:
-        told = estimates(histograms[quantity.name], quantity.bins, SHARE)
+        estimated = estimates(histograms[quantity.name], quantity.bins, SHARE)
         true = truth[:, FABRIC.index(quantity)]
         guess = np.array([np.median(true[material == code]) for code in material])
         found[quantity.name] = FabricErrors(
             clips=len(true),
             simulations=len(np.unique(run)),
-            error=measure(scale * np.abs(told.median - true), run),
+            error=measure(scale * np.abs(estimated.median - true), run),
             guess=measure(scale * np.abs(guess - true), run),
-            coverage=measure(((told.low <= true) & (true <= told.high)).astype(float), run),
-            width=measure(scale * (told.high - told.low), run),
+            coverage=measure(((estimated.low <= true) & (true <= estimated.high)).astype(float), run),
+            width=measure(scale * (estimated.high - estimated.low), run),
         )
     return found
 
 
-def told_fabric(quantities: tuple[Quantity, ...], histograms: dict[str, Floats]) -> dict[str, list[dict[str, float]]]:
+def fabric_intervals(
+    quantities: tuple[Quantity, ...], histograms: dict[str, Floats]
+) -> dict[str, list[dict[str, float]]]:
     """Return median and shortest 80 % interval of each quantity, in its unit, for every clip."""
     found = {}
     for quantity in quantities:
-        told = estimates(histograms[quantity.name], quantity.bins, SHARE)
+        estimated = estimates(histograms[quantity.name], quantity.bins, SHARE)
         found[quantity.name] = [
             {"median": _rounded(median), "low": _rounded(low), "high": _rounded(high)}
-            for median, low, high in zip(told.median, told.low, told.high, strict=True)
+            for median, low, high in zip(estimated.median, estimated.low, estimated.high, strict=True)
         ]
     return found
 

@@ -61,8 +61,8 @@ class ClothTraining:
     averaging: float = 0.99
     """Decay of the running average over steps that is the model's weights."""
     smoothing: tuple[float, float] = (0.2, 0.02)
-    """Standard deviation of mu about the truth in the training labels, at the first and at the last step [1]: it
-    learns an order first, and at the end bins."""
+    """Standard deviation of the target histogram of mu at the first and at the last step [1]: wide targets teach the
+    order of mu first."""
     gap: float = 0.3
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
@@ -214,11 +214,11 @@ class FrictionLearner(Learner):
         rows = torch.arange(len(mu), device=device)
         given = log_mu[rows, material.to(device)]
         loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
-        for place, (quantity, told) in enumerate(zip(self.quantities, net.read_quantities(seen), strict=True)):
+        for place, (quantity, log_p) in enumerate(zip(self.quantities, net.read_quantities(seen), strict=True)):
             bins = quantity.bins
             wide = deviation * (bins.high - bins.low) / (MU_BINS.high - MU_BINS.low)
             centers = torch.from_numpy(bins.centers.astype(np.float32))
-            loss = loss - (_blurred(centers, fabric[:, place], wide).to(device) * told).sum(dim=1).mean()
+            loss = loss - (_blurred(centers, fabric[:, place], wide).to(device) * log_p).sum(dim=1).mean()
         return torch.as_tensor(loss)
 
     def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -245,15 +245,15 @@ class FrictionLearner(Learner):
         if self.clips is None:
             return rendered
         some = self.clips.train[random.integers(len(self.clips.train), size=count // 2)]
-        told = (
+        given = (
             jittered(some.crops, generator),
             some.direction,
             torch.from_numpy(some.material),
             torch.from_numpy(some.mu.astype(np.float32)),
             torch.from_numpy(some.fabric.astype(np.float32)),
         )
-        both = zip(rendered, told, strict=True)
-        a, b, c, d, e = (torch.cat([own[: count - len(some)], given]) for own, given in both)
+        both = zip(rendered, given, strict=True)
+        a, b, c, d, e = (torch.cat([first[: count - len(some)], second]) for first, second in both)
         return a, b, c, d, e
 
     def validate(self, net: nn.Module) -> float | None:

@@ -13,9 +13,9 @@ class PosteriorNet(nn.Module):
     """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and log p(mu | m), (B,
     M, K); with `quantities`, the bins of each, also to histograms of these: see `fabric`.
 
-    Every frame goes through the same four convolutions and keeps its places: what tells friction is where an edge lies,
-    to a part of a pixel. Frames are phase-locked to the stage, so each has a place of its own in the layer that joins
-    them.
+    Every frame goes through the same four convolutions and keeps its places: friction shows in
+    where an edge lies, to a part of a pixel. Frames are at fixed phases of the path of the holders, so each has a place
+    of its own in the layer that joins them.
     """
 
     def __init__(

@@ -116,7 +116,7 @@ def _blots(generator: torch.Generator) -> torch.Tensor:
 
 
 def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> Cameras:
-    """Turn cameras about the stage's middle by angles (B,) [rad]: about the vertical, and up."""
+    """Turn cameras about the middle of the drag scene by angles (B,) [rad]: about the vertical, and up."""
     middle = cameras.translation.new_tensor([0.15, 0.0, 0.05]).expand(len(azimuth), 3)
     seen = (cameras.rotation @ middle[..., None])[..., 0] + cameras.translation
     c, s, zero, one = torch.cos(azimuth), torch.sin(azimuth), torch.zeros_like(azimuth), torch.ones_like(azimuth)

@@ -23,8 +23,8 @@ STEP = 1e-5
 """Of the positions in a packed file [m]."""
 
 SLIDING = 60
-"""The instant, of 300, that tells the branch: on the first leg the free edge trails, or is pushed ahead of the
-holders."""
+"""The instant, of 300, at which the branch is read: on the first leg the free edge trails the holders, or is pushed
+ahead of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def _load(path: str | Path) -> Runs:
 def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
     """Return the simulations of a dataset that stores its meshes, and the slot of one sample of each.
 
-    Samples of one simulation are recognised by material, mu and the mesh at the last instant that is read.
+    Samples of one simulation have the same material, mu and the mesh at the last instant that is read.
     """
     for name in ("positions", "rest", "material", "mu"):
         if name not in reader.arrays:
@@ -181,7 +181,7 @@ def _landed(grid: SingleFloats) -> Integers:
 
 
 def _first(instants: tuple[int, ...]) -> int:
-    """Return the frame that tells the branch."""
+    """Return the frame at which the branch is read."""
     late = [frame for frame, instant in enumerate(instants) if instant >= SLIDING]
     return late[0] if late else len(instants) - 1
 

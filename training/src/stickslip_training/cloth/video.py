@@ -1,13 +1,13 @@
-"""A user's own video of the stage: its frames on the stage's clock, registered to the holders.
+"""Import of a user's video of the drag scene: clock and registration from the path of the holders.
 
-The stage moves the two holders on a known path, so they tell both clocks and cameras apart. Two small patches of cloth
-under the holders are followed through the video [Lucas and Kanade 1981]. With P the projection by the calibrated
+The path of the two holders is known, so it gives both the clock and the registration of the camera. Two small patches
+of cloth under the holders are tracked [Lucas and Kanade 1981]. With P the projection by the calibrated
 camera, h_c(t) the place of holder c on the path, and o the same for all frames,
 
     p_c(t) = P(h_c(t - t0)) + o + w(t)
 
-gives the start t0 of the path and o; what both holders do alike besides, w(t), is a camera that is not at rest. Both
-are taken out of every frame. What the two do differently is the residual.
+gives the start t0 of the path and o. The common motion w(t) of both holders is that of a shaking camera. o and w are
+removed from every frame. The difference between the two holders is the residual.
 """
 
 import io
@@ -29,7 +29,7 @@ from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Floats
 from stickslip_training.cloth.clips import INSTANTS, Clips, frames_at
-from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, stage
+from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, holder_path
 from stickslip_training.cloth.fabric import FABRIC
 
 if TYPE_CHECKING:
@@ -48,23 +48,24 @@ WINDOW = 0.012
 """Side of the tracked patch [m]."""
 
 MATCH_MAX = 1.0
-"""How far a match with a kept frame may be from where the steps since led; then another frame is kept [px]."""
+"""Largest distance of a match with the kept frame from the sum of the steps since; beyond it another frame is kept
+[px]."""
 
 RESIDUAL_MAX = 1.0
 """[px of a picture 224 px wide]"""
 
 TIMING_MAX = 0.1
-"""How far the starts may be apart that a video and its two halves tell [s]."""
+"""Largest spread of the starts found in the whole video and in its two halves [s]."""
 
 TILT_MAX = 5.0
 """Angle between the line of the holders in the video and in the calibrated camera [degree]."""
 
 LATE_MAX = 0.1
-"""How far the frame of an instant may be from it [s]."""
+"""Largest distance of a frame from its instant [s]."""
 
 
 class VideoError(ValueError):
-    """The video cannot be measured: the message says why, with number and limit."""
+    """The video cannot be measured; the message has the measured number and its limit."""
 
 
 @dataclass(frozen=True)
@@ -78,18 +79,18 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Registration:
-    """How a video lies on the stage's clock and picture."""
+    """Clock and registration of a video."""
 
     start: float
-    """When the stage starts, in the video's time [s]."""
+    """Time in the video at which the holders start [s]."""
     timing: float
-    """By how much the starts differ that the whole, or the user, and the first and the second half tell [s]."""
+    """Spread of the starts: of the whole video or as given, of its first and of its second half [s]."""
     offset: tuple[float, float]
     """Of the holders in the video from where the calibration has them [px]."""
     shake: float
-    """Root mean square of what both holders do besides the path, per coordinate [px]."""
+    """RMS of the common motion of both holders besides the path, per coordinate [px]."""
     residual: float
-    """Root mean square of what the two do differently, per coordinate [px of a picture 224 px wide]."""
+    """RMS of the difference between the two holders, per coordinate [px of a picture 224 px wide]."""
     tilt: float
     """Of the line of the holders against that of the calibration [degree]."""
     frames: int
@@ -100,7 +101,7 @@ class Registration:
         reasons = []
         if not self.residual <= RESIDUAL_MAX:
             reasons.append(
-                f"the holders must move as one on the stage's path to within {RESIDUAL_MAX:g} px of a picture 224 px "
+                f"the holders must move as one on their path to within {RESIDUAL_MAX:g} px of a picture 224 px "
                 f"wide, and are {self.residual:.2f} px off"
             )
         if not self.timing <= TIMING_MAX:
@@ -136,10 +137,10 @@ def load_calibration(path: str | Path) -> Calibration:
     if isinstance(rotation, list) and len(rotation) == 3 and all(isinstance(r, int | float) for r in rotation):
         content["rotation"] = _matrix(np.array(rotation, dtype=np.float64)).tolist()
     try:
-        camera = Camera.model_validate({"name": "own", **content})
+        camera = Camera.model_validate({"name": "custom", **content})
     except ValidationError as error:
-        told = [f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()]
-        raise ValueError(f"{path} must describe a camera: {'; '.join(told)}") from error
+        problems = [f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()]
+        raise ValueError(f"{path} must describe a camera: {'; '.join(problems)}") from error
     return Calibration(camera, tuple(map(float, distortion)))
 
 
@@ -150,11 +151,17 @@ def import_video(
     start: float | None = None,
     holders: tuple[float, float, float, float] | None = None,
 ) -> tuple[torch.Tensor, tuple[int, ...], Registration]:
-    """Return crops (F, 72, 88) of a video, the instants that they show, and how the video was registered.
+    """Return crops (F, 72, 88) of a video, their instants and the registration.
 
-    `start` is when the stage starts [s]; without it, the path is found. `holders` are columns and rows of the middles
-    of the two held patches in the first frame, that with the smaller y first [px]; without it, the calibration's. The
-    video must begin before the stage starts. Raises VideoError where it cannot be measured.
+    Args:
+        path: The video, which must begin before the holders start.
+        calibration: The camera.
+        start: Time at which the holders start [s]; by default it is found.
+        holders: Column and row of the middle of each held patch in the first frame, smaller y first [px]; by default
+            those of the calibration.
+
+    Raises:
+        VideoError: The video cannot be measured.
     """
     times, tracks = _follow(path, calibration, holders)
     camera = calibration.camera
@@ -235,7 +242,7 @@ def _frames(path: str | Path) -> Iterator[tuple[float, "NDArray[np.uint8]"]]:
 
 def holder_points(instants: Array) -> Floats:
     """Return the middles of the two held patches at instants (F,), which need not be whole: (F, 2, 3) [m]."""
-    x, z = (np.asarray(part, dtype=np.float64) for part in stage(instants))
+    x, z = (np.asarray(part, dtype=np.float64) for part in holder_path(instants))
     points = np.zeros((len(x), 2, 3))
     points[:, :, 0] = x[:, None]
     points[:, :, 1] = (-PATCH, PATCH)
@@ -310,7 +317,7 @@ def _intrinsics(camera: Camera) -> Floats:
 
 
 def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None) -> tuple[Registration, Floats]:
-    """Return the registration, and what both holders do besides the path in every frame, (N, 2) [px]."""
+    """Return the registration, and the common motion of both holders besides the path, (N, 2) [px]."""
 
     def off(t0: float, some: slice = slice(None)) -> Floats:
         """Return tracks less the path, less their mean, (N, 2, 2)."""
@@ -322,7 +329,7 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
 
     def found(some: slice, near: float) -> float:
         def residuals(t0: Floats) -> Floats:
-            # What moves within a second: a hand wanders slowly, and the stage turns fast.
+            # What moves within a second: a hand wanders slowly, and the holders turn fast.
             apart = off(float(t0[0]), some)
             return np.asarray(apart[second:] - apart[:-second]).ravel()
 

@@ -1,1 +1,1 @@
-"""Datasets: where their bytes come from, what they must say, and what is read of them."""
+"""Datasets: opening, checking and reading them, and batches for PyTorch."""

@@ -8,10 +8,11 @@ import hashlib
 import os
 import re
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
@@ -22,28 +23,35 @@ API_KEY_VARIABLE = "STICKSLIP_API_KEY"
 """Environment variable with the key that is sent to a server where none is given."""
 
 
-class Source(Protocol):
+class Source(ABC):
     """The files of one dataset version."""
 
+    @abstractmethod
     def read_manifest(self) -> bytes:
         """Return the manifest's bytes."""
-        ...
 
+    @abstractmethod
     def read_unlisted(self, name: str) -> bytes:
         """Return all bytes of a file that the manifest does not list."""
-        ...
 
-    def digest(self, file: FileEntry) -> str | None:
-        """Return the SHA-256 of the file; None where that would mean to fetch all of it."""
-        ...
+    @abstractmethod
+    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
+        """Return `length` bytes from `offset` of a file whose size must be that of the manifest."""
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
         """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
-        ...
+        length = file.size - offset if length is None else length
+        data = self.read_range(file, offset, length)
+        if len(data) != length:
+            raise CorruptDataError(f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected")
+        return data
 
-    def close(self) -> None:
-        """Let go of connections; the source can be read again afterwards."""
-        ...
+    def digest(self, file: FileEntry) -> str | None:
+        """Return the SHA-256 of the file; None where the whole file would have to be fetched."""
+        return None
+
+    def close(self) -> None:  # noqa: B027
+        """Close connections; the source can be read again afterwards."""
 
 
 def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -> "Source":
@@ -56,7 +64,7 @@ def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -
     return DirectorySource(Path(text))
 
 
-class DirectorySource:
+class DirectorySource(Source):
     """A dataset version in a directory."""
 
     def __init__(self, root: Path) -> None:
@@ -66,15 +74,13 @@ class DirectorySource:
         return self._root
 
     def read_manifest(self) -> bytes:
-        """Return the manifest's bytes."""
-        path = Path(self._root, MANIFEST_NAME)
         try:
-            return path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
+            return self.read_unlisted(MANIFEST_NAME)
+        except MissingFileError:
+            path = f"{self}/{MANIFEST_NAME}"
             raise MissingFileError(f"{path} is not there: this is no committed dataset version") from None
 
     def read_unlisted(self, name: str) -> bytes:
-        """Return all bytes of a file that the manifest does not list."""
         path = Path(self._root, name)
         try:
             return path.read_bytes()
@@ -82,16 +88,13 @@ class DirectorySource:
             raise MissingFileError(f"{path} does not exist") from None
 
     def digest(self, file: FileEntry) -> str | None:
-        """Return the SHA-256 of the file."""
         try:
             with Path(self._root, file.path).open("rb", buffering=0) as opened:
                 return hashlib.file_digest(opened, "sha256").hexdigest()
         except (FileNotFoundError, NotADirectoryError):
             raise MissingFileError(f"{self._root}/{file.path} is not there, and the manifest says it is") from None
 
-    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
-        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
-        length = file.size - offset if length is None else length
+    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
         path = f"{self._root}/{file.path}"
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -111,11 +114,8 @@ class DirectorySource:
             os.close(descriptor)
         return data
 
-    def close(self) -> None:
-        """Do nothing: no file stays open."""
 
-
-class BucketSource:
+class BucketSource(Source):
     """A dataset version in an S3 bucket: `s3://BUCKET/PREFIX/datasets/<id>/v<n>`.
 
     Region, endpoint and credentials are those of the variables `AWS_...` of the environment. A read is one request. The
@@ -140,33 +140,20 @@ class BucketSource:
         return self.__dict__ | {"_objects": None, "_pid": 0}
 
     def read_manifest(self) -> bytes:
-        """Return the manifest's bytes."""
         return self.read_unlisted(MANIFEST_NAME)
 
     def read_unlisted(self, name: str) -> bytes:
-        """Return all bytes of a file that the manifest does not list."""
         return self._asked(name, lambda obstore, objects: obstore.get(objects, name).bytes().to_bytes())
 
-    def digest(self, file: FileEntry) -> str | None:
-        """Return None: a shard is not fetched whole for the sake of one sample."""
-        return None
-
-    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
-        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
-        length = file.size - offset if length is None else length
+    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
         if offset == 0 and length == file.size:
-            data = self.read_unlisted(file.path)
-        else:
-            data = self._asked(
-                file.path,
-                lambda obstore, objects: obstore.get_range(objects, file.path, start=offset, length=length).to_bytes(),
-            )
-        if len(data) != length:
-            raise CorruptDataError(f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected")
-        return data
+            return self.read_unlisted(file.path)
+        return self._asked(
+            file.path,
+            lambda obstore, objects: obstore.get_range(objects, file.path, start=offset, length=length).to_bytes(),
+        )
 
     def close(self) -> None:
-        """Let go of the client."""
         self._objects = None
 
     def _asked(self, name: str, request: Callable[[Any, Any], bytes]) -> bytes:
@@ -192,7 +179,7 @@ class BucketSource:
             raise SourceError(f"{self}/{name} cannot be read: {str(error).splitlines()[0]}") from error
 
 
-class HttpSource:
+class HttpSource(Source):
     """A dataset version behind a URL.
 
     Either a version of the service, `.../v1/datasets/<id>/versions/<n>` (with or without `/files` or `/manifest`), or
@@ -219,7 +206,6 @@ class HttpSource:
         return self.__dict__ | {"_client": None, "_client_pid": 0}
 
     def read_manifest(self) -> bytes:
-        """Return the manifest's bytes."""
         for url in self._manifests:
             response = self._get(url, {})
             if response.status_code == 200:
@@ -229,7 +215,6 @@ class HttpSource:
         raise MissingFileError(f"{' and '.join(self._manifests)} answered 404: this is no committed dataset version")
 
     def read_unlisted(self, name: str) -> bytes:
-        """Return all bytes of a file that the manifest does not list."""
         url = f"{self._files}/{name}"
         response = self._get(url, {})
         if response.status_code == 404:
@@ -238,13 +223,7 @@ class HttpSource:
             raise SourceError(f"{url} answered {response.status_code}, and 200 was expected")
         return bytes(response.content)
 
-    def digest(self, file: FileEntry) -> str | None:
-        """Return None: a shard is not fetched whole for the sake of one sample."""
-        return None
-
-    def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
-        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
-        length = file.size - offset if length is None else length
+    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
         whole = offset == 0 and length == file.size
         url = f"{self._files}/{file.path}"
         response = self._get(url, {} if whole else {"Range": f"bytes={offset}-{offset + length - 1}"})
@@ -260,13 +239,9 @@ class HttpSource:
             content_range = response.headers.get("Content-Range", "")
             if content_range != expected:
                 raise CorruptDataError(f"{url} sent {content_range!r}, and {expected!r} was expected")
-        data = bytes(response.content)
-        if len(data) != length:
-            raise CorruptDataError(f"{url} sent {len(data)} bytes, and {length} were expected")
-        return data
+        return bytes(response.content)
 
     def close(self) -> None:
-        """Close this process's connections."""
         if self._client is not None and self._client_pid == os.getpid():
             self._client.close()
         self._client = None
@@ -277,10 +252,10 @@ class HttpSource:
 
         if self._client is None or self._client_pid != os.getpid():
             # A fork shares the parent's sockets: the child must not use them, nor close them.
-            own = {"Accept-Encoding": "identity"}  # ranges are of the file, not of a compressed form of it
+            headers_of_all = {"Accept-Encoding": "identity"}  # ranges are of the file, not of a compressed form of it
             if self._api_key:
-                own["Authorization"] = f"Bearer {self._api_key}"
-            self._client = httpx.Client(headers=own, timeout=self._timeout, follow_redirects=True)
+                headers_of_all["Authorization"] = f"Bearer {self._api_key}"
+            self._client = httpx.Client(headers=headers_of_all, timeout=self._timeout, follow_redirects=True)
             self._client_pid = os.getpid()
         for attempt in range(self.TRIES):
             try:

@@ -1,4 +1,4 @@
-"""Batches in an order that can be interrupted: a seed decides on it, and a state says how far it has come."""
+"""Batches in an order that follows from a seed, and that a saved state continues."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -30,7 +30,7 @@ _CHECKPOINT_SECONDS = 300.0  # a checkpoint is several times as large as the net
 
 @dataclass(frozen=True, kw_only=True)
 class FitSettings:
-    """How long and in which way a network is trained. Exactly one of `steps` and `minutes` says how long."""
+    """Settings of a run. Exactly one of `steps` and `minutes` limits it."""
 
     steps: int | None = None
     minutes: float | None = None
@@ -317,7 +317,9 @@ def check_device(name: str) -> None:
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device must be one that torch can use here, and is {name!r}: {error}") from None
+        raise ValueError(
+            f"device must be one that torch can use here, and is {name!r}: {str(error).splitlines()[0]}"
+        ) from None
 
 
 def check_positive(settings: object, *names: str) -> None:

@@ -52,7 +52,7 @@ def export_coco(reader: DatasetReader, out: Path, *, every: int = 1, split: Spli
         "info": {"description": f"{reader.manifest.dataset}, version {reader.manifest.version}"},
         "images": images,
         "annotations": annotations,
-        "categories": [{"id": code, "name": name, "supercategory": "stage"} for code, name in codes.items()],
+        "categories": [{"id": code, "name": name, "supercategory": "scene"} for code, name in codes.items()],
     }
     (out / "annotations.json").write_text(json.dumps(content), encoding="utf-8")
     return len(images), len(annotations)

@@ -28,7 +28,7 @@ LEAST_HEIGHT = 600  # [px]: smaller pictures are enlarged by a whole factor
 
 
 def import_pillow() -> Any:
-    """Return PIL.Image, or say how to get it."""
+    """Return PIL.Image; raise ImportError with the way to install it."""
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
@@ -117,11 +117,11 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
     try:
         rigs = read_rigs(path)
     except ValidationError as error:
-        told = [
+        problems = [
             f"{'.'.join(map(str, item['loc']))}: {item['msg']}; got {item['input']!r}"
             for item in error.errors(include_url=False)
         ]
-        raise ReconstructionError(f"{path}: " + "\n  ".join(told)) from error
+        raise ReconstructionError(f"{path}: " + "\n  ".join(problems)) from error
     except tomllib.TOMLDecodeError as error:
         raise ReconstructionError(f"{path}: not TOML: {error}") from error
     names = ", ".join(rigs)

@@ -31,7 +31,7 @@ _TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apar
 
 @dataclass(frozen=True, kw_only=True)
 class CurvatureTraining:
-    """Options of a run. Exactly one of `minutes` and `epochs` says how long it takes."""
+    """Settings of a run. Exactly one of `minutes` and `epochs` limits it."""
 
     dataset: str
     """Directory or URL of a dataset of rods."""
@@ -59,7 +59,7 @@ class CurvatureTraining:
     device: str = "cpu"
     """Of torch."""
     evaluation_rods: int = 1000
-    """The most test rods that are evaluated; the first of the split are taken, and the report says how many."""
+    """The most test rods that are evaluated; the first of the split are taken."""
 
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.epochs is None):

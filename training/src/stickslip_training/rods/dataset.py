@@ -67,7 +67,7 @@ def load_splits(
         seen = "chose the weights" if other == "validation" else "trained the network"
         notes.append(f"The test split is empty: errors are those on the {other} split, which {seen}.")
     if set(slots["test"]) & set(slots["train"]):
-        notes.append("Test rods were trained on: the network's errors say nothing about rods it has not seen.")
+        notes.append("Test rods were trained on: these errors do not hold for other rods.")
     if len(slots["test"]) > evaluation_rods:
         notes.append(f"Evaluated on {evaluation_rods} of {len(slots['test'])} test rods (evaluation_rods).")
         slots["test"] = slots["test"][:evaluation_rods]
