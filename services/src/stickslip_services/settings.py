@@ -14,56 +14,56 @@ from stickslip_services.errors import SettingsError
 
 
 class Settings(BaseSettings):
-    """Where the coordinator keeps its things, where it listens, and how patient its queue is."""
+    """Paths, addresses, limits and times of the coordinator."""
 
     model_config = SettingsConfigDict(env_prefix="STICKSLIP_", frozen=True, extra="forbid")
 
     data: Path = Path("stickslip-data")
-    """Directory of the worker key; also of database and store, unless `database` and `store` say otherwise."""
+    """Directory of the worker key, and by default of database and store."""
     store: str | None = None
-    """Place of the store, a directory or `s3://BUCKET/PREFIX`; null is the directory `data/store`."""
+    """Place of the store, a directory or `s3://BUCKET/PREFIX`; null: `data/store`."""
     database: SecretStr | None = None
-    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`. Null is a SQLite file in `data`."""
+    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`; null: a SQLite file in `data`."""
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 
     allowed_hosts: tuple[str, ...] = ()
-    """Names, besides those of loopback and `host`, under which the coordinator may be asked."""
+    """Accepted values of the Host header, besides loopback and `host`."""
     require_keys: bool = False
-    """Whether every request needs a key. Always so where others than this machine can send some."""
+    """Whether requests on loopback need a key; others always do."""
     behind_proxy: bool = False
-    """Whether a proxy in front of the coordinator speaks TLS to the world. Requests then need keys."""
+    """Whether a proxy terminates TLS in front of the coordinator. Requests then need keys."""
     tls_certificate: Path | None = None
-    """File with the certificate, and its chain, with which the coordinator speaks TLS itself."""
+    """File of the TLS certificate and its chain."""
     tls_key: Path | None = None
-    """File with the private key of `tls_certificate`."""
+    """File of the private key of `tls_certificate`."""
 
     durable: bool = True
-    """Wait for the disk at each commit. Without it a power cut may lose what was accepted; for tests."""
+    """Wait for the disk at each commit; tests turn it off. Without it a power cut may lose accepted results."""
     lease_seconds: float = Field(default=30.0, gt=0)
-    """How long a lease lasts without a heartbeat [s]."""
+    """Duration of a lease without a heartbeat [s]."""
     max_tries: int = Field(default=3, ge=1)
-    """Failed tries after which a task fails."""
+    """Failed attempts after which a task fails."""
     max_losses: int = Field(default=20, ge=1)
-    """Lost workers after which a task is quarantined. A single loss does not count as a failed try."""
+    """Lost workers after which a task is quarantined. A loss is not a failed attempt."""
     max_quarantined: int = Field(default=10, ge=0)
     """Quarantined tasks of a job beyond which the job fails."""
     limit_floor_seconds: float = Field(default=60.0, gt=0)
-    """No call is ended for its cost before this time [s], however little it was expected to take."""
+    """Least time limit of a call [s]."""
     retry_seconds: float = Field(default=1.0, ge=0)
-    """Wait before the second try [s]; it doubles with every further one."""
+    """Delay before the second attempt [s]; it doubles with each further one."""
     sweep_seconds: float = Field(default=1.0, gt=0)
-    """Time between two looks at expired leases and due retries [s]."""
+    """Polling interval for expired leases and due retries [s]."""
     plan_samples: int = Field(default=10_000, ge=1)
-    """Samples that are planned at once. A job of more is planned in the background, in pieces of so many."""
+    """Largest job that is planned at once, and size of the pieces of larger ones [samples]."""
     lease_limit: int = Field(default=1000, ge=1)
-    """The most tasks of one stage that one request is granted."""
+    """Largest number of tasks of one stage that a request gets."""
     min_free_bytes: int = Field(default=256 * 2**20, ge=0)
-    """Space that must stay free on the disks of store and database [bytes]; jobs are paused where less is left."""
+    """Free space on the disks of store and database below which jobs are paused [bytes]."""
     previews_per_job: int = Field(default=24, ge=0)
-    """How many samples of a job, evenly spread over its slots, are rendered with a preview."""
+    """Samples of a job with a preview, evenly spread over its slots."""
     body_limit: int = Field(default=16 * 2**20, ge=1024)
-    """The largest request body that is read [bytes]."""
+    """Largest accepted request body [bytes]."""
 
     @classmethod
     def chosen(cls, **values: Any) -> Self:
