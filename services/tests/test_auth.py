@@ -26,7 +26,7 @@ WORKER_PATHS = ("/v1/workers", "/v1/worker/lease", "/v1/worker/heartbeat", "/v1/
 
 @pytest.fixture(scope="module")
 def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
-    data = tmp_path_factory.mktemp("doors")
+    data = tmp_path_factory.mktemp("auth")
     return make_app(Settings(data=data, durable=False, allowed_hosts=("farm.example",)))
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.tasks import PackTask
 from stickslip_schemas.documents.worker_api import LeaseRequest
 from stickslip_services.access.projects import acting_for, check_quota, find_project, set_quota
 from stickslip_services.database.tables import tasks
@@ -16,7 +17,7 @@ from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import start, sweep
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
-from stickslip_testing.worker import DirectApi, PretendWorker, failure
+from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 
 
 def submit(context: Context, *, priority: int = 0, project: str = "", **spec: Any) -> str:
@@ -218,3 +219,37 @@ def test_leases_are_renewed_at_the_start_of_a_coordinator(
     start(context)
     sweep(context)
     assert row(context, lease.task_id).expires_at == clock.now + context.settings.lease_seconds
+
+
+def test_a_sweep_takes_back_expired_leases_only(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context)
+    expired, renewed = worker.lease(simulate=2)
+    clock.advance(20)
+    worker.beat(renewed)
+    clock.advance(20)
+    sweep(context)
+    assert row(context, expired.task_id).owner is None
+    assert row(context, renewed.task_id).owner == worker.id
+
+
+def test_a_sweep_retries_due_tasks_only(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    submit(context)
+    first, second = worker.lease(simulate=2)
+    worker.report((first, failure()))
+    clock.advance(0.5)
+    worker.report((second, failure()))
+    clock.advance(0.5)
+    sweep(context)
+    assert row(context, first.task_id).state == TaskState.pending
+    assert row(context, second.task_id).state == TaskState.soft_failed
+
+
+def test_a_rejected_slot_keeps_its_labels(context: Context, worker: PretendWorker) -> None:
+    submit(context, gamma=(1.0,), phi1=(1.0,))
+    worker.report(*((lease, rejection()) for lease in worker.lease(simulate=1)))
+    (pack,) = worker.lease(pack=1)
+    assert isinstance(pack.task, PackTask)
+    (slot,) = pack.task.slots
+    assert slot.labels == {"gamma": 1.0, "phi0": 0.0, "phi1": 1.0}
+    assert slot.rejection is not None
+    assert slot.rejection.labels == slot.labels

@@ -160,7 +160,7 @@ def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
                 continue
             heard.append((json.loads(event.data)["state"], time.monotonic()))
             if len(heard) == 1:
-                time.sleep(2.5)  # now the stream waits for the bell: by itself it looks again after 15 s
+                time.sleep(2.5)  # now the stream waits for the notifier: by itself it looks again after 15 s
                 asked = time.monotonic()
                 pair.client.post(f"{one}/v1/jobs/{job}:cancel").raise_for_status()
     assert [state for state, _ in heard][-1] == "cancelled"
@@ -281,11 +281,11 @@ def test_reads_see_one_state(settings: Settings) -> None:
 def test_what_was_rolled_back_is_not_announced(settings: Settings) -> None:
     database = connect(settings)
     other = connect(settings)
-    rung: list[float] = []
+    notified: list[float] = []
 
     async def listen() -> None:
-        task = asyncio.create_task(other.listen(lambda: rung.append(time.monotonic())))
-        await _until(lambda: len(rung) == 1)  # it listens
+        task = asyncio.create_task(other.listen(lambda: notified.append(time.monotonic())))
+        await _until(lambda: len(notified) == 1)  # it listens
         for fails in (True, False):
             try:
                 with database.write():
@@ -293,12 +293,12 @@ def test_what_was_rolled_back_is_not_announced(settings: Settings) -> None:
                         raise RuntimeError
             except RuntimeError:
                 await asyncio.sleep(0.5)
-                assert len(rung) == 1
-        await _until(lambda: len(rung) == 2)
+                assert len(notified) == 1
+        await _until(lambda: len(notified) == 2)
         with other.write():
             pass
         await asyncio.sleep(0.5)
-        assert len(rung) == 2  # one's own words are no news
+        assert len(notified) == 2  # one's own words are no news
         task.cancel()
 
     asyncio.run(listen())

@@ -99,6 +99,15 @@ def find_reserved(connection: Connection, publish_task: int) -> tuple[str, int] 
     return None if row is None else (row.dataset, row.version)
 
 
+def version_number(connection: Connection, dataset: str, publish_task: int) -> int:
+    """Return the version number reserved for a publish task, or the next free one of its dataset."""
+    reserved = find_reserved(connection, publish_task)
+    if reserved is not None:
+        return reserved[1]
+    latest = select(func.coalesce(func.max(dataset_versions.c.version), 0))
+    return int(connection.scalar(latest.where(dataset_versions.c.dataset == dataset)) or 0) + 1
+
+
 def version_exists(connection: Connection, dataset: str, version: int) -> bool:
     """Return whether a version number of a dataset is taken."""
     columns = dataset_versions.c

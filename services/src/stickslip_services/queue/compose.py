@@ -1,11 +1,11 @@
-"""Composing a task at the time of its lease: what it is, and where the results lie that it builds on."""
+"""Composition of a task when it is leased: its document, with references to the results of its dependencies."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, func, select
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
@@ -16,20 +16,21 @@ from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
 
+from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
 from stickslip_services.database.database import batches
-from stickslip_services.database.tables import dataset_versions, jobs, samples, task_dependencies, tasks
+from stickslip_services.database.tables import jobs, samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, NotFoundError
 from stickslip_services.queue.ids import task_id, task_key
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
 Publish = Callable[[bytes], Sha256]
-"""Writes an artifact."""
+"""Stores an artifact and returns its digest."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredTask:
-    """The columns of a task that say what it is."""
+    """The columns of a task that define its document."""
 
     seq: int
     stage: Stage
@@ -38,10 +39,10 @@ class StoredTask:
 
 
 def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish: Publish) -> dict[int, AnyTask]:
-    """Return the tasks by `seq`; all that they depend on has to be settled.
+    """Return the documents of tasks by `seq`; all their dependencies must be settled.
 
-    What is too long for a task that publishes is written to the store with `publish`, which takes a while: do not call
-    this in a transaction that keeps others from writing.
+    The sections of a publish task are stored with `publish`, which takes a while: do not call this in a write
+    transaction.
     """
     composers: Mapping[Stage, Callable[[Connection, list[StoredTask]], dict[int, AnyTask]]] = {
         Stage.simulate: _simulate_tasks,
@@ -59,7 +60,7 @@ def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish:
 def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     """Return a task by its name, composed as by `compose_tasks`.
 
-    Raise NotFoundError, or ConflictError where what it builds on is not there yet.
+    Raises NotFoundError, or ConflictError where its dependencies are not settled.
     """
     key = task_key(name)
     columns = (tasks.c.seq, tasks.c.stage, tasks.c.payload, tasks.c.preview, tasks.c.waiting_on)
@@ -138,13 +139,7 @@ def _slots(connection: Connection, job: int, *, first: int, count: int) -> list[
         slot: dict[str, Any] = {"slot": row.slot, "sample_key": row.key.hex(), "split": row.split}
         if row.state == TaskState.rejected:
             slot["labels"] = labels
-            slot["rejection"] = {
-                "slot": row.slot,
-                "sample_key": row.key.hex(),
-                "reason": row.reason,
-                "message": row.message,
-                "labels": labels,
-            }
+            slot["rejection"] = _rejection(row)
         else:
             simulation = json.loads(row.simulate_output)
             render = json.loads(row.render_output) if row.render_task is not None else {"labels": {}, "chunks": {}}
@@ -176,7 +171,7 @@ def _publish_task(connection: Connection, task: StoredTask, publish: Publish) ->
     return PublishTask(
         spec=spec,
         dataset=dataset,
-        version=find_version(connection, dataset, task.seq),
+        version=version_number(connection, dataset, task.seq),
         builds=builds,
         sections=tuple(in_parallel(publish, sections)),
         certificate=payload.get("certificate"),
@@ -192,14 +187,14 @@ def _section(connection: Connection, job: int, spec: JobSpec, packed: Mapping[in
     document = {
         "first": first,
         "sample_keys": [key.hex() for key in keys],
-        "rejections": rejections(connection, job, first=first, end=end),
+        "rejections": _rejections(connection, job, first=first, end=end),
         "files": [file for output in outputs for file in output["files"]],
         "labels": [output["labels"] for output in outputs],
     }
     return json.dumps(document).encode()
 
 
-def rejections(connection: Connection, job: int, *, first: int, end: int) -> list[dict[str, Any]]:
+def _rejections(connection: Connection, job: int, *, first: int, end: int) -> list[dict[str, Any]]:
     """Return the rejected samples of a job among the slots from `first` to `end`, by slot."""
     last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
     rows = connection.execute(
@@ -209,35 +204,25 @@ def rejections(connection: Connection, job: int, *, first: int, end: int) -> lis
         .where(tasks.c.state == TaskState.rejected)
         .order_by(samples.c.slot)
     )
-    return [
-        {
-            "slot": row.slot,
-            "sample_key": row.key.hex(),
-            "reason": row.reason,
-            "message": row.message,
-            "labels": json.loads(row.labels),
-        }
-        for row in rows
-    ]
+    return list(map(_rejection, rows))
 
 
-def find_version(connection: Connection, dataset: str, publish_task: int) -> int:
-    """Return the number of the version that a publish task makes: the one it has been given, or else the next."""
-    mine = connection.scalar(select(dataset_versions.c.version).where(dataset_versions.c.publish_task == publish_task))
-    if mine is not None:
-        return int(mine)
-    query = select(func.coalesce(func.max(dataset_versions.c.version), 0)).where(dataset_versions.c.dataset == dataset)
-    return int(connection.scalar(query) or 0) + 1
+def _rejection(row: Any) -> dict[str, Any]:
+    return {
+        "slot": row.slot,
+        "sample_key": row.key.hex(),
+        "reason": row.reason,
+        "message": row.message,
+        "labels": json.loads(row.labels),
+    }
 
 
 def reserve_version(connection: Connection, task: StoredTask) -> None:
-    """Give a publish task the number of its version, for good, so that no other takes it."""
-    spec, _ = _job_spec(connection, json.loads(task.payload)["job"])
-    dataset = dataset_id(spec)
-    taken = select(dataset_versions.c.version).where(dataset_versions.c.publish_task == task.seq)
-    if connection.scalar(taken) is None:
-        version = find_version(connection, dataset, task.seq)
-        connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=task.seq))
+    """Reserve the version number of a publish task, for good, so that no other task takes it."""
+    if find_reserved(connection, task.seq) is None:
+        spec, _ = _job_spec(connection, json.loads(task.payload)["job"])
+        dataset = dataset_id(spec)
+        reserve_number(connection, dataset, version_number(connection, dataset, task.seq), task.seq)
 
 
 def _job_spec(connection: Connection, job: int) -> tuple[Any, Builds]:

@@ -5,7 +5,7 @@ transaction.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, bindparam, case, select, update
@@ -201,6 +201,20 @@ def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) ->
         update(tasks).where(tasks.c.seq == task.seq).values(state=state, owner=None, expires_at=None, **values)
     )
     book.moved(task.seq, task.stage, task.state, state)
+
+
+def reset_tasks(book: Ledger, rows: Collection[tuple[int, str, str]], job_of: Mapping[int, int]) -> None:
+    """Let ended tasks (seq, stage, state) run again, with all their tries, each charged to a job."""
+    values = {"reason": None, "message": "", "tries": 0, "losses": 0, "retry_at": None, "finished_at": None}
+    if rows:
+        book.connection.execute(
+            update(tasks)
+            .where(tasks.c.seq == bindparam("b_seq"))
+            .values(state=TaskState.pending, job=bindparam("b_job"), **values),
+            [{"b_seq": seq, "b_job": job_of[seq]} for seq, _, _ in rows],
+        )
+    for seq, stage, state in rows:
+        book.moved(seq, stage, state, TaskState.pending)
 
 
 _START = Prepared(

@@ -23,7 +23,7 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
-from stickslip_services.queue.ledger import LIVE, Ending, Ledger, live_jobs
+from stickslip_services.queue.ledger import LIVE, Ending, Ledger, live_jobs, reset_tasks
 
 logger = logging.getLogger(__name__)
 
@@ -142,22 +142,7 @@ def reopen(book: Ledger, makers: Iterable[_Maker]) -> None:
         edges = select(task_dependencies.c.task).where(task_dependencies.c.depends_on.in_(batch))
         dependents.update(book.connection.scalars(edges))
     _wait_for(book, dependents)
-    for maker in ended:
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq == maker.seq)
-            .values(
-                state=TaskState.pending,
-                reason=None,
-                message="",
-                job=job_of[maker.seq],
-                tries=0,
-                losses=0,
-                retry_at=None,
-                finished_at=None,
-            )
-        )
-        book.moved(maker.seq, maker.stage, maker.state, TaskState.pending)
+    reset_tasks(book, [(maker.seq, maker.stage, maker.state) for maker in ended], job_of)
 
 
 def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[_Maker]:

@@ -6,7 +6,7 @@ wait for it; if it failed or was cancelled, the new job starts it again.
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, func, insert, select, update
@@ -26,7 +26,7 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
-from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks
+from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks, reset_tasks
 from stickslip_services.queue.plan import Plan, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
@@ -152,7 +152,8 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     if groups:
         rows = [{"job": job, "stage": stage, "cost_group": group, "n": left[stage, group]} for stage, group in groups]
         _ADD_GROUPS.run_all(connection, rows)
-    _retry(book, job, [task for task in shared if task.state in _LOST])  # its moves change the counts
+    lost = [(task.seq, task.stage, task.state) for task in shared if task.state in _LOST]
+    reset_tasks(book, lost, dict.fromkeys((seq for seq, _, _ in lost), job))  # its moves change the counts
     charge_tasks(connection, (task.seq for task in shared if not task.state.is_settled))
     return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
 
@@ -184,27 +185,6 @@ def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
         for key, seq, stage, state, *rest in connection.execute(select(*columns).where(tasks.c.key.in_(batch))):
             found[key] = _Known(seq, Stage(stage), TaskState(state), *rest)
     return found
-
-
-def _retry(book: Ledger, job: int, lost: Sequence[_Known]) -> None:
-    """Reset failed and cancelled tasks: submitting a spec again retries them."""
-    for task in lost:
-        book.moved(task.seq, task.stage, task.state, TaskState.pending)
-    for batch in batches(lost):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([task.seq for task in batch]))
-            .values(
-                state=TaskState.pending,
-                reason=None,
-                message="",
-                job=job,
-                tries=0,
-                losses=0,
-                retry_at=None,
-                finished_at=None,
-            )
-        )
 
 
 def _insert_tasks(

@@ -1,4 +1,4 @@
-"""The worker API: dispatchers register, lease tasks, send heartbeats, and report results."""
+"""The worker API: dispatchers register, lease tasks, send heartbeats, and report results. Tasks can be read, too."""
 
 import asyncio
 from collections.abc import Callable
@@ -21,6 +21,7 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_services.api.bodies import JsonBody, body_schema
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, ContextDep, problem_responses
+from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.lease import heartbeat, lease_tasks, register_worker
 from stickslip_services.queue.report import report_results
@@ -28,14 +29,14 @@ from stickslip_services.queue.workers import show_workers
 
 T = TypeVar("T")
 
-router = APIRouter(tags=["workers"])
+router = APIRouter()
 
 _LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest)
 _HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat)
 _REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
 
 
-@router.get("/v1/workers", responses=problem_responses())
+@router.get("/v1/workers", tags=["workers"], responses=problem_responses())
 def get_workers(context: ContextDep) -> list[WorkerEntry]:
     """List the workers that have registered, the newest session of each name, newest first."""
     with context.database.read() as connection:
@@ -44,6 +45,7 @@ def get_workers(context: ContextDep) -> list[WorkerEntry]:
 
 @router.post(
     "/v1/workers",
+    tags=["workers"],
     status_code=201,
     responses=problem_responses(*BODY_PROBLEMS),
     openapi_extra=body_schema("WorkerRegistration") | KEYED,
@@ -57,6 +59,7 @@ def post_worker(
 
 @router.post(
     "/v1/worker/lease",
+    tags=["workers"],
     response_model=LeaseBatch,
     responses=problem_responses(404, 409, *BODY_PROBLEMS),
     openapi_extra=body_schema("LeaseRequest") | KEYED,
@@ -68,6 +71,7 @@ async def post_lease(request: Request) -> Response:
 
 @router.post(
     "/v1/worker/heartbeat",
+    tags=["workers"],
     response_model=HeartbeatAnswer,
     responses=problem_responses(404, *BODY_PROBLEMS),
     openapi_extra=body_schema("Heartbeat") | KEYED,
@@ -79,6 +83,7 @@ async def post_heartbeat(request: Request) -> Response:
 
 @router.post(
     "/v1/worker/report",
+    tags=["workers"],
     response_model=ReportAnswer,
     responses=problem_responses(404, *BODY_PROBLEMS),
     openapi_extra=body_schema("ReportBatch") | KEYED,
@@ -93,6 +98,25 @@ async def post_report(request: Request) -> Response:
         return answer
 
     return await _answer(request, _REPORT_BATCH, report)
+
+
+@router.get(
+    "/v1/tasks/{task_id}",
+    tags=["tasks"],
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The task",
+            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/Task"}}},
+        },
+        **problem_responses(404, 409),
+    },
+)
+def get_task(task_id: str, context: ContextDep) -> Response:
+    """Return a task as a worker gets it. 409: one of its dependencies has not ended yet."""
+    with context.database.read() as connection:
+        task = find_task(connection, task_id, context.store.publish)
+    return Response(task.model_dump_json(), media_type="application/json")
 
 
 async def _answer(request: Request, document: JsonBody[T], verb: Callable[[Context, T], BaseModel]) -> Response:
