@@ -36,7 +36,7 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
 
 @contextmanager
 def opened(settings: Settings, role: Role) -> Iterator[Database]:
-    """Open the database of a coordinator, and migrate it, or make it where there is none.
+    """Open the database of a coordinator, and migrate it, or make it if there is none.
 
     Raises DatabaseRefusedError where it is damaged, has an unknown schema, or refuses the role.
     """

@@ -39,7 +39,7 @@ _CONNECT = {
 
 _WRITER_SETTINGS = (
     "lock_timeout = '30s'",
-    # A process that stops in a write (SIGSTOP, a lost network) must not block the others for ever.
+    # A process that stops in a write (SIGSTOP, a lost network) must not block the others forever.
     "idle_in_transaction_session_timeout = '60s'",
     "tcp_keepalives_idle = 30",
     "tcp_keepalives_interval = 10",

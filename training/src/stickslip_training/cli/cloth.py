@@ -172,7 +172,7 @@ def import_(
         ),
     ] = None,
 ) -> None:
-    """Align a video of your own with the clock of the drag scene, and register it to the holders."""
+    """Align your own video with the clock of the drag scene, and register it to the holders."""
     from stickslip_training.cloth.video import import_video, load_calibration, save_clip
 
     with readable_errors():
@@ -200,7 +200,7 @@ def predict(
     split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
-    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of a video of your own."""
+    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your own video."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.fabric import fabric_intervals

@@ -59,7 +59,7 @@ PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
 
 
 def seed_rules(physical: tuple[str, ...], *seen: str) -> tuple[tuple[SeedRule, ...], tuple[SeedRule, ...]]:
-    """Return the seeds of simulations and of renders, from the physical axes and those of what is seen."""
+    """Return the seeds of simulations and of renders, from the physical and the visual axes."""
     light = SeedRule("light_seed", "light", (*physical, *seen))
     return (SeedRule("seed", "bias", physical),), (light, SeedRule("crease_seed", "creases", physical))
 
