@@ -1,6 +1,5 @@
 """A square of cloth that falls on a sphere, which then turns and drags it over the floor [thesis, 4.6]."""
 
-from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -13,7 +12,7 @@ from stickslip_schemas.kinds.cloth.arrays import (
     physical_arrays,
     solver_arrays,
 )
-from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, TextureAxis
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, TextureAxis, ThreeViewpoint, ThreeViewpointAxis
 from stickslip_schemas.kinds.cloth.spec import (
     PHYSICAL_AXES,
     ClothAxes,
@@ -25,7 +24,6 @@ from stickslip_schemas.kinds.cloth.spec import (
 )
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.spec.fabrics import CustomName, name_schema
 
 AngularSpeed = Annotated[
     float,
@@ -39,29 +37,13 @@ AngularSpeedAxis = Annotated[
 ]
 
 
-class SphereViewpoint(StrEnum):
-    """Cameras of the rig `sphere-3`.
-
-    Their order gives the codes of the label `viewpoint`: add new ones at the end.
-    """
-
-    front = "front"
-    side = "side"
-    high = "high"
-
-
-ViewpointAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("SphereViewpoint"), name_schema(SphereViewpoint)]], SHORTHAND
-]
-
-
 class ClothSphereAxes(ClothAxes):
     """What a clip of cloth on a turning sphere depends on."""
 
     mu: MuAxis = Field(description="friction coefficient of the cloth with sphere and floor")
     angular_speed: AngularSpeedAxis = Field(description="angular speed of the sphere about its vertical axis [rad/s]")
     texture: TextureAxis
-    viewpoint: ViewpointAxis = Field(description="camera of the rig, or a custom one under `viewpoints`")
+    viewpoint: ThreeViewpointAxis
 
 
 class ClothSphereSimulation(ClothSimulation):
@@ -87,7 +69,7 @@ class ClothSphereSpec(ClothSpec):
     instants = 150
     instants_per_second = 15.0
     rig = "sphere-3"
-    custom = CUSTOM_LOOKS | {"viewpoint": Custom("viewpoints", "camera", tuple(SphereViewpoint))}
+    custom = CUSTOM_LOOKS | {"viewpoint": Custom("viewpoints", "camera", tuple(ThreeViewpoint))}
 
     kind: Literal["cloth_sphere"]
     axes: ClothSphereAxes

@@ -1,6 +1,5 @@
 """A shawl over the shoulders of a figure that moves [thesis, 4.6]."""
 
-from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -14,7 +13,7 @@ from stickslip_schemas.kinds.cloth.arrays import (
     physical_arrays,
     solver_arrays,
 )
-from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, TextureAxis
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, TextureAxis, ThreeViewpoint, ThreeViewpointAxis
 from stickslip_schemas.kinds.cloth.spec import (
     PHYSICAL_AXES,
     ClothAxes,
@@ -26,7 +25,6 @@ from stickslip_schemas.kinds.cloth.spec import (
 )
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, SobolAxis, quantity
-from stickslip_schemas.spec.fabrics import CustomName, name_schema
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
 BONES, SKIN_VERTICES, SKIN_TRIANGLES = 5, 1442, 2880
@@ -40,22 +38,6 @@ Swing = Annotated[
 SwingAxis = Annotated[ListAxis[Swing] | LinspaceAxis[Swing] | RandomAxis[Swing] | SobolAxis[Swing], TAGGED, SHORTHAND]
 
 
-class ShawlViewpoint(StrEnum):
-    """Cameras of the rig `shawl-3`.
-
-    Their order gives the codes of the label `viewpoint`: add new ones at the end.
-    """
-
-    front = "front"
-    side = "side"
-    high = "high"
-
-
-ViewpointAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("ShawlViewpoint"), name_schema(ShawlViewpoint)]], SHORTHAND
-]
-
-
 class ShawlAxes(ClothAxes):
     """What a clip of a shawl depends on."""
 
@@ -63,7 +45,7 @@ class ShawlAxes(ClothAxes):
     self_friction: MuAxis = Field(description="friction coefficient of the shawl with itself")
     swing: SwingAxis | None = Field(default=None, description="size of the figure's motion; by default 1")
     texture: TextureAxis
-    viewpoint: ViewpointAxis = Field(description="camera of the rig, or a custom one under `viewpoints`")
+    viewpoint: ThreeViewpointAxis
 
 
 _PHYSICAL_AXES = (*PHYSICAL_AXES, "self_friction", "swing")
@@ -92,7 +74,7 @@ class ShawlSpec(ClothSpec):
     instants = 150
     instants_per_second = 15.0
     rig = "shawl-3"
-    custom = CUSTOM_LOOKS | {"viewpoint": Custom("viewpoints", "camera", tuple(ShawlViewpoint))}
+    custom = CUSTOM_LOOKS | {"viewpoint": Custom("viewpoints", "camera", tuple(ThreeViewpoint))}
 
     kind: Literal["shawl"]
     axes: ShawlAxes

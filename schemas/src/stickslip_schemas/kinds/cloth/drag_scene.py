@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, Custom, Lighting, LightingAxis, definitions
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, VIEWPOINT, Custom, Lighting, LightingAxis, definitions
 from stickslip_schemas.kinds.cloth.spec import ClothSpec
 from stickslip_schemas.spec.appearance import LampNumbers
 from stickslip_schemas.spec.arrays import array
@@ -41,9 +41,7 @@ HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_V
 """`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
 
 ViewpointAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]],
-    SHORTHAND,
-    Field(description="camera of the rig, or a custom one under `viewpoints`"),
+    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]], SHORTHAND, VIEWPOINT
 ]
 LampAxis = Annotated[
     LightingAxis | None, Field(description="range of lamps, or a custom one under `lamps`; by default `drawn`")

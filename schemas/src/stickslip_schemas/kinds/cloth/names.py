@@ -44,6 +44,21 @@ class Substrate(StrEnum):
     any = "any"
 
 
+class ThreeViewpoint(StrEnum):
+    """Cameras of the rigs of three views, `sphere-3` and `shawl-3`.
+
+    Their order gives the codes of the label `viewpoint`: add new ones at the end.
+    """
+
+    front = "front"
+    side = "side"
+    high = "high"
+
+
+VIEWPOINT = Field(description="camera of the rig, or a custom one under `viewpoints`")
+ThreeViewpointAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("ThreeViewpoint"), name_schema(ThreeViewpoint)]], SHORTHAND, VIEWPOINT
+]
 MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
 TextureAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
