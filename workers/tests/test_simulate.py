@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
+from stickslip_schemas.kinds import UnknownKindError
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
 from stickslip_sim_core.scenes import rod_hang
+from stickslip_workers.kinds import kind
 from stickslip_workers.stages.run import run_tasks
 
 
@@ -98,3 +100,10 @@ def test_all_rejected_makes_no_artifact(store: DirectoryStore, monkeypatch: pyte
     monkeypatch.setattr(rod_hang, "solve_rods", fail)
     assert {result.outcome for result in run_tasks(_rods(2), store)} == {"rejected"}
     assert not (store.root / "artifacts").exists()
+
+
+@pytest.mark.parametrize("name", ["custom", "scene", "rod"])
+def test_an_unknown_kind_is_refused(name: str) -> None:
+    """Also where sim_core has a module of that name."""
+    with pytest.raises(UnknownKindError):
+        kind(name)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
-from stickslip_sim_core.protocols import Curve, ProtocolResult, bend_twist, rod_lateral_buckling
-from stickslip_sim_core.protocols.dense import dense_master
-from stickslip_sim_core.protocols.rod_chain import extrapolated, loss_of_stability, planar_frames, round_rod, tip
+from stickslip_sim_core.protocols import Curve, ProtocolResult, rods
+from stickslip_sim_core.protocols.plots import dense_master
+from stickslip_sim_core.protocols.rods import extrapolated, loss_of_stability, planar_frames, round_rod, tip
 from stickslip_sim_core.reference import master_curves
 
 
@@ -31,8 +31,8 @@ class TestBendTwist:
         assert result.passed
 
     def test_error_falls_with_the_square_before_extrapolation(self) -> None:
-        limit = bend_twist.upper_boundary(10.0, 0.5, 1024)
-        errors = [bend_twist.upper_boundary(10.0, 0.5, n) - limit for n in (64, 128)]
+        limit = rods.upper_boundary(10.0, 0.5, 1024)
+        errors = [rods.upper_boundary(10.0, 0.5, n) - limit for n in (64, 128)]
         assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
 
     def test_lower_boundary_meets_the_upper_at_the_onset(self) -> None:
@@ -43,15 +43,15 @@ class TestBendTwist:
             assert start.stable
             return loss_of_stability(relax, start, 1e-2 * 1.05 ** np.arange(1, np.ceil(np.log(phi**3 / 1e-2) / 0.0488)))
 
-        upper, lower = (f(5.57, 0.5, 256) for f in (bend_twist.upper_boundary, lower_boundary))
+        upper, lower = (f(5.57, 0.5, 256) for f in (rods.upper_boundary, lower_boundary))
         assert 0.75 * upper < lower < upper
 
     def test_certificate_is_that_of_solve_rods(self) -> None:
         """Just above and below the measured boundary, solve_rods says the same of the planar rod."""
-        boundary = bend_twist.upper_boundary(6.0, 0.5, 128)
-        rods = solve_rods([boundary * 0.999, boundary * 1.001], [0.0, 0.0], [6.0, 6.0])
-        assert rods.converged.all()
-        assert rods.stable.tolist() == [False, True]
+        boundary = rods.upper_boundary(6.0, 0.5, 128)
+        solved = solve_rods([boundary * 0.999, boundary * 1.001], [0.0, 0.0], [6.0, 6.0])
+        assert solved.converged.all()
+        assert solved.stable.tolist() == [False, True]
 
 
 class TestRodCantilever:
@@ -71,7 +71,7 @@ class TestRodLateralBuckling:
         assert result.error < 1e-8
 
     def test_strip_that_bends_in_its_plane_buckles_later(self) -> None:
-        weights = [rod_lateral_buckling.buckling_weight(0.3, ratio, 64) for ratio in (1e2, 1e3, 1e4)]
+        weights = [rods.buckling_weight(0.3, ratio, 64) for ratio in (1e2, 1e3, 1e4)]
         assert weights[0] > weights[1] > weights[2]
 
 

@@ -23,7 +23,7 @@ from stickslip_schemas.plan.sources import digests, sources
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
-from stickslip_sim_core.protocols.dense import dense_master
+from stickslip_sim_core.protocols.plots import dense_master
 
 from stickslip_workers.builds import solver_build
 

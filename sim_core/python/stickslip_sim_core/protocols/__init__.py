@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_sim_core.protocols.bend_twist import BendTwist
 from stickslip_sim_core.protocols.cantilever import Cantilever
 from stickslip_sim_core.protocols.capstan import Capstan
 from stickslip_sim_core.protocols.certification import CERTIFICATION, SCENE_PROTOCOLS, Certification
@@ -14,9 +13,7 @@ from stickslip_sim_core.protocols.lateral_buckling import LateralBuckling
 from stickslip_sim_core.protocols.protocol import Protocol
 from stickslip_sim_core.protocols.pull_out import PullOut
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.rod_cantilever import RodCantilever
-from stickslip_sim_core.protocols.rod_chain import RodProtocol
-from stickslip_sim_core.protocols.rod_lateral_buckling import RodLateralBuckling
+from stickslip_sim_core.protocols.rods import BendTwist, RodCantilever, RodLateralBuckling, RodProtocol
 from stickslip_sim_core.protocols.stacked_incline import StackedIncline
 from stickslip_sim_core.protocols.stick_slip import StickSlip
 

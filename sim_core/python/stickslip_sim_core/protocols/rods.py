@@ -1,0 +1,247 @@
+"""Protocols of the rod solver, and its chains as they use them: given frames, equilibria, extrapolation, searches."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from stickslip_sim_core import _sim_core
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.protocols.protocol import Protocol
+from stickslip_sim_core.protocols.result import Setting
+from stickslip_sim_core.reference import master_curves
+
+POISSON = (0.0, 0.3, 0.5)
+
+# Bisections end at this relative width.
+BISECTION = 1e-12
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """Where a chain came to rest on one level of the solver."""
+
+    gamma: float
+    """Weight, rho A g L^3 / EI [-]."""
+
+    frames: Floats
+    """Quaternions, shape (N + 1, 4), rows (w, x, y, z); the clamp first."""
+
+    stable: bool
+    """In equilibrium, with a positive definite Hessian."""
+
+
+# From a weight and frames to the equilibrium next to them.
+Relax = Callable[[float, Floats], Equilibrium]
+
+
+def round_rod(phi: float, poisson: float) -> Relax:
+    """Relax chains of a round rod with natural bend phi / L by the rod solver's Newton method."""
+
+    def relax(gamma: float, frames: Floats) -> Equilibrium:
+        at_rest, _, stable, *_ = _sim_core.relax_rod(gamma, 0.0, phi, 1.0 / (1.0 + poisson), frames)
+        return Equilibrium(gamma, at_rest, stable)
+
+    return relax
+
+
+def planar_frames(angles: Floats) -> Floats:
+    """Frames in the plane y = 0, d3 = -y, whose tangents make these angles [rad] with gravity, shape (N + 1, 4)."""
+    c, s = np.cos(0.5 * angles), np.sin(0.5 * angles)
+    # (1, 1, 1, -1) / 2, the clamp of solve_rods, times (c, 0, 0, s).
+    return 0.5 * np.stack([c + s, c + s, c - s, s - c], axis=1)
+
+
+def tip(frames: Floats) -> Floats:
+    """Position of the free end [L], shape (3,): r' = d1 by the trapezoidal rule, whose error is even in h."""
+    w, x, y, z = frames.T
+    tangents = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)], axis=1)
+    weights = np.full(len(w), 1.0 / (len(w) - 1))
+    weights[[0, -1]] *= 0.5
+    return np.asarray(weights @ tangents)
+
+
+def extrapolated(measure: Callable[[int], float], elements: int) -> float:
+    """Measure with 1/4, 1/2 and all of `elements` and go to the limit, as the solver does: error O(h^6)."""
+    coarse, middle, fine = (measure(elements // k) for k in (4, 2, 1))
+    return float(64.0 * fine - 20.0 * middle + coarse) / 45.0
+
+
+def loss_of_stability(relax: Relax, start: Equilibrium, gammas: Iterable[float]) -> float:
+    """Follow a stable equilibrium through `gammas` and bisect where it ceases to be stable; NaN where it does not."""
+    stable = start
+    for gamma in gammas:
+        after = relax(float(gamma), stable.frames)
+        if not after.stable:
+            return _bisected(relax, stable, after.gamma)
+        stable = after
+    return np.nan
+
+
+def _bisected(relax: Relax, stable: Equilibrium, unstable: float) -> float:
+    """Bisect between a stable equilibrium and a weight at which it is not."""
+    while abs(unstable - stable.gamma) > BISECTION * unstable:
+        middle = relax(0.5 * (stable.gamma + unstable), stable.frames)
+        if middle.stable:
+            stable = middle
+        else:
+            unstable = middle.gamma
+    return 0.5 * (stable.gamma + unstable)
+
+
+@dataclass(kw_only=True, eq=False)
+class RodProtocol(Protocol):
+    """A protocol of the rod solver.
+
+    Raises:
+        ValueError: `elements` breaks its rule.
+    """
+
+    elements: int
+    """Of the finest chain, a multiple of 4, at least 16."""
+
+    def __post_init__(self) -> None:
+        count = self.elements
+        if isinstance(count, bool) or not isinstance(count, int) or count < 16 or count % 4:
+            raise ValueError(f"elements: must be a multiple of 4 and at least 16, got {count!r}")
+
+    def reported(self) -> dict[str, Setting]:
+        return {"elements": self.elements}
+
+
+# Natural curvature times L [rad]: 6 ... 25 pi.
+PHI = (6.0, 6.5, 7.0, 8.0, 10.0, 12.5, 16.0, 20.0, 27.0, 36.0, 48.0, 62.0, 25.0 * np.pi)
+
+# Branches are followed in these steps of gamma; close to the onset the three-dimensional window may be narrower than
+# one of them. From above they start at gamma = phi^3, where every such rod hangs almost straight and stable, and end at
+# gamma = 1e-4 phi^3, where all of it has curled up again.
+DOWN = 0.9
+DOWN_TO = 1e-4
+
+
+@dataclass(kw_only=True, eq=False)
+class BendTwist(RodProtocol):
+    """The weight at which a hanging curly rod leaves its plane [Miller et al. 2014; Romero et al. 2021].
+
+    Measured is the weight at which the Hessian along a branch of planar equilibria ceases to be positive definite. An
+    exactly planar rod stays planar. The master curve is `master_curves.bend_twist`.
+    """
+
+    name, x_name, y_name = "bend-twist", "phi", "Gamma"
+    points, parameters = "phi", {"poisson": "poisson"}
+
+    phi: Sequence[float] = PHI
+    """Natural curvatures times L [rad]."""
+    poisson: Sequence[float] = POISSON
+    elements: int = 1024
+    tolerance: float = 1e-4
+
+    def measure(self, phi: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        boundary = extrapolated(lambda elements: upper_boundary(phi, at["poisson"], elements), self.elements)
+        return boundary, float(master_curves.bend_twist(phi, at["poisson"]))
+
+
+def upper_boundary(phi: float, poisson: float, elements: int) -> float:
+    """Return the weight at which the planar chain, followed from large weights downwards, loses stability, or NaN."""
+    relax = round_rod(phi, poisson)
+    start = relax(phi**3, planar_frames(np.zeros(elements + 1)))
+    if not start.stable:
+        raise RuntimeError(f"bend-twist: the heavy rod of phi = {phi} is not stable on {elements} elements")
+    steps = np.arange(1, np.ceil(np.log(DOWN_TO) / np.log(DOWN)))
+    return loss_of_stability(relax, start, phi**3 * DOWN**steps)
+
+
+# Weights rho A g L^3 / EI [-]: 1e-3 ... 1e5.
+GAMMA = tuple(float(g) for g in 10.0 ** np.arange(-3.0, 5.1, 0.5))
+
+
+@dataclass(kw_only=True, eq=False)
+class RodCantilever(RodProtocol):
+    """H/W, drop of the tip over its horizontal reach, against `master_curves.cantilever`."""
+
+    name, x_name, y_name = "rod-cantilever", "Gamma", "H/W"
+    points = "gamma"
+
+    gamma: Sequence[float] = GAMMA
+    elements: int = 2048
+    tolerance: float = 1e-4
+
+    def measure(self, gamma: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        drop = extrapolated(lambda elements: drop_over_reach(gamma, elements), self.elements)
+        return drop, float(master_curves.cantilever(gamma))
+
+
+def drop_over_reach(gamma: float, elements: int) -> float:
+    """Return H/W of a straight chain clamped horizontally, NaN if it finds no stable equilibrium."""
+    straight = planar_frames(np.full(elements + 1, 0.5 * np.pi))
+    hanging = round_rod(0.0, 0.5)(gamma, straight)
+    if not hanging.stable:
+        return np.nan
+    x, y, z = tip(hanging.frames)
+    return float(-z / np.hypot(x, y))
+
+
+# Bending stiffness in the strip's plane over that across it; the buckling weight is a power series in its inverse.
+STIFFNESS_RATIOS = (1000.0, 2000.0, 4000.0)
+
+# The weight over sqrt(EI GJ) grows from half of what buckles a strip, in these steps.
+UP_FROM = 6.0
+UP = 1.1
+UP_TO = 60.0
+
+
+@dataclass(kw_only=True, eq=False)
+class RodLateralBuckling(RodProtocol):
+    """The weight at which a strip clamped edge-on buckles sideways, against `master_curves.lateral_buckling_rod`.
+
+    Measured is the loss of a positive definite Hessian as the weight of a strip grows that stays in its vertical plane.
+    The limit of a strip that does not bend in its own plane is reached by extrapolation.
+    """
+
+    name, x_name, y_name = "rod-lateral-buckling", "poisson", "rho A g L^3 / sqrt(EI GJ)"
+    points = "poisson"
+
+    poisson: Sequence[float] = POISSON
+    elements: int = 128
+    tolerance: float = 1e-4
+
+    def measure(self, poisson: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        return rigid_limit(poisson, self.elements), master_curves.lateral_buckling_rod()
+
+    def reported(self) -> dict[str, Setting]:
+        return super().reported() | {"stiffness_ratios": STIFFNESS_RATIOS}
+
+
+def rigid_limit(poisson: float, elements: int) -> float:
+    """Return the buckling weight of a continuous strip, rigid in its plane."""
+    single, double, fourfold = (
+        extrapolated(partial(buckling_weight, poisson, ratio), elements) for ratio in STIFFNESS_RATIOS
+    )
+    return (8.0 * fourfold - 6.0 * double + single) / 3.0
+
+
+def buckling_weight(poisson: float, stiffness_ratio: float, elements: int) -> float:
+    """Return rho A g L^3 / sqrt(EI GJ) at which the chain of a strip loses stability, NaN if it never does."""
+    # A thin strip: EI = Y w t^3 / 12 across its plane, GJ = Y w t^3 / (6 (1 + poisson)).
+    twist = 2.0 / (1.0 + poisson)
+    relax = strip_chain(twist, stiffness_ratio, elements)
+    horizontal = planar_frames(np.full(elements + 1, 0.5 * np.pi))
+    start = relax(UP_FROM * np.sqrt(twist), horizontal)
+    if not start.stable:
+        return np.nan
+    steps = np.arange(1, np.ceil(np.log(UP_TO / UP_FROM) / np.log(UP)))
+    return loss_of_stability(relax, start, start.gamma * UP**steps) / float(np.sqrt(twist))
+
+
+def strip_chain(twist_stiffness: float, stiffness_ratio: float, elements: int) -> Relax:
+    """Relax chains of a straight strip; d3 = -y is the axis it hardly bends about."""
+    stiffness = np.array([twist_stiffness, 1.0, stiffness_ratio])
+    straight = np.zeros((elements, 3))
+
+    def relax(gamma: float, frames: Floats) -> Equilibrium:
+        at_rest, _, _, stable = _sim_core.relax_chain(gamma, stiffness, straight, frames)
+        return Equilibrium(gamma, at_rest, stable)
+
+    return relax
