@@ -4,6 +4,7 @@ import pkgutil
 import subprocess
 import sys
 
+import pytest
 import stickslip_training
 
 MODULES = [module.name for module in pkgutil.walk_packages(stickslip_training.__path__, "stickslip_training.")]
@@ -27,6 +28,7 @@ def run(blocked, modules):
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.real
 def test_everything_imports_without_what_makes_and_serves_datasets():
     blocked = ["ray", "bpy", "fastapi", "starlette", "sqlalchemy", "zarr", "tensorstore", "matplotlib"]
     blocked += ["stickslip_workers", "stickslip_services", "stickslip_sim_core", "stickslip_blender"]

@@ -106,6 +106,7 @@ def test_numpy_must_draw_the_same_noise(rod_set, monkeypatch):
         checked("some-rods", rod_set.root)
 
 
+@pytest.mark.physics
 def test_clips_that_look_different_are_refused(folder, make_clips, monkeypatch):
     clips = make_clips(frames=4)
     add_set(folder, "some-clips", clips, None)

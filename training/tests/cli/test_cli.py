@@ -23,6 +23,7 @@ def test_info_says_what_is_in_a_dataset(clips):
     assert re.search(r"video +uint8 +12 × 2 × 224 × 224 × 3 +3\.6 MB", result.output)
 
 
+@pytest.mark.physics
 def test_curvature_trains_and_writes(rods, tmp_path):
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
@@ -48,6 +49,7 @@ def test_curvature_trains_and_writes(rods, tmp_path):
     assert len(json.loads((out / "report.json").read_text())["history"]) == 2
 
 
+@pytest.mark.physics
 def test_local_global_trains_and_writes(rods, tmp_path):
     out, measured = tmp_path / "out", tmp_path / "reconstructed.npz"
     true = np.zeros((4, 150, 3))

@@ -38,6 +38,7 @@ def clips(make_clips):
     return made
 
 
+@pytest.mark.physics
 def test_train_and_evaluate(packed, tmp_path):
     run = ["cloth", "train", str(packed), "--out", str(tmp_path / "run"), "--threads", "1"]
     trained = runner.invoke(app, [*run, "--steps", "2"])

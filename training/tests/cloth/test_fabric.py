@@ -97,6 +97,7 @@ def test_heads_of_quantities_leave_the_rest_of_the_network_as_it_was():
     assert len(nets[1]) == len(nets[0]) + 4
 
 
+@pytest.mark.physics
 def test_a_model_tells_histograms_of_a_fabric_and_is_read_back(model, parts, tmp_path):
     clips = render_clips(parts[1], 1, 0)
     told = model.fabric(clips)
@@ -111,6 +112,7 @@ def test_a_model_tells_histograms_of_a_fabric_and_is_read_back(model, parts, tmp
     assert all(np.array_equal(histogram, told[name]) for name, histogram in again.fabric(clips).items())
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_the_weights_of_the_package_and_learns_its_new_heads(parts, monkeypatch):
     """These know more fabrics, and friction only."""
     start = load_friction()
@@ -139,6 +141,7 @@ def test_it_goes_on_from_the_weights_of_the_package_and_learns_its_new_heads(par
         parts[0].named(start.materials[:3])
 
 
+@pytest.mark.physics
 def test_the_commands_tell_the_fabric(tmp_path):
     runner = CliRunner(env={"COLUMNS": "160", "NO_COLOR": "1"})
     out = tmp_path / "run"

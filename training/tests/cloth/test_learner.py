@@ -30,6 +30,7 @@ def equal(first, second):
     return all(torch.equal(value, weights(second)[name]) for name, value in weights(first).items())
 
 
+@pytest.mark.physics
 def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, tmp_path, monkeypatch):
     from stickslip_training.engine import fit as engine
 
@@ -43,6 +44,7 @@ def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, t
     assert not equal(straight, train_friction(*few[:2], replace(SMALL, seed=1), epoch=2))
 
 
+@pytest.mark.physics
 def test_saved_and_loaded(few, tmp_path):
     model = train_friction(*few[:2], SMALL, epoch=6)
     save_friction(tmp_path / "friction.safetensors", model)
@@ -68,6 +70,7 @@ def test_what_is_no_model_is_refused(tmp_path):
         load_friction(tmp_path / "none.safetensors")
 
 
+@pytest.mark.physics
 def test_every_render_has_a_look_of_its_own_and_the_seed_repeats_it(few):
     clips = render_clips(few[2], 2, 3)
     assert torch.equal(clips.crops, render_clips(few[2], 2, 3).crops)
@@ -93,11 +96,11 @@ def test_temperatures_mend_what_is_too_sure():
 
 def test_intervals_of_a_network_that_is_twice_too_sure_become_twice_as_wide():
     random = np.random.default_rng(0)
-    mu = random.uniform(0.5, 1.1, 2000)
-    told = mu + random.normal(0.0, 0.1, 2000)
+    mu = random.uniform(0.5, 1.1, 500)
+    told = mu + random.normal(0.0, 0.1, 500)
     log_mu = (-0.5 * ((MU_BINS.centers - told[:, None]) / 0.05) ** 2)[:, None]
     # A Gaussian histogram at temperature T is sqrt(T) as wide.
-    found = covering_temperature(np.zeros((2000, 1), np.float32), log_mu, mu, MU_BINS, 1.0)
+    found = covering_temperature(np.zeros((500, 1), np.float32), log_mu, mu, MU_BINS, 1.0)
     assert found == pytest.approx(4.0, rel=0.15)
 
 
@@ -124,6 +127,7 @@ def some_clips(few, renders=2):
     return RenderedClips(train, replace(validation, run=validation.run + 100))
 
 
+@pytest.mark.physics
 def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_path):
     first = train_friction(*few[:2], SMALL, epoch=6)
     going = replace(SMALL, steps=4, learning_rate=1e-4)
@@ -140,6 +144,7 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_p
     assert 0.0 < distance(model, first) < 0.2 * distance(fresh, first)
 
 
+@pytest.mark.physics
 def test_half_of_each_batch_is_of_the_clips(few):
     black = replace(some_clips(few).train, mu=np.full(18, 9.0))
     learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
@@ -148,6 +153,7 @@ def test_half_of_each_batch_is_of_the_clips(few):
     assert (mu == 9.0).tolist() == [False] * 3 + [True] * 3
 
 
+@pytest.mark.physics
 def test_jittered_crops_are_those_of_another_exposure():
     crops = torch.rand(4, 6, 72, 88, generator=torch.Generator().manual_seed(0))
     other = jittered(crops, torch.Generator().manual_seed(1))
@@ -158,6 +164,7 @@ def test_jittered_crops_are_those_of_another_exposure():
         assert 0.95 < likeness < 1.0
 
 
+@pytest.mark.physics
 def test_clips_of_one_simulation_in_both_splits_are_refused(few):
     clips = render_clips(few[0], 1, 0)
     with pytest.raises(ValueError, match="clips of one simulation must not be in both splits"):
@@ -168,6 +175,7 @@ def test_clips_of_one_simulation_in_both_splits_are_refused(few):
         RenderedClips(clips, clips[np.arange(0)])
 
 
+@pytest.mark.physics
 def test_a_model_of_another_size_is_no_start(few):
     model = train_friction(*few[:2], SMALL, epoch=6)
     with pytest.raises(ValueError, match="the model to start from must know the runs' materials, and be"):

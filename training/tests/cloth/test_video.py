@@ -27,6 +27,8 @@ cv2 = pytest.importorskip("cv2")
 START, FRAMES_A_SECOND, DISTORTION = 1.7, 6, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 CAMERA = next(camera for camera in load_rig("drag") if camera.name == "calibrated")
 
+pytestmark = pytest.mark.physics  # films are written and tracked
+
 
 def pictures(run, seconds):
     """Return grey levels (F, 224, 224) as a pinhole camera sees them: a checked cloth on a dark floor."""

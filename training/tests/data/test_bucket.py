@@ -62,6 +62,7 @@ def test_a_sample_is_one_request(clips_url, server, monkeypatch):
         assert len(asked) == len(slots)
 
 
+@pytest.mark.real
 def test_workers_that_are_spawned_read_it(clips_url, clips):
     dataset = Samples(clips_url, "train")
     loader = dataset.loader(2, num_workers=1, multiprocessing_context="spawn")

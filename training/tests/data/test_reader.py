@@ -106,6 +106,7 @@ def test_works_in_a_forked_child_after_use_in_the_parent(clips):
 # --- damage ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.physics
 def test_no_flipped_bit_is_silent(clips, tmp_path):
     """Single flips anywhere in the files of shards and labels: 6 in each file, and 100 more."""
     made = clips.copy(tmp_path / "v1")
@@ -250,6 +251,7 @@ def test_no_flipped_bit_in_the_files_that_vouch_for_the_others_is_silent(rods, t
     DatasetReader(made.root)
 
 
+@pytest.mark.physics
 def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
     """200 swaps: those that chance makes equal in size, and a sample's chunk that is put where another's was."""
     made = clips.copy(tmp_path / "v1")

@@ -121,6 +121,7 @@ def test_a_ring_takes_batches_of_any_size(clips):
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.real
 def test_workers_read_what_one_process_reads(clips, method):
     dataset = Samples(clips.root, ring=2)
     dataset.__getitems__([0])  # used in the parent first

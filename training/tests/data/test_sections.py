@@ -88,6 +88,7 @@ def test_opening_and_filtering_read_no_section(sectioned):
             reader.read("video", [0])
 
 
+@pytest.mark.physics
 def test_no_flipped_bit_of_a_section_is_silent(sectioned):
     slots = DatasetReader(sectioned.root).slots()
     generator = np.random.default_rng(4)

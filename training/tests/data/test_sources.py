@@ -121,6 +121,7 @@ def test_verify_reads_every_file(server, seen_rods):
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.real
 def test_workers_make_connections_of_their_own(server, seen_rods, method):
     dataset = Samples(_url(server), arrays=["centerline", "views"])
     dataset[0]  # the parent is connected already

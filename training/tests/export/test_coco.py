@@ -24,6 +24,7 @@ def test_run_lengths_give_the_mask_back() -> None:
         assert np.array_equal(found, mask)
 
 
+@pytest.mark.physics
 def test_frames_and_segments_are_written(make_clips: Callable[..., Any], tmp_path: Path) -> None:
     made = make_clips(ground_truth=["segmentation"], rejected=(3,))
     with DatasetReader(made.root) as reader:

@@ -112,6 +112,7 @@ def test_webdataset_is_the_source(source: Any, tmp_path: Path, monkeypatch: pyte
     assert (target / "source-manifest.json").read_bytes() == (source.root / "manifest.json").read_bytes()
 
 
+@pytest.mark.physics
 def test_huggingface_is_the_source(source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     datasets = pytest.importorskip(
         "datasets", reason="datasets is not installed: pip install 'stickslip-training[export]'"

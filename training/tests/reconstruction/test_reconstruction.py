@@ -178,6 +178,7 @@ def bench(tmp_path):
     return folder, calibration, line
 
 
+@pytest.mark.physics
 def test_the_command_writes_centreline_overlay_and_report(bench, tmp_path):
     folder, calibration, line = bench
     out = tmp_path / "out"

@@ -143,6 +143,7 @@ def test_the_drawing_changes_as_its_derivatives_say():
         np.testing.assert_allclose(derivative[known], difference[known], atol=1e-2 * scale)
 
 
+@pytest.mark.physics
 def test_the_cost_falls_as_its_gradient_says(views, line):
     fit = start(curve.fit(line, 44), 1.1 * RADIUS, 4)
     fit = replace(fit, control=fit.control + 0.002 * np.sin(np.arange(132).reshape(44, 3)))
@@ -158,6 +159,7 @@ def test_the_cost_falls_as_its_gradient_says(views, line):
         )
 
 
+@pytest.mark.physics
 def test_the_hull_holds_the_rod_and_little_else(views, line):
     cloud = visual_hull(views)
     gaps = np.linalg.norm(line[:, None] - cloud, axis=-1).min(axis=1)

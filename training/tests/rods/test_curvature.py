@@ -70,6 +70,7 @@ def test_few_test_rods_are_told(trained):
     assert trained[1].notes[0].startswith(f"There are only {trained[1].rods['test']} test rods")
 
 
+@pytest.mark.physics
 def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, tmp_path):
     first = train_curvature(config)
     again = replace(config, out=tmp_path / "again")
@@ -82,6 +83,7 @@ def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, 
     assert not torch.equal(weights(config)["head.3.weight"], weights(other)["head.3.weight"])
 
 
+@pytest.mark.physics
 def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path, monkeypatch):
     straight = train_curvature(config)
     stopped = replace(config, out=tmp_path / "stopped", epochs=None, minutes=1000.0)
@@ -101,6 +103,7 @@ def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path
         train_curvature(replace(config, out=tmp_path / "nothing"), resume=True)
 
 
+@pytest.mark.physics
 def test_the_model_is_the_average_of_the_weights_or_the_last_ones(config, tmp_path):
     def net_of(file):
         return torch.load(file, weights_only=True)["net"]["head.3.weight"]
@@ -115,6 +118,7 @@ def test_the_model_is_the_average_of_the_weights_or_the_last_ones(config, tmp_pa
     assert not torch.equal(net_of(config.out / "model.pt"), weights[0])
 
 
+@pytest.mark.physics
 def test_a_time_budget_is_kept_also_within_an_epoch(config, monkeypatch):
     clock = iter(np.arange(0.0, 1e6, 10.0))  # ten seconds pass whenever someone looks
     monkeypatch.setattr(engine.time, "perf_counter", lambda: float(next(clock)))
@@ -124,6 +128,7 @@ def test_a_time_budget_is_kept_also_within_an_epoch(config, monkeypatch):
     assert report.best_step > 0
 
 
+@pytest.mark.physics
 def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
     axes = {"gamma": [200.0, 400.0, 800.0], "phi0": [1.0, 3.0], "phi1": 8.0}
 
@@ -145,6 +150,7 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
     assert only_test.notes[0] == "The train split is empty: the network was trained on the test split."
 
 
+@pytest.mark.physics
 def test_evaluation_of_a_part_is_told(config):
     report = train_curvature(replace(config, epochs=1, evaluation_rods=3))
     assert report.rods["test"] == 3
@@ -178,12 +184,14 @@ def test_a_config_is_checked_where_it_is_built(config, changes, message):
         replace(config, **changes)
 
 
+@pytest.mark.physics
 def test_the_number_of_threads_is_put_back(config):
     before = torch.get_num_threads()
     train_curvature(replace(config, epochs=1))
     assert torch.get_num_threads() == before
 
 
+@pytest.mark.physics
 def test_rods_in_memory_train_as_those_of_a_dataset(config, rods, tmp_path):
     with DatasetReader(rods.root) as reader:
         parts = [read_rods(reader, reader.slots(split)) for split in ("train", "validation")]

@@ -32,6 +32,7 @@ def trained() -> LocalGlobalNet:
     return train_local_global(*helices(2000, 0), settings)
 
 
+@pytest.mark.physics
 def test_features_are_whitened_and_answers_are_the_mean_before_training():
     x, k = map(torch.from_numpy, helices(200, 1))
     net = LocalGlobalNet(width=16, blocks=1, centerline_modes=4, strain_modes=2, local=2)
@@ -78,6 +79,7 @@ def test_it_learns(trained: LocalGlobalNet):
     assert error.median() < 0.4 * mean.median()
 
 
+@pytest.mark.physics
 def test_the_same_run_gives_the_same_weights_and_reports():
     rods = helices(50, 4)
     settings = LocalGlobalTraining(steps=7, batch_size=8, **SMALL)
