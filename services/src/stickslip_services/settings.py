@@ -119,7 +119,7 @@ class Settings(BaseSettings):
 
     @property
     def keys_required(self) -> bool:
-        """Whether a request without a key is refused, whatever it asks for."""
+        """Whether every request without a key is refused."""
         return self.require_keys or self.behind_proxy or self.tls_certificate is not None or not is_loopback(self.host)
 
     @property
@@ -157,5 +157,5 @@ class Settings(BaseSettings):
 
     @property
     def url(self) -> str:
-        """Where the coordinator can be reached from this machine."""
+        """URL of the coordinator on this machine."""
         return http_url(reachable(self.host), self.port, tls=self.tls_certificate is not None)

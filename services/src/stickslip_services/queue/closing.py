@@ -74,7 +74,7 @@ def close(book: Ledger) -> None:
     ):
         book.end_job(job, _quarantined(book.connection, job))
     _settle(book, given_up)
-    _tell(book)
+    _emit(book)
     for job, ending in book.endings.items():
         _end_job(book, job, ending)
     if not {JobState.cancelling, JobState.pausing}.isdisjoint(state for _, state, _ in open_jobs):
@@ -132,7 +132,7 @@ def _quarantined(connection: Connection, job: int) -> Ending:
     return Ending(JobState.failed, Reason.quarantined, message)
 
 
-def _tell(book: Ledger) -> None:
+def _emit(book: Ledger) -> None:
     holders = book.holders(task for task, _ in book.news)
     for task, event in book.news:
         for holder in holders.get(task, ()):

@@ -1,6 +1,6 @@
-"""States and events of jobs: an event is written in the transaction that makes it true, and read by event streams.
+"""States and events of jobs. An event is stored in the transaction of the change, and read by event streams.
 
-Progress is not written: it is read from the counters when somebody watches.
+Progress is not stored: it is read from the counters while a job is watched.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class StoredEvent:
 
     @property
     def is_last(self) -> bool:
-        """True where the job has come to its end with this event."""
+        """True where the job ends with this event."""
         return self.name is EventName.job_state and not JobStateEvent.model_validate_json(self.data).state.is_open
 
 
@@ -42,7 +42,7 @@ def set_job_state(
     reason: Reason | None = None,
     message: str = "",
 ) -> None:
-    """Give a job a state with its reason and message, and tell it in an event."""
+    """Set the state of a job with its reason and message, and store the event."""
     values: dict[str, object] = {"state": state, "reason": reason, "message": message}
     if state is JobState.running:
         values["started_at"] = func.coalesce(jobs.c.started_at, now)
@@ -54,12 +54,12 @@ def set_job_state(
 
 
 def append_task_state(connection: Connection, job: int, event: TaskStateEvent, now: float) -> None:
-    """Tell that a task of a job came to an end worth telling."""
+    """Store the event of a failed or rejected task."""
     _append(connection, job, EventName.task_state, event, now)
 
 
 def append_published(connection: Connection, job: int, dataset: DatasetRef, now: float) -> None:
-    """Tell that the dataset of a job is there."""
+    """Store the event of a published dataset."""
     _append(connection, job, EventName.dataset_published, DatasetPublishedEvent(dataset=dataset), now)
 
 

@@ -1,4 +1,4 @@
-"""The ledger of one write transaction: what it does to tasks, and which jobs it ends.
+"""The ledger of a write transaction: its changes of tasks, and the jobs that it ends.
 
 Who changes `tasks.state` tells the ledger. `closing.close` then brings counters and jobs up to date, in the same
 transaction.
@@ -18,28 +18,28 @@ from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.eta import Run
 
 RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
-"""States of a job whose tasks may be leased: of one that is being planned, those that are written down."""
+"""States of a job whose tasks may be leased; a `planning` job has only a part of them."""
 
 LIVE = (*RUNNABLE, JobState.pausing, JobState.paused)
 """States of a job that needs its tasks."""
 
 OVER = tuple(state for state in TaskState if state.is_over)
-"""States of a task that nothing is left to do of."""
+"""States of a finished task."""
 
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """A job that has a task, and whether the task was settled before the job came."""
+    """A job that has a task, and whether the task was settled before the job was submitted."""
 
     job: int
     cached: bool
     cost_group: str
-    """Of the task."""
+    """Cost group of the task."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How a job ends, and which dataset version it has made or found."""
+    """The end state of a job, and the dataset version that it has made or found."""
 
     state: JobState
     reason: Reason | None
@@ -58,7 +58,7 @@ class Ending:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A task that has gone from one state to another."""
+    """A change of a task's state."""
 
     task: int
     stage: Stage
@@ -68,7 +68,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class HeldTask:
-    """A task on lease, or one that was a moment ago."""
+    """A leased task, or one whose lease has just ended."""
 
     seq: int
     key: bytes
@@ -93,7 +93,7 @@ ADD_TO_JOB_COUNTS = Prepared(
 
 
 class Ledger:
-    """What one write transaction does to tasks."""
+    """The changes of one write transaction."""
 
     def __init__(self, connection: Connection, now: float) -> None:
         self.connection = connection
@@ -106,19 +106,19 @@ class Ledger:
         self.endings: dict[int, Ending] = {}
 
     def moved(self, task: int, stage: str, old: str, new: TaskState) -> None:
-        """Note that a task has gone from one state to another."""
+        """Note a change of a task's state."""
         self.moves.append(Move(task, Stage(stage), TaskState(old), new))
 
     def ran(self, run: Run) -> None:
-        """Note what a task cost."""
+        """Note the cost of a task."""
         self.runs.append(run)
 
-    def tell(self, task: int, event: TaskStateEvent) -> None:
+    def emit(self, task: int, event: TaskStateEvent) -> None:
         """Note the events of all jobs of a task."""
         self.news.append((task, event))
 
     def end_job(self, job: int, ending: Ending) -> None:
-        """Note that a live job ends here; the first ending counts."""
+        """Note that a live job ends; the first ending counts."""
         self.endings.setdefault(job, ending)
 
     def holders(self, task_seqs: Iterable[int]) -> dict[int, list[Holder]]:
@@ -142,7 +142,7 @@ def give_up_tasks(book: Ledger, job: int, *, ending: Collection[int] = ()) -> No
 
 
 def charge_waiting_tasks(connection: Connection, job: int) -> None:
-    """Charge each waiting task of a live job to the job that it is to run for: a runnable one if there is one.
+    """Charge each waiting task of a live job to the job that it will run for, preferably a runnable one.
 
     Called whenever a job starts or stops being runnable, or changes its priority, for a task is leased only on behalf
     of the job it is charged to.
@@ -151,7 +151,7 @@ def charge_waiting_tasks(connection: Connection, job: int) -> None:
 
 
 def charge_tasks(connection: Connection, waiting: Iterable[int]) -> None:
-    """Charge waiting tasks to the jobs that they are to run for."""
+    """Charge waiting tasks to the jobs that they will run for."""
     for batch in batches(waiting):
         _charge(connection, live_jobs(connection, batch))
 
@@ -244,7 +244,7 @@ _RUNNABLE_TASKS = Prepared(
 
 
 def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collection[int] = ()) -> dict[int, int]:
-    """Return, for each of the tasks that have any, its first runnable job, or else its first live one.
+    """Return the first runnable job of each task, or else its first live one; tasks without any are left out.
 
     First is the one of the highest priority, and of these the oldest. Jobs in `but` are left out.
     """
@@ -258,5 +258,5 @@ def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collecti
 
 
 def runnable_tasks(connection: Connection, task_seqs: Iterable[int]) -> set[int]:
-    """Return those of the tasks that a runnable job needs."""
+    """Return the tasks that a runnable job needs."""
     return {task for batch in batches(task_seqs) for (task,) in _RUNNABLE_TASKS.tuples(connection, {"b_tasks": batch})}

@@ -1,4 +1,4 @@
-"""How far jobs are, from the counters that the ledger keeps; of `tasks` only rows with numbers of frames are read."""
+"""Progress of jobs, from the counters of the ledger, and from the frames that running simulations report."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from stickslip_services.queue.eta import Cost, Group, StageWork, estimate, poole
 from stickslip_services.queue.ids import task_key
 
 Frames = Mapping[str, tuple[int, int]]
-"""Of the simulations that run and tell, by task: frames done, and frames."""
+"""Progress of running simulations by task: (frames done, frames total)."""
 
 
 def read_progress(
@@ -23,7 +23,7 @@ def read_progress(
     costs: Mapping[Group, Cost],
     frames: Frames,
 ) -> dict[int, Progress]:
-    """Return the progress of jobs (rows of `jobs`) by `seq`; `slots` says how many tasks of each can run at once."""
+    """Return the progress of jobs (rows of `jobs`) by `seq`; `slots` is the number of tasks that can run at once."""
     seqs = [row.seq for row in rows]
     counts: dict[tuple[int, str], dict[TaskState, int]] = {}
     for job, stage, state, count in connection.execute(select(job_counts).where(job_counts.c.job.in_(seqs))):
@@ -41,7 +41,7 @@ def read_progress(
 
 
 def _frames(connection: Connection, seqs: list[int], frames: Frames) -> dict[tuple[int, str, str], "_Sum"]:
-    """Return the frames of the tasks that tell, by job, stage and cost group."""
+    """Return the reported frames by job, stage and cost group."""
     found: dict[tuple[int, str, str], _Sum] = {}
     by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
     if not by_key:
@@ -62,7 +62,7 @@ class _Sum(NamedTuple):
     done: int
     total: int
     share: float
-    """Of tasks that are done of running ones."""
+    """Sum of the finished fractions of running tasks."""
 
 
 class _Known(NamedTuple):
@@ -74,7 +74,7 @@ class _Known(NamedTuple):
 
 
 def rejected_samples(progress: Progress) -> int:
-    """Return the number of rejected samples, while a job runs: one for each rejected task of the last stage."""
+    """Return the number of rejected samples of a running job: the rejected tasks of its last stage."""
     rendered = progress.stages.get(Stage.render)
     last = rendered if rendered is not None and rendered.counts else progress.stages.get(Stage.simulate)
     return 0 if last is None else last.counts.get(TaskState.rejected, 0)

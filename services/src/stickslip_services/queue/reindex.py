@@ -31,7 +31,7 @@ from stickslip_services.queue.plan import Terms, pieces
 from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
 
 PIECE = 10_000
-"""Samples that are planned at once."""
+"""Size of the pieces of a plan [samples]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +42,12 @@ class Found:
     """Dataset and version, as in `ds-0123456789abcdef:v1`."""
     samples: int
     fault: str
-    """Why it was not taken in; empty where it was."""
+    """Why it was left out; empty if it was not."""
     is_new: bool = True
 
 
 def reindex(database: Database, store: Store) -> Iterator[Found]:
-    """Take in the versions that are in the store and not in the database, one transaction each; yield all of them."""
+    """Insert the versions that only the store has, one transaction each; yield all versions of the store."""
     for shown in store.versions(MANIFEST_NAME):
         name = f"{shown.dataset}:v{shown.version}"
         try:
@@ -55,12 +55,12 @@ def reindex(database: Database, store: Store) -> Iterator[Found]:
         except (OSError, ValueError) as error:
             yield Found(name, 0, str(error).splitlines()[0])
             continue
-        is_new = _take_in(database, store, manifest, output, shown.modified_at)
+        is_new = _insert(database, store, manifest, output, shown.modified_at)
         yield Found(name, manifest.sample_count, "", is_new)
 
 
 def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
-    """Read a version; put artifacts back that are gone and that the version still shows."""
+    """Read a version; restore lost artifacts from the files of the version."""
     place = shown.dataset, shown.version
     content, group, seal = (store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME))
     check_seal(content, group, seal)
@@ -82,8 +82,8 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     return manifest, output
 
 
-def _take_in(database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float) -> bool:
-    """Write a version down as the work of a job that has ended; return False where it is known."""
+def _insert(database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float) -> bool:
+    """Insert a version as the result of an ended job; return False where it is known."""
     terms = Terms(manifest.builds, manifest.certificate)
     with database.write() as connection:
         if version_exists(connection, manifest.dataset, manifest.version):

@@ -312,7 +312,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
             event = TaskStateEvent(
                 task_id=name, stage=task.stage, state=state, reason=result.reason, message=result.message
             )
-            book.tell(task.seq, event)
+            book.emit(task.seq, event)
     _release_dependents(book, [end.task.seq for end in settled], rejected)
 
 

@@ -68,7 +68,7 @@ def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], s
         retry_at = book.now + settings.retry_seconds * 2 ** (tries - 1)
         values = {"tries": tries, "reason": reason, "message": message, "retry_at": retry_at}
         release(book, task, TaskState.soft_failed, job=job, **values)
-        _tell(book, task, TaskState.soft_failed, reason, message)
+        _emit(book, task, TaskState.soft_failed, reason, message)
 
 
 def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, times: int, settings: Settings) -> None:
@@ -78,14 +78,14 @@ def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, 
     name = task_id(task.stage, task.key)
     if not reason.ends_a_process:
         release(book, task, TaskState.failed, reason=reason, message=message, **values)
-        _tell(book, task, TaskState.failed, reason, message)
+        _emit(book, task, TaskState.failed, reason, message)
         _fail_jobs(book, task, f"task {name} failed {times} times, at last with {reason}: {message}", settings)
         return
     message = (
         f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {reproducer(name, settings)}"
     )
     release(book, task, TaskState.failed, reason=Reason.quarantined, message=message, **values)
-    _tell(book, task, TaskState.failed, Reason.quarantined, message)
+    _emit(book, task, TaskState.failed, Reason.quarantined, message)
     for job_seq in _live_holders(book, task):
         count = _count_failed(book.connection, job_seq)
         if count > settings.max_quarantined:
@@ -97,10 +97,10 @@ def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, 
             set_job_state(book.connection, job_seq, state, book.now, reason=Reason.quarantined, message=news)
 
 
-def _tell(book: Ledger, task: HeldTask, state: TaskState, reason: Reason, message: str) -> None:
+def _emit(book: Ledger, task: HeldTask, state: TaskState, reason: Reason, message: str) -> None:
     name = task_id(task.stage, task.key)
     event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
-    book.tell(task.seq, event)
+    book.emit(task.seq, event)
 
 
 def _count_failed(connection: Connection, job: int) -> int:

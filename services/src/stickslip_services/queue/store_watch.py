@@ -1,6 +1,6 @@
-"""Whether the store can take results. While it cannot, jobs are paused and say why; afterwards they go on.
+"""Monitoring of the store. While it takes no results, jobs are paused; afterwards they resume.
 
-Two ways lead to trouble: the coordinator itself looks, or a worker reports that it could not write.
+Trouble is found by a look of the coordinator, or reported by a worker that could not write.
 """
 
 from collections.abc import Callable
@@ -9,14 +9,14 @@ from pathlib import Path
 from stickslip_schemas.store import DirectoryStore, Store
 
 HOLD_SECONDS = 10.0
-"""How long a worker's word counts where the coordinator itself finds nothing wrong [s]."""
+"""Duration of a worker's report, if the coordinator itself finds no fault [s]."""
 
 PROBE_SECONDS = 10.0
-"""Time between two looks at a bucket that takes results [s]: each look costs requests."""
+"""Time between two probes of a working bucket [s]: each probe costs requests."""
 
 
 class StoreWatch:
-    """Looks at the store and at the directory of the database."""
+    """Monitors the store and the directory of the database."""
 
     def __init__(self, store: Store, data: Path, *, min_free_bytes: int, clock: Callable[[], float]) -> None:
         self._places: tuple[Store, ...] = (store, DirectoryStore(data))
@@ -26,16 +26,16 @@ class StoreWatch:
         self._reported_until = float("-inf")
         self._next_probe = float("-inf")
         self.trouble = ""
-        """What is wrong, in words; empty where nothing is."""
+        """Description of the fault; empty without one."""
 
     def look(self) -> str:
-        """Look again; return what is wrong."""
+        """Check again; return the fault."""
         reported = self._reported if self._clock() < self._reported_until else ""
         self.trouble = self._fault() or reported
         return self.trouble
 
     def note(self, message: str) -> None:
-        """Take a worker's word that the store cannot be written."""
+        """Note a worker's report that the store cannot be written."""
         self._reported = message
         self._reported_until = self._clock() + HOLD_SECONDS
         self.trouble = self.trouble or message

@@ -51,11 +51,11 @@ class RegisteredWorker:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds that it makes."""
+        """The kinds that the worker makes."""
         return tuple(self.builds)
 
     def stage_builds(self, kind: str) -> dict[Stage, str]:
-        """Return which build of each stage it runs for a kind; nothing where it does not make the kind."""
+        """Return the builds for a kind by stage; empty where the worker does not make the kind."""
         return stage_builds(self.builds[kind]) if kind in self.builds else {}
 
 
@@ -103,7 +103,7 @@ def present_workers(connection: Connection, *, seen_since: float | None = None) 
 
 
 def builds_for(connection: Connection, kind: str) -> Builds | None:
-    """Return the builds that a new job of `kind` is planned for: those of the newest worker that makes the kind.
+    """Return the builds for new jobs of `kind`: those of the newest worker that makes it.
 
     None where no worker has ever registered; raise KindNotAvailableError where none of those makes it.
     """
@@ -118,7 +118,7 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
 
 
 def other_sessions(connection: Connection, name: str) -> list[str]:
-    """Return the ids of all sessions that a worker of this name has had."""
+    """Return the ids of all sessions of a worker."""
     return list(connection.scalars(select(workers.c.id).where(workers.c.name == name)))
 
 
@@ -133,7 +133,7 @@ def is_silent(context: Context, worker: RegisteredWorker) -> bool:
 
 
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:
-    """Return how many tasks of a job the workers can run at once; `builds` is JSON, None until the job is planned."""
+    """Return the number of tasks of a job that can run at once; `builds` is JSON, None for an unplanned job."""
     if builds is None:
         return 0
     needed = stage_builds(Builds.model_validate_json(builds))
@@ -141,7 +141,7 @@ def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | 
 
 
 def leased_counts(connection: Connection) -> dict[str, int]:
-    """Return how many tasks each worker holds."""
+    """Return the number of leased tasks by worker."""
     query = select(tasks.c.owner, func.count()).where(text("tasks.owner IS NOT NULL")).group_by(tasks.c.owner)
     return dict(connection.execute(query).all())
 

@@ -117,7 +117,7 @@ class _Known(NamedTuple):
 
 
 def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
-    """Write the tasks of `job` and return the state of the last of them."""
+    """Insert the tasks of `job`; return the state of the last one."""
     connection = book.connection
     needed = {key for task in plan.tasks.values() for key in task.depends_on} - plan.tasks.keys()
     known = _find(connection, [*plan.tasks, *needed])
@@ -190,7 +190,7 @@ def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
 def _insert_tasks(
     connection: Connection, job: int, plan: Plan, known: Mapping[bytes, _Known]
 ) -> tuple[dict[bytes, int], set[int]]:
-    """Insert the tasks that are not there yet, in the order of the plan.
+    """Insert the tasks that are new, in the order of the plan.
 
     Return the `seq` of every task of the plan, and those of new renders whose simulation has been rejected before.
     """

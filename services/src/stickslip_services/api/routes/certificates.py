@@ -1,4 +1,4 @@
-"""Certificates: registering them, listing them, and their pages."""
+"""Routes of certificates: register and list them, and show their pages."""
 
 from typing import Annotated, Any
 
@@ -34,7 +34,7 @@ def post_certificate(
     context: ContextDep,
     response: Response,
 ) -> CertificateEntry:
-    """Register a certificate; it may be sent twice. Of a preset and build the full one that came last stands."""
+    """Register a certificate; it may be sent twice. The newest full certificate of a preset and build counts."""
     entry = register_certificate(context.database, context.store, upload, context.clock())
     response.headers["Location"] = entry.href
     return entry

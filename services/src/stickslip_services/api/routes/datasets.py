@@ -60,13 +60,13 @@ _MANIFEST_CONTENT: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/
 )
 @router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
 def get_manifest(dataset: str, version: Version, request: Request, context: ContextDep) -> Response:
-    """Return the manifest: every file of the version with its digest, and what it was made from."""
+    """Return the manifest: every file of the version with its digest, the spec and the builds."""
     return _serve(request, context, dataset, version, MANIFEST_NAME)
 
 
 @router.get("/v1/datasets/{dataset}/versions/{version}/page", include_in_schema=False)
 def get_page(dataset: str, version: Version, context: ContextDep) -> Response:
-    """Return the version's page for people: its acceptance rate, and where in the grid samples were lost."""
+    """Return the HTML page of a version: its acceptance rate, and the rejected samples in the grid."""
     file = _find(context, dataset, version, MANIFEST_NAME)
     return Response(dataset_page(read_contents(context.store, file.sha256)), media_type="text/html", headers=_INERT)
 

@@ -1,4 +1,4 @@
-"""Whether the coordinator lives, whether it can serve, and its metrics."""
+"""Routes of health checks and metrics."""
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
@@ -20,13 +20,13 @@ class Health(Document):
 
 @router.get("/livez")
 async def get_livez() -> Health:
-    """Tell that the process answers."""
+    """Answer: the process is alive."""
     return Health(version=__version__)
 
 
 @router.get("/readyz", responses=problem_responses())
 def get_readyz(context: ContextDep) -> Health:
-    """Tell that the database can be read; 503 where it cannot."""
+    """Answer: the database can be read. 503 where it cannot."""
     with context.database.read() as connection:
         connection.execute(text("SELECT seq FROM jobs LIMIT 1"))
     return Health(version=__version__)

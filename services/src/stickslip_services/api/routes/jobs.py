@@ -1,4 +1,4 @@
-"""Jobs: submitting, watching and cancelling them."""
+"""Routes of jobs: submit, list, watch, pause, resume and cancel them."""
 
 from typing import Annotated, Any
 
@@ -68,9 +68,9 @@ def post_job(
         Header(max_length=255, description="the span that asks [W3C Trace Context], where spans are exported"),
     ] = None,
 ) -> Response:
-    """Submit a job. What of it is there already is not done again; what had failed is tried again.
+    """Submit a job. Existing results are reused, and failed tasks are tried again.
 
-    429: the project of the key has as many jobs or samples as it may have.
+    429: the project of the key has reached its quota of jobs or samples.
     """
     job = submit_job(context, spec, idempotency_key, priority=priority, traceparent=traceparent)
     if isinstance(job, Replay):
@@ -80,7 +80,7 @@ def post_job(
 
 @router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
 def validate_job(spec: SpecBody, context: ContextDep) -> Validation:
-    """Tell what a job would be, without making one."""
+    """Return counts and sizes of a job, and why it would be refused, without making it."""
     return validate_spec(context, spec)
 
 
@@ -122,25 +122,25 @@ def patch_job(
     response: Response,
     if_match: IfMatch = None,
 ) -> JobDetail:
-    """Give a job another priority, from its next task on. 409: it has ended."""
+    """Set the priority of a job, from its next task on. 409: it has ended."""
     return _tagged(response, control.prioritise_job(context, job_id, patch.priority, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=_CHANGED)
 def cancel_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
-    """Cancel a job. Tasks that only it needs are dropped; what is finished or published stays."""
+    """Cancel a job. Tasks that only it needs are dropped; finished results and datasets stay."""
     return _tagged(response, control.cancel_job(context, job_id, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:pause", status_code=202, responses=_CHANGED)
 def pause_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
-    """Pause a job: nothing more is started for it, and what runs finishes. Its place in the queue stays."""
+    """Pause a job: no further tasks start, running ones finish. It keeps its place in the queue."""
     return _tagged(response, control.pause_job(context, job_id, if_match=_etags(if_match)))
 
 
 @router.post("/v1/jobs/{job_id}:resume", status_code=202, responses=_CHANGED)
 def resume_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
-    """Let a paused job go on."""
+    """Resume a paused job."""
     return _tagged(response, control.resume_job(context, job_id, if_match=_etags(if_match)))
 
 
@@ -160,7 +160,7 @@ def get_samples(
 
 @router.get("/v1/jobs/{job_id}/previews", responses=problem_responses(404))
 def get_previews(job_id: str, context: ContextDep) -> list[Preview]:
-    """List the pictures of samples that there are so far."""
+    """List the previews of finished samples."""
     with context.database.read() as connection:
         return list_previews(connection, find_job(connection, job_id).seq)
 
@@ -188,7 +188,7 @@ def get_events(
         str | None, Header(pattern=r"^[0-9]{0,18}$", description="id of the last event that you have")
     ] = None,
 ) -> Response:
-    """Follow a job."""
+    """Stream the events of a job."""
     with context.database.read() as connection:
         job = int(find_job(connection, job_id).seq)
     feeds: Feeds = request.app.state.feeds

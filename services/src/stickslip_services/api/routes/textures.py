@@ -1,4 +1,4 @@
-"""Textures of users: uploading them."""
+"""Upload of textures."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from stickslip_services.catalog.textures import store_texture
 router = APIRouter(tags=["textures"])
 
 MEDIA_TYPES = {"image/png": b"\x89PNG", "image/jpeg": b"\xff\xd8\xff"}
-"""What may be sent, and how such files begin."""
+"""Accepted media types, and the first bytes of such files."""
 
 _PICTURE: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 _BODY = {"requestBody": {"required": True, "content": dict.fromkeys(MEDIA_TYPES, _PICTURE)}}
