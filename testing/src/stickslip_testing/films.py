@@ -1,5 +1,4 @@
-"""For tests and measurements: films of cloth as a phone makes them, with a lens, a hand that shakes and a codec that
-loses. Needs PyAV and OpenCV."""
+"""Films of cloth as a phone records them: lens distortion, camera shake and lossy H.264. Needs PyAV and OpenCV."""
 
 from collections.abc import Iterable
 from pathlib import Path

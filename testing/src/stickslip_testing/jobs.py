@@ -21,19 +21,19 @@ class ManualClock:
         return self.now
 
     def advance(self, seconds: float) -> None:
-        """Let time pass."""
+        """Move the clock forward [s]."""
         self.now += seconds
 
 
 def rods(gamma: Any = (1.0, 2.0), phi1: Any = (1.0, 3.0), **rest: Any) -> dict[str, Any]:
-    """Return a small spec."""
+    """Return the document of a small spec of rods, with other fields from `rest`."""
     gamma = list(gamma) if isinstance(gamma, tuple) else gamma
     axes = {"gamma": gamma, "phi0": 0.0, "phi1": list(phi1) if isinstance(phi1, tuple) else phi1}
     return {"kind": "rod_hang", "axes": axes, "samples_per_shard": 2, **rest}
 
 
 def parsed(spec: dict[str, Any]) -> Any:
-    """Return a spec as the coordinator gets it."""
+    """Return a spec as the coordinator parses it."""
     return job_spec_adapter.validate_python(spec)
 
 

@@ -1,4 +1,4 @@
-"""A PostgreSQL server for tests: in a temporary directory, reached by a Unix socket, and gone with the process."""
+"""A PostgreSQL server for tests, in a temporary directory, with a Unix socket; it ends with the process."""
 
 import ctypes
 import os
@@ -24,7 +24,7 @@ _OPTIONS = (
     *("listen_addresses=", "fsync=off", "synchronous_commit=off", "full_page_writes=off", "shared_buffers=64MB"),
     *("wal_level=minimal", "max_wal_senders=0", "autovacuum=off"),
 )
-"""No TCP; and no test cuts the power."""
+"""Without TCP, and without waiting for the disk."""
 _INITIAL = (
     "--username=stickslip",
     "--auth=trust",
@@ -36,7 +36,7 @@ _INITIAL = (
 
 
 def find_programs() -> Path | None:
-    """Return the directory of PostgreSQL's own programs; None where they are not installed."""
+    """Return the directory of PostgreSQL's programs, None if they are not installed."""
     found = [Path(path).parent for path in (shutil.which("initdb"),) if path]
     versions = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4]))
     found += [path.parent for path in reversed(versions)]
@@ -61,7 +61,7 @@ class PostgresqlServer:
         return self.url(name)
 
     def clean(self) -> str:
-        """Return the URL of a migrated database as if it were new, always the same one.
+        """Return the URL of a migrated database without rows, always the same one.
 
         It has no rows and counts from 1 again. Who still uses it is thrown out.
         """
@@ -91,7 +91,7 @@ class PostgresqlServer:
 
 @contextmanager
 def postgresql_server(programs: Path) -> Iterator[PostgresqlServer]:
-    """Run a server. It refuses to be root's, so root gives it to `nobody`."""
+    """Run a server. It refuses to run as root, so root runs it as `nobody`."""
     user = "nobody" if os.geteuid() == 0 else None
     directory = Path(tempfile.mkdtemp(prefix="stickslip-postgresql-"))
     try:

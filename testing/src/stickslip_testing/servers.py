@@ -1,4 +1,4 @@
-"""Coordinators that answer over HTTP: in a thread of the test process, or as a process of their own."""
+"""Coordinators that answer over HTTP, in a thread of the test process or in a separate process."""
 
 import subprocess
 import sys

@@ -61,17 +61,17 @@ ALL_STAGES = dict.fromkeys(Stage, 1000)
 
 
 def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed") -> TaskResult:
-    """Return a failed try."""
+    """Return the result of a failed attempt."""
     return TaskResult(outcome="failed", reason=reason, message=message, wall_seconds=1.0)
 
 
 def rejection(message: str = "it diverged") -> TaskResult:
-    """Return a rejected sample."""
+    """Return the result of a rejected sample."""
     return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
 
 
 class DirectApi:
-    """The four verbs of the worker API, as calls within this process."""
+    """The worker API as calls within this process."""
 
     def __init__(self, context: Context) -> None:
         self.register = partial(register_worker, context)
@@ -82,7 +82,7 @@ class DirectApi:
 
 @dataclass
 class PretendWorker:
-    """Does what a dispatcher does, at once and with made-up data that the store really holds."""
+    """A dispatcher that finishes tasks at once and stores invented data; `judge` may give other results."""
 
     api: Any  # DirectApi or HttpApi
     store: Store
@@ -94,10 +94,10 @@ class PretendWorker:
     id: str = ""
     ran: list[str] = field(default_factory=list)
     whole: bool = False
-    """Whether its datasets have all the arrays of their kind, filled with something, and not just two."""
+    """Whether its datasets have all arrays of their kind, or only `views` and `sample_key`."""
 
     def register(self) -> "PretendWorker":
-        """Present itself."""
+        """Register with the coordinator."""
         registration = WorkerRegistration(
             name=self.name, builds=dict.fromkeys(self.kinds, self.builds), slots=self.slots, versions={}
         )
@@ -105,17 +105,17 @@ class PretendWorker:
         return self
 
     def lease(self, **wanted: int) -> tuple[Lease, ...]:
-        """Ask for tasks, all there are unless told otherwise."""
+        """Lease tasks: so many of each named stage, by default all."""
         stages = {Stage(stage): count for stage, count in wanted.items()} or ALL_STAGES
         leases: tuple[Lease, ...] = self.api.lease(LeaseRequest(worker_id=self.id, wanted=stages)).leases
         return leases
 
     def start(self, *leases: Lease) -> tuple[str, ...]:
-        """Say that tasks have been started; return those to drop."""
+        """Report tasks as started; return the ids of tasks to drop."""
         return self.beat(*leases, started=True)
 
     def beat(self, *leases: Lease, started: bool = False) -> tuple[str, ...]:
-        """Renew leases; return those to drop."""
+        """Renew leases; return the ids of tasks to drop."""
         states = tuple(LeaseState(task_id=lease.task_id, token=lease.token, started=started) for lease in leases)
         drop: tuple[str, ...] = self.api.heartbeat(Heartbeat(worker_id=self.id, leases=states)).drop
         return drop
@@ -127,7 +127,7 @@ class PretendWorker:
         return [verdict.verdict for verdict in answer.verdicts]
 
     def finish(self, *leases: Lease) -> list[str]:
-        """Run tasks and report what came of them."""
+        """Run tasks and report their results; return the verdicts."""
         self.ran += [lease.task_id for lease in leases]
         ended = [(lease, self.result(lease.task)) for lease in leases]
         for lease, result in ended:
@@ -135,7 +135,7 @@ class PretendWorker:
         return self.report(*ended)
 
     def work(self, rounds: int = 1000) -> int:
-        """Run all there is to run; return the number of tasks."""
+        """Run tasks until none is left; return their number."""
         count = 0
         for _ in range(rounds):
             leases = self.lease()
@@ -143,10 +143,10 @@ class PretendWorker:
                 return count
             count += len(leases)
             self.finish(*leases)
-        raise AssertionError("there is no end of it")
+        raise AssertionError(f"tasks are left after {rounds} rounds")
 
     def result(self, task: Any) -> TaskResult:
-        """Return what a task gives."""
+        """Return the result of a task."""
         judged = self.judge(task)
         if judged is not None:
             return judged
@@ -228,7 +228,7 @@ class PretendWorker:
         return PublishOutput(manifest=digest, group=group_digest, bytes=sum(file.size for file in every))
 
     def _label_files(self, task: PublishTask, given: Sequence[PublishSection]) -> Iterator[FileEntry]:
-        """Yield the files of the labels that packs gave: all of them, or `sample_key` alone."""
+        """Yield the files of the labels of the packed shards: all labels, or only `sample_key`."""
         labels = [array for array in layout(task.spec) if array.is_label]
         labels = labels if self.whole else [array for array in labels if array.name == "sample_key"]
         columns: dict[str, list[bytes]] = {array.name: [] for array in labels}
@@ -263,7 +263,7 @@ class PretendWorker:
 
 
 def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
-    """Return the file of an array whose values rise from sample to sample."""
+    """Return the file of an array whose values grow from sample to sample."""
     size = task.spec.samples_per_shard
     ramp = np.arange(prod(array.shape)).reshape(array.shape)
     values = [((ramp + slot.slot) % 251).astype(array.dtype) for slot in task.slots if slot.valid]
