@@ -1,4 +1,4 @@
-"""The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python face."""
+"""The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python layer."""
 
 from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
 from stickslip_sim_core.cloth.bodies import Body, box, cylinder, plane, sphere

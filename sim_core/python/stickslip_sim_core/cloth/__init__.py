@@ -1,4 +1,4 @@
-"""Pieces of cloth: what they are made of, their meshes, and the solver that steps them."""
+"""Cloth: fabrics, meshes, contact, and the solver."""
 
 from stickslip_sim_core.cloth.bodies import Body, box, plane, sphere
 from stickslip_sim_core.cloth.contact import PairForces, SelfContact

@@ -1,4 +1,4 @@
-"""What cloth is made of: density, stiffness against stretching and against bending."""
+"""Fabrics: density, stiffness against stretching and against bending."""
 
 import tomllib
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ class Fabric:
         return float((0.5 * (self.rigidity[0, 0] + self.rigidity[1, 1]) / (self.density * 9.81)) ** (1.0 / 3.0))
 
     def scaled(self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0) -> "Fabric":
-        """Return a fabric with these factors times the numbers of this one.
+        """Return a fabric whose numbers are those of this one times factors.
 
         Raises:
             ValueError: A factor is not positive, or a product breaks its rule.

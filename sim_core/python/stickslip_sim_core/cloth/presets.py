@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Numbers by which the cloth solver steps.
+    """Settings of the cloth solver.
 
     Raises:
         ValueError: A number breaks its rule.

@@ -34,7 +34,7 @@ def kernel_level() -> str:
 
 
 class Cloth:
-    """Cloth, its state, and the settings by which it is stepped: a sheet, or several in one mesh.
+    """Cloth with its state and solver settings: a sheet, or several in one mesh.
 
     Args:
         mesh: The cloth at rest; `meshes.together` puts several sheets into one.
@@ -146,7 +146,7 @@ class Cloth:
 
     @property
     def kernel(self) -> str:
-        """Level of the kernels that step it."""
+        """Level of the kernels."""
         return str(self._solver.kernel())
 
     @property
@@ -306,5 +306,5 @@ class Cloth:
         return ""
 
     def phases(self) -> dict[str, float]:
-        """Return CPU seconds by phase since the start."""
+        """Return CPU times by phase since the start [s]."""
         return dict(zip(("assembly", "factorization", "krylov", "contact"), self._solver.phases(), strict=True))

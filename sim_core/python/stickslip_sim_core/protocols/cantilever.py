@@ -1,4 +1,4 @@
-"""Cantilever: how far a strip of cloth that is clamped horizontally hangs down [Romero et al. 2021]."""
+"""Cantilever: the sag of a strip of cloth that is clamped horizontally [Romero et al. 2021]."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

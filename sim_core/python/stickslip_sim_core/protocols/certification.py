@@ -1,4 +1,4 @@
-"""Which protocols a preset has to pass before data are made with it, and the numbers that it stands for."""
+"""Protocols that a preset must pass before data are made with it, and the settings that it stands for."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -10,7 +10,7 @@ from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings
 
 @dataclass(frozen=True)
 class Certification:
-    """What the certificate of a preset is made of."""
+    """Protocols and settings of the certificate of a preset."""
 
     protocols: tuple[str, ...]
     """Names in PROTOCOLS, in the order in which they run: the quick ones first."""

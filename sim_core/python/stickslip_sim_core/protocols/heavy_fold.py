@@ -1,4 +1,4 @@
-"""Heavy fold: a strip that is folded onto itself lies on a floor; its loop has one shape, whatever friction is.
+"""Heavy fold: a strip folded onto itself lies on a floor; the shape of its loop does not depend on friction.
 
 The upper layer is then pulled away from the loop, until it slips.
 """
@@ -143,7 +143,7 @@ class Fold:
         return height, nose_to_landing
 
     def rests(self) -> bool:
-        """Let it come to rest, and return whether it did."""
+        """Step until nothing moves; return False if it does not come to rest."""
         for _ in range(STEPS_MAX):
             before = self.cloth.positions
             self.cloth.step(self.step, bodies=self.floor, damping=DAMPING)
@@ -158,7 +158,7 @@ class Fold:
         self.cloth.gravity[self.end, 0] = -share * self.expected * self.unit / self.cloth.masses[self.end].sum()
 
     def drift(self) -> float:
-        """Return how far any vertex comes in `HOLD_TIME` without damping [m], pulled by `HOLD_SHARE`."""
+        """Return the largest displacement in `HOLD_TIME` without damping [m], pulled by `HOLD_SHARE`."""
         if np.isnan(self.expected):
             return np.inf
         growing = round(GROWING / self.preset.time_step)

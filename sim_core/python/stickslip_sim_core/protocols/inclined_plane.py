@@ -1,4 +1,4 @@
-"""Inclined plane: the slope at which a patch of cloth begins to slide, and how far it creeps below."""
+"""Inclined plane: the slope at which a patch of cloth begins to slide, and its creep below that slope."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -83,7 +83,7 @@ def slip_slope(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_sh
 
 
 def drift(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_share: float = FORCE_SHARE) -> float:
-    """Return how far any vertex comes in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
+    """Return the largest displacement in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
     cloth, start = _laid(mesh, preset, force_share)
     cloth.gravity[:] = tilted(HOLD_SHARE * np.arctan(mu))
     floor = [plane(mu)]

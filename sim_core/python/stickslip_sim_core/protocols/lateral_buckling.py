@@ -81,7 +81,7 @@ def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
 
 
 def loaded(clamped: Strip, poisson: float, rigidity: float, preset: SolverSettings) -> tuple[Cloth, Floats]:
-    """Return a flat strip at rest, to bear its weight along its width, and where its vertices are."""
+    """Return a flat strip at rest under its weight along its width, and its vertices (V, 3) [m]."""
     cloth = Cloth(
         clamped.mesh,
         isotropic(DENSITY, STRETCHING * DENSITY * GRAVITY * LENGTH, rigidity, poisson),

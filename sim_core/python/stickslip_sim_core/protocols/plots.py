@@ -74,7 +74,7 @@ def plot(result: ProtocolResult) -> "Figure":
 
 
 def _label(result: ProtocolResult, name: str, value: float) -> str:
-    """Return what a parameter of a curve is: settings may have texts for its numbers, such as "0 height, 1 length"."""
+    """Return the label of a parameter: settings may have texts for its numbers, such as "0 height, 1 length"."""
     texts = dict(part.split(" ", 1) for part in str(result.settings.get(name, "")).split(", ") if " " in part)
     return texts.get(f"{value:g}", f"{name} = {value:g}")
 
@@ -84,7 +84,7 @@ def _verdict(result: ProtocolResult) -> str:
 
 
 def plot_stick_slip_phases(result: ProtocolResult) -> "Figure":
-    """Draw what the strips of a Stick-Slip did at which friction and strain, over the master curve."""
+    """Draw the phase diagram of Stick-Slip over friction and strain, with the master curve."""
     from matplotlib.figure import Figure
 
     strain_c, mu_c = master_curves.stick_slip_triple_point()

@@ -1,4 +1,4 @@
-"""What a protocol returns: measured curves beside their master curves, and whether they agree."""
+"""Results of protocols: measured curves beside their master curves, and whether they agree."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ Setting = float | int | str | Numbers
 
 @dataclass(frozen=True)
 class Curve:
-    """One measured curve beside its master curve. NaN says that there is nothing to measure, such as no boundary."""
+    """One measured curve beside its master curve. NaN: nothing to measure, such as no boundary."""
 
     parameters: Mapping[str, float]
     """What is fixed along the curve, such as Poisson's ratio."""
@@ -28,7 +28,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class ProtocolResult:
-    """A protocol that was run: see docs/protocols.md for the definitions."""
+    """The result of a protocol: see docs/protocols.md for the definitions."""
 
     protocol: str
     x_name: str

@@ -1,4 +1,4 @@
-"""Protocols of the rod solver, and its chains as they use them: given frames, equilibria, extrapolation, searches."""
+"""Protocols of the rod solver, and what they share: chains of frames, equilibria, extrapolation, searches."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ BISECTION = 1e-12
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """Where a chain came to rest on one level of the solver."""
+    """An equilibrium of a chain on one level of the solver."""
 
     gamma: float
     """Weight, rho A g L^3 / EI [-]."""

@@ -116,11 +116,11 @@ class Stack:
         self.floor = [plane(ROUGHER * mu)]
 
     def moved(self) -> Floats:
-        """Return how far each vertex has come [m]."""
+        """Return the displacement of each vertex (V,) [m]."""
         return np.asarray(np.abs(self.cloth.positions - self.start).max(axis=1))
 
     def drift(self) -> float:
-        """Return how far any vertex comes in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
+        """Return the largest displacement in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
         self.cloth.gravity[:] = tilted(HOLD_SHARE * np.arctan(self.mu))
         for _ in range(round(HOLD_TIME / self.preset.time_step)):
             self.cloth.step(self.preset.time_step, bodies=self.floor)

@@ -37,7 +37,7 @@ FORCE_SHARE = 0.03
 MOVED = 2e-4  # of the length: a tip that has come so far has slipped,
 LET_GO = 1e-6  # and it began with the step, the last of its kind, before it moved by more than this.
 
-# Strains at which the phase diagram says what a strip does, and frictions beyond the triple point.
+# Strains of the phase diagram, and frictions beyond the triple point.
 PHASE_STRAIN = tuple(round(0.02 * i, 2) for i in range(1, 23))
 PHASE_FRICTION = (0.38, 0.5)
 STICK, SLIP, EXTENDED = 0.0, 1.0, 2.0

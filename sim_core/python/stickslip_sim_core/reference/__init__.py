@@ -1,1 +1,1 @@
-"""What physics says: master curves, from the equations of the continuous rod, strip and plate."""
+"""Master curves, from the equations of the continuous rod, strip and plate."""

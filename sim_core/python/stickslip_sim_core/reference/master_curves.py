@@ -1,4 +1,4 @@
-"""Master curves: what physics says that a protocol must measure, computed here and never tabulated.
+"""Master curves: the values that physics predicts for the protocols, computed here and never tabulated.
 
 Every curve of a rod, or of a strip that bends in one direction, comes from the differential equations of the continuous
 rod, solved by collocation to 1e-10 (boundary_value.py); that of a plate from plate_buckling.py, to 5e-5. They share
@@ -479,7 +479,7 @@ def heavy_fold(gap: float) -> HeavyFold:
         kappa' = H sin(theta) - (V + s) cos(theta),   x' = cos(theta),   y' = sin(theta),
         theta = kappa = y = 0 at s = 0,   theta = pi, kappa = 0, y = gap at the end.
 
-    kappa^2/2 + n . t - y is constant, so that H = -gap/2 whatever the rest: friction changes nothing. It is
+    kappa^2/2 + n . t - y is constant, so that H = -gap/2: friction changes nothing. It is
     solved in three parts, up to the nose, up to the top and up to the landing.
 
     Args:

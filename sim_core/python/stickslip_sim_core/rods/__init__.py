@@ -1,1 +1,1 @@
-"""Hanging rods: equilibria, what they look like, and the way back to their natural shape."""
+"""Hanging rods: equilibria, labels of their shapes, and inverses to their natural shape."""

@@ -1,4 +1,4 @@
-"""Inverse design: the natural curvature of a rod whose hanging shape is known, and how far to trust it."""
+"""Inverse design: the natural curvature of a rod whose hanging shape is known, and its error."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Numbers that say what a hanging rod looks like: how near it comes to itself, how far it reaches sideways."""
+"""Labels of the shape of a hanging rod: its distance from itself, and its sideways reach."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ def reach(centerline: ArrayLike) -> Floats:
 
 
 def self_contact_distance(centerline: ArrayLike) -> Floats:
-    """Return how near each rod's centreline comes to another part of itself.
+    """Return the least distance of each centreline from another part of itself.
 
     Neighbouring parts are always close; what counts is a local minimum of the distance between two points of the
     centreline, each free to slide along it: the doubly critical distance of the theory of ideal knots [Gonzalez and

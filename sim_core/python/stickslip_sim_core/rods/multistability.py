@@ -21,7 +21,7 @@ MIRROR = np.array([-1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class OtherMinima:
-    """What searches from other starts found, of n rods."""
+    """Other stable equilibria of n rods."""
 
     multistable: Bools
     """A stable equilibrium other than that of `solve_rods` was found, shape (n,). False is no proof that none is."""

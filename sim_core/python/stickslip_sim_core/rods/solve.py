@@ -118,7 +118,7 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
 
 
 def check_count(name: str, value: int) -> None:
-    """Refuse what is no integer; its range is the C++ core's rule."""
+    """Refuse a value that is no integer; the C++ core checks its range."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"{name}: must be an integer, got {value!r}")
     if not 0 <= value < 2**24:

@@ -1,1 +1,1 @@
-"""Scenes: what is simulated. The module of a kind of simulations offers it as `KIND`."""
+"""Scenes: the simulations of each kind. `KIND` of the module of a kind runs them."""

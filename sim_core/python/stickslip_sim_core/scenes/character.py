@@ -39,7 +39,7 @@ Field = Callable[[Floats], Floats]
 
 
 def _ellipsoid(center: tuple[float, float, float], radii: tuple[float, float, float]) -> Field:
-    """Return about the distance from an ellipsoid [Quilez 2008]: |q| (|q| - 1) / |q / r|, q = (p - c) / r."""
+    """Return the approximate distance from an ellipsoid [Quilez 2008]: |q| (|q| - 1) / |q / r|, q = (p - c) / r."""
     c, r = np.array(center), np.array(radii)
 
     def distance(p: Floats) -> Floats:
@@ -52,7 +52,7 @@ def _ellipsoid(center: tuple[float, float, float], radii: tuple[float, float, fl
 
 
 def _limb(*joints: tuple[float, float, float, float]) -> Field:
-    """Return about the distance from a limb along joints (x, y, z, radius); radii change evenly between joints."""
+    """Return the approximate distance from a limb along joints (x, y, z, radius); radii change evenly between."""
     knots = np.array(joints)
 
     def distance(p: Floats) -> Floats:
@@ -102,7 +102,7 @@ LOW, HIGH = (-0.22, -0.42, -0.24), (0.22, 0.42, 0.98)
 
 
 def distance(points: Floats) -> Floats:
-    """Return about the distance of points (..., 3) [m] from the skin at rest, negative inside."""
+    """Return the approximate distance of points (..., 3) [m] from the skin at rest, negative inside."""
     return _union([_union([part(points) for part in parts]) for parts in _PARTS])
 
 

@@ -51,7 +51,7 @@ def travel(time: float, distance: float) -> float:
 
 
 def duration_of(distance: float) -> float:
-    """Return the time of a travel of at least SPEED^2 / ACCELERATION [s]."""
+    """Return the duration [s] of a travel of at least SPEED^2 / ACCELERATION."""
     return distance / SPEED + SPEED / ACCELERATION
 
 

@@ -1,4 +1,4 @@
-"""Kinds of simulations: what the module of each kind offers to the workers."""
+"""Kinds of simulations: the interface between the workers and the module of each kind."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Motions that a user prescribes: by keyframes, and by the frames of an animated mesh.
+"""Prescribed motions: keyframes, and the frames of an animated mesh.
 
 All are smooth in time, and begin and end at rest.
 """
@@ -177,7 +177,7 @@ def read_obj(path: Path) -> tuple[Floats, NDArray[np.int32]]:
     """Return the vertices (N, 3) and triangles (T, 3) of a Wavefront OBJ file; its polygons are cut into triangles.
 
     Raises:
-        ValueError: A line says nothing about a mesh of triangles.
+        ValueError: A line is no vertex or face.
     """
     vertices: list[list[float]] = []
     triangles: list[tuple[int, int, int]] = []

@@ -1,4 +1,4 @@
-"""Scenes of cloth: what a scene consists of, the driver that runs all of them, and the run that it returns."""
+"""Scenes of cloth: their parts, the driver that runs all of them, and the run that it returns."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -224,10 +224,10 @@ def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
-    """Refuse a number outside its range.
+    """Check that a number is in [low, high].
 
     Raises:
-        ValueError: It is.
+        ValueError: It is outside.
     """
     if not low <= value <= high:
         raise ValueError(f"{name}: must be in [{low:g}, {high:g}], got {value}")
