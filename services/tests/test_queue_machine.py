@@ -258,13 +258,13 @@ class QueueMachine(RuleBasedStateMachine):
         return held is not None and held[:2] == (worker.id, lease.token) and held[2] > self.clock()
 
     def _is_asked_for(self, task: str) -> bool:
-        """Tell whether a job that may run needs the task."""
+        """Return whether a job that may run needs the task."""
         with self.context.database.read() as connection:
             seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
             return seq is not None and bool(runnable_tasks(connection, [seq]))
 
     def _expired_unnoticed(self, worker: PretendWorker, lease: Lease) -> bool:
-        """Tell whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""
+        """Return whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""
         held = self.holders.get(lease.task_id)
         return held is not None and held[:2] == (worker.id, lease.token)
 

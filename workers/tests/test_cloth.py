@@ -103,7 +103,7 @@ class Core:
 
 @pytest.fixture
 def core(monkeypatch: pytest.MonkeyPatch) -> Core:
-    """A core that answers at once, in place of the one that takes minutes."""
+    """A core that answers at once, instead of the one that takes minutes."""
     core = Core()
     monkeypatch.setattr(cloth_drag, "KIND", cloth_kind(core.scene))
     monkeypatch.setattr(Scene, "run", lambda scene, on_frame: core.run(scene, on_frame))

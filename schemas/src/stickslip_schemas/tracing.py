@@ -66,7 +66,7 @@ def stop() -> None:
 
 
 def is_on() -> bool:
-    """Tell whether spans are exported."""
+    """Return whether spans are exported."""
     return _provider is not _OFF
 
 

@@ -108,7 +108,7 @@ class Settings(BaseSettings):
         for name in ("tls_certificate", "tls_key"):
             path: Path | None = getattr(self, name)
             if path is not None and not path.is_file():
-                raise ValueError(f"{name} must be a file, and {path} is none")
+                raise ValueError(f"{name} must be a file; {path} is not")
         if not (is_loopback(self.host) or self.tls_certificate or self.behind_proxy):
             raise ValueError(
                 f"host must be a loopback address unless the coordinator speaks TLS or a proxy does it, because keys "
@@ -124,7 +124,7 @@ class Settings(BaseSettings):
 
     @property
     def database_url(self) -> URL | None:
-        """URL of the PostgreSQL database, which shows no password when printed; None where it is SQLite."""
+        """URL of the PostgreSQL database, which shows no password when printed; None if it is SQLite."""
         if self.database is None:
             return None
         return make_url(self.database.get_secret_value()).set(drivername="postgresql+psycopg")

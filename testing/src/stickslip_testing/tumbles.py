@@ -269,7 +269,7 @@ def tumble(name: str, preset: str | SolverSettings = "certified") -> Tumble:
     """Return one of `TUMBLES`.
 
     Raises:
-        ValueError: There is none of this name.
+        ValueError: The name is unknown.
     """
     if name not in TUMBLES:
         raise ValueError(f"tumble: must be one of {', '.join(TUMBLES)}, got {name!r}")

@@ -366,7 +366,7 @@ class Dispatcher:
         return parts
 
     def _may_share_a_call(self, lease: Lease) -> bool:
-        """Tell whether a task is a render that shares no shading, and has not been in a call that failed."""
+        """Return whether a task is a render that shares no shading, and has not been in a call that failed."""
         return (
             isinstance(lease.task, RenderTask) and shading_of(lease.task) is None and lease.task_id not in self._alone
         )
@@ -407,7 +407,7 @@ class Dispatcher:
         return self._slots + (EXPRESS_SLOTS if self._is_clogged() else 0)
 
     def _is_clogged(self) -> bool:
-        """Tell whether all slots have been taken for long: then short tasks have a slot of their own."""
+        """Return whether all slots have been taken for long: then short tasks have a slot of their own."""
         since = time.monotonic() - self._settings.clog_seconds
         return sum(assignment.started_at < since for assignment in self._running.values()) >= self._slots
 

@@ -24,7 +24,7 @@ class Host:
         return {**self._inner.describe(), "pid": os.getpid(), "node": ray.get_runtime_context().get_node_id()}
 
     def frames(self) -> Any:
-        """Return how far the object is, while `call` runs in another thread; None where it does not tell."""
+        """Return how far the object is, while `call` runs in another thread; None if it does not tell."""
         return self._inner.frames()
 
     def call(self, method: str, arguments: list[Any]) -> tuple[list[Any], int]:

@@ -46,7 +46,7 @@ def process_failure(error: Exception, *, renders: bool) -> TaskResult:
 
 
 def shading_of(task: RenderTask) -> str | None:
-    """Return a key that renders of one shading share; None where a render shares none."""
+    """Return a key that renders of one shading share; None if a render shares none."""
     shared = task.render.shading
     return None if shared is None else canonical_json({"shading": shared, "record": task.record.model_dump()})
 

@@ -23,7 +23,7 @@ class Settings:
     name: str
     """Name of this dispatcher; a second one of the same name takes the first one's place."""
     key: str | None = None
-    """What the coordinator wants to be shown by workers; None where it wants nothing."""
+    """What the coordinator wants to be shown by workers; None if it wants nothing."""
     tls_certificate: Path | None = None
     """The coordinator's own certificate, which is then trusted by itself; None: certificates are checked as usual."""
     slots: int | None = None

@@ -46,7 +46,7 @@ def sha256(data: bytes) -> str:
 
 
 def is_sha256(text: str) -> bool:
-    """Tell whether `text` is a SHA-256 in lower-case hexadecimal."""
+    """Return whether `text` is a SHA-256 in lower-case hexadecimal."""
     return re.fullmatch(KEY_PATTERN, text) is not None
 
 

@@ -72,7 +72,7 @@ def field_errors(error: ValidationError, document: Any, of: Any) -> list[FieldEr
 
 
 def _is_echo(item: ErrorDetails) -> bool:
-    """Tell whether a list is said to be too short only because its items have errors of their own."""
+    """Return whether a list is said to be too short only because its items have errors of their own."""
     return item["type"] == "too_short" and item["ctx"]["actual_length"] != len(item["input"])
 
 

@@ -126,7 +126,7 @@ def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
 
 
 def in_order_of_chunks(array: ArrayLayout, values: np.ndarray) -> bool:
-    """Tell whether samples (samples, *sample shape) of an array lie in memory in the order that chunks have."""
+    """Return whether samples (samples, *sample shape) of an array lie in memory in the order that chunks have."""
     return bool((values.transpose(axes_order(array)) if array.is_clip else values).flags.c_contiguous)
 
 
@@ -184,7 +184,7 @@ def _without_crc(data: bytes, what: str) -> memoryview:
 
 
 def _content_size(frame: memoryview) -> int | None:
-    """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None where it states none."""
+    """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None if it states none."""
     if len(frame) < 6 or bytes(frame[:4]) != b"\x28\xb5\x2f\xfd":
         return None
     descriptor = frame[4]

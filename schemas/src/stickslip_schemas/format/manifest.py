@@ -44,7 +44,7 @@ def section_samples(spec: JobSpec) -> int:
 
 
 def has_sections(spec: JobSpec) -> bool:
-    """Tell whether the manifest of a dataset of `spec` has sections."""
+    """Return whether the manifest of a dataset of `spec` has sections."""
     return spec.sample_count > SECTION_SAMPLES
 
 
@@ -215,7 +215,7 @@ class Contents:
             yield from section.files
 
     def file(self, path: str) -> FileEntry | None:
-        """Return the file at a path of the version; None where it lists none. At most one section is read."""
+        """Return the file at a path of the version; None if it lists none. At most one section is read."""
         own = self._root_files
         if own is None:
             own = self._root_files = {file.path: file for file in [*self.manifest.files, *self.manifest.sections]}

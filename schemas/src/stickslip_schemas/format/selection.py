@@ -58,7 +58,7 @@ class Selection(Document):
 
     @property
     def is_everything(self) -> bool:
-        """Tell whether nothing is left out."""
+        """Return whether nothing is left out."""
         return self == Selection()
 
     def choose_arrays(self, arrays: Iterable[ArrayLayout]) -> tuple[ArrayLayout, ...]:
@@ -69,7 +69,7 @@ class Selection(Document):
         names = [array.name for array in arrays]
         for name in self.arrays:
             if name not in names:
-                raise ValueError(f"arrays must be some of {', '.join(names)}, and {name!r} is none of them")
+                raise ValueError(f"arrays must be some of {', '.join(names)}, got {name!r}")
         return tuple(array for array in arrays if array.is_label or array.name in self.arrays)
 
     def choose_samples(self, arrays: Iterable[ArrayLayout], label: Labels) -> npt.NDArray[np.bool_]:

@@ -58,7 +58,7 @@ def digests(files: dict[str, Path]) -> dict[str, str]:
 
 
 def module_file(name: str) -> Path | None:
-    """Return the source of a module of ours, None where it is compiled; raise ModuleNotFoundError."""
+    """Return the source of a module of ours, None if it is compiled; raise ModuleNotFoundError."""
     package, *rest = name.split(".")
     base = _package_folder(package).joinpath(*rest)
     if (base / "__init__.py").is_file():

@@ -34,7 +34,7 @@ class CorruptArtifactError(OSError):
 
 
 def is_unavailable(error: OSError) -> bool:
-    """Tell whether an error says that a store takes no files: full, read-only, not ours, gone, or out of reach."""
+    """Return whether an error says that a store takes no files: full, read-only, not ours, gone, or out of reach."""
     return error.errno in _UNAVAILABLE
 
 
@@ -93,7 +93,7 @@ class Store(Protocol):
 
     @property
     def cache(self) -> Path | None:
-        """A directory that all workers share for what may be lost; None where the store has none."""
+        """A directory that all workers share for what may be lost; None if the store has none."""
 
     def publish(self, data: bytes) -> str:
         """Make `data` an artifact, durably, and return its digest. A damaged one is written anew."""
@@ -114,10 +114,10 @@ class Store(Protocol):
         """Return how long an artifact is [bytes], without reading it."""
 
     def exists(self, digest: str, *, size: int = 0) -> bool:
-        """Tell whether an artifact is there with at least `size` bytes, without reading it."""
+        """Return whether an artifact is there with at least `size` bytes, without reading it."""
 
     def holds(self, digest: str, *, size: int | None = None) -> bool:
-        """Tell whether an artifact is there, of `size` bytes where that is known, with the digest that names it."""
+        """Return whether an artifact is there, of `size` bytes where that is known, with the digest that names it."""
 
     def delete(self, name: str) -> None:
         """Delete an artifact, by its digest, or a leftover, by its name in `stored`. Deleting twice is no error."""
@@ -126,13 +126,13 @@ class Store(Protocol):
         """Yield the artifacts and the leftovers, ordered by digest."""
 
     def url(self, digest: str, *, seconds: float) -> str | None:
-        """Return where anybody can download an artifact for so long; None where the store has no such address."""
+        """Return where anybody can download an artifact for so long; None if the store has no such address."""
 
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
         """Let a version show an artifact at `path`. Showing it twice is no error."""
 
     def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
-        """Tell whether a version shows the bytes of `digest` at `path`. They are read where they are a copy."""
+        """Return whether a version shows the bytes of `digest` at `path`. They are read where they are a copy."""
 
     def read_shown(self, dataset: str, version: int, path: str) -> bytes:
         """Return what a version shows at `path`, unchecked."""
@@ -144,10 +144,10 @@ class Store(Protocol):
         """Let a version show nothing any more; the artifacts stay. Hiding it twice is no error."""
 
     def is_shown(self, dataset: str, version: int) -> bool:
-        """Tell whether a version shows anything."""
+        """Return whether a version shows anything."""
 
     def room(self) -> Room | None:
-        """Return how full the store is; None where it has no limit that it knows."""
+        """Return how full the store is; None if it has no limit that it knows."""
 
     def probe(self) -> None:
         """Write a small file and delete it; raise OSError where that fails."""

@@ -78,7 +78,7 @@ class BucketStore:
 
     @property
     def cache(self) -> None:
-        """Return None: there is none."""
+        """None: this store has no cache directory."""
 
     def publish(self, data: bytes) -> str:
         """An artifact that is there already is compared by its entity tag, or else read."""
@@ -116,7 +116,7 @@ class BucketStore:
         self._tried(put)
 
     def _is_there(self, digest: str, data: bytes) -> bool:
-        """Tell whether an artifact has the bytes `data`.
+        """Return whether an artifact has the bytes `data`.
 
         The entity tag of an object that was put in one piece is its MD5, unless the server encrypts it with a key of
         its own [Amazon S3, API reference, Object]. Another tag decides nothing, and the object is read.

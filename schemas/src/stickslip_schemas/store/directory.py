@@ -123,7 +123,7 @@ class DirectoryStore:
                 yield Stored(path.name, status.st_size, status.st_mtime, is_shown)
 
     def url(self, digest: str, *, seconds: float) -> str | None:
-        """Return None: there is none."""
+        """None: files of a directory have no URL."""
         artifact_name(digest)
         return None
 

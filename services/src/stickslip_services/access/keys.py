@@ -121,7 +121,7 @@ class KeyRing:
         return time.monotonic() < self._read_at + FRESH_SECONDS
 
     def holder_of(self, secret: str) -> Holder | None:
-        """Return the holder of a secret; None where it is unknown or revoked."""
+        """Return the holder of a secret; None if it is unknown or revoked."""
         with self._lock:
             if not self.is_fresh:
                 with self._database.read() as connection:

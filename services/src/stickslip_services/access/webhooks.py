@@ -174,7 +174,7 @@ def _is_due(now: float) -> ColumnElement[bool]:
 
 
 def _next_message(connection: Connection, seq: int) -> _Message | None:
-    """Return the first message that a webhook has not received; None where it has received all."""
+    """Return the first message that a webhook has not received; None if it has received all."""
     position = select(webhooks.c.position).where(webhooks.c.seq == seq).scalar_subquery()
     found = connection.execute(
         select(events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name)

@@ -123,7 +123,7 @@ class KeyMiddleware:
 
 
 def needed_scope(method: str, path: str) -> Scope | None:
-    """Return the scope that a request needs; None where it needs no key."""
+    """Return the scope that a request needs; None if it needs no key."""
     if path in ("/livez", "/readyz") or path.startswith("/static/"):
         return None
     if path.startswith("/v1/worker") and method not in _SAFE:

@@ -152,7 +152,7 @@ def find_committed(connection: Connection, publish_task: int) -> CommittedVersio
 def damaged_files(store: Store, manifest: Sha256, group: Sha256) -> frozenset[Sha256] | None:
     """Return the digests of the damaged files of a version, in the store or in the version's directory.
 
-    None where the manifest, the root's metadata or the seal is damaged, so that the others are unknown. All files are
+    None if the manifest, the root's metadata or the seal is damaged, so that the others are unknown. All files are
     read. Raises OSError where the store is out of reach.
     """
     seal = sha256(seal_text(manifest, group))

@@ -88,7 +88,7 @@ def _has_versions(settings: Settings) -> bool:
 
 
 def _sqlite_revision(path: Path) -> str | None:
-    """Return the schema revision of a file; None where it is missing or empty."""
+    """Return the schema revision of a file; None if it is missing or empty."""
     if not path.exists():
         return None
     revision = None
@@ -114,7 +114,7 @@ def _sqlite_revision(path: Path) -> str | None:
 
 
 def _postgresql_revision(settings: Settings, role: Role) -> str | None:
-    """Return the schema revision of a database; None where it is empty."""
+    """Return the schema revision of a database; None if it is empty."""
     name = settings.database_name
     if settings.database_path.exists():
         raise DatabaseRefusedError(

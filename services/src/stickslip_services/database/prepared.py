@@ -52,7 +52,7 @@ class Prepared:
         return found
 
     def scalar(self, connection: Connection, values: Values | None = None) -> Any:
-        """Return the first column of the first row; None where there is no row."""
+        """Return the first column of the first row; None if there is no row."""
         sql, parameters = self._filled(connection, values or {})
         with _translated(connection, sql):
             row = _driver(connection).execute(sql, parameters).fetchone()

@@ -90,7 +90,7 @@ class Run:
     wall_seconds: float
     """Its share of the call that made it."""
     call_seconds: float | None
-    """The whole call; None where it is not representative."""
+    """The whole call; None if it is not representative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class StageWork:
 
 
 def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | None:
-    """Return the time left, or None where it is unknown or nothing is left.
+    """Return the time left, or None if it is unknown or nothing is left.
 
     Packing and publishing are a few short tasks at the end. Until one has been measured they are assumed to take
     `PACK_GUESS`, or the mean of the slowest measured group where that is less, with an error of 100 %. Simulations and

@@ -55,7 +55,7 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
 
 
 def traceparent_of(connection: Connection, task: str) -> str | None:
-    """Return the traceparent of the job that a task is charged to; None where it has none."""
+    """Return the traceparent of the job that a task is charged to; None if it has none."""
     query = select(jobs.c.traceparent).join(tasks, tasks.c.job == jobs.c.seq).where(tasks.c.key == task_key(task))
     return connection.scalar(query)
 

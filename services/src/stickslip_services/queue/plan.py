@@ -35,7 +35,7 @@ class Terms:
 
 
 def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
-    """Return builds and certificate for a job of `spec`, None where no worker has ever registered.
+    """Return builds and certificate for a job of `spec`, None if no worker has ever registered.
 
     Raises KindNotAvailableError where no worker makes the kind, UnknownKindError where its class is not registered,
     and PresetNotCertifiedError where the spec needs a certificate and its preset has none that passed for the workers'

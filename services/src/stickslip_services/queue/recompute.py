@@ -107,7 +107,7 @@ def check_made_datasets(context: Context, *, at_most: int | None = None) -> None
 def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:
     """End a job whose dataset is intact; otherwise reset the tasks that made the damaged files.
 
-    `damaged` has the digests of the damaged artifacts; None where the manifest itself cannot be trusted.
+    `damaged` has the digests of the damaged artifacts; None if the manifest itself cannot be trusted.
     """
     if made not in made_jobs(book.connection):
         return  # cancelled, or ended by another check

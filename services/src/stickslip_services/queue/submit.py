@@ -172,7 +172,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
 
 
 def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
-    """Return the number of tasks that have a result; None where the grid is too large to look them up."""
+    """Return the number of tasks that have a result; None if the grid is too large to look them up."""
     with database.read() as connection:
         planned_so = (jobs.c.kind == spec.kind, jobs.c.builds == terms.builds.model_dump_json())
         if connection.scalar(select(jobs.c.seq).where(*planned_so).limit(1)) is None:

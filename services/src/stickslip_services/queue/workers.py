@@ -105,7 +105,7 @@ def present_workers(connection: Connection, *, seen_since: float | None = None) 
 def builds_for(connection: Connection, kind: str) -> Builds | None:
     """Return the builds for new jobs of `kind`: those of the newest worker that makes it.
 
-    None where no worker has ever registered; raise KindNotAvailableError where none of those makes it.
+    None if no worker has ever registered; raise KindNotAvailableError where none of those makes it.
     """
     workers = present_workers(connection)
     if not workers:

@@ -195,7 +195,7 @@ def fabric_of(fabric_or_name: Fabric | str) -> Fabric:
     """Return the fabric of this name; a fabric is returned as it is.
 
     Raises:
-        ValueError: There is none of this name.
+        ValueError: The name is unknown.
     """
     return fabric_or_name if isinstance(fabric_or_name, Fabric) else fabric(fabric_or_name)
 

@@ -106,7 +106,7 @@ def preset_named(preset: str | SolverSettings) -> SolverSettings:
     """Return the settings of this name; settings are returned as they are.
 
     Raises:
-        ValueError: There are none of this name.
+        ValueError: The name is unknown.
     """
     if isinstance(preset, SolverSettings):
         return preset

@@ -212,7 +212,7 @@ def cloth_kind(scene: Callable[..., Scene]) -> Kind:
 
 
 def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return physics with fabrics in place of their names, the user's own numbers, and factors."""
+    """Return physics with fabrics instead of their names, the user's own numbers, and factors."""
     known = dict(physics)
     factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
     for prefix in ("", "substrate_"):

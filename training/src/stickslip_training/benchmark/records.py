@@ -72,13 +72,11 @@ def enter(
 
 
 def read_record(path: Path) -> Record:
-    """Return the record of a file; raise ValueError where it is none."""
+    """Return the record of a file; raise ValueError if it is not one."""
     try:
         return Record(**json.loads(path.read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path} must be a record of `stickslip-train benchmark score`, and is none: {error}"
-        ) from None
+        raise ValueError(f"{path} must be a record of `stickslip-train benchmark score`: {error}") from None
 
 
 def table(name: str, records: Iterable[Record]) -> str:

@@ -131,7 +131,7 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
 
 
 def _quantiles(errors: Floats) -> dict[str, Any]:
-    """Return median and 95 % quantile, each with its 90 % interval over rods; None where it is infinite."""
+    """Return median and 95 % quantile, each with its 90 % interval over rods; None if it is infinite."""
     errors = np.where(np.isfinite(errors), errors, np.inf)
     drawn = errors[np.random.default_rng(0).integers(len(errors), size=(_DRAWS, len(errors)))]
     found = {}

@@ -92,7 +92,7 @@ def set_names() -> tuple[str, ...]:
 
 
 def load_set(name: str) -> NamedSet:
-    """Return a set; raise ValueError if there is none of this name."""
+    """Return a set; raise ValueError if the name is unknown."""
     if name not in set_names():
         raise ValueError(f"the test set must be one of {', '.join(set_names())}, and is {name!r}")
     document = json.loads((_folder() / f"{name}.json").read_text(encoding="utf-8"))

@@ -59,7 +59,7 @@ class Scores:
     blind: Errors
     """Material not known."""
     given: Errors | None
-    """Material known; None where the answers have no mu for it."""
+    """Material known; None if the answers have no mu for it."""
     top_1: Measure | None
     """Share of the clips whose likeliest material is the true one."""
     top_2: Measure | None

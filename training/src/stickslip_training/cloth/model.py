@@ -124,4 +124,4 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             quantity_temperatures=tuple(about["quantity_temperatures"]),
         )
     except (safetensors.SafetensorError, KeyError, RuntimeError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} must be a model of `stickslip-train cloth train`, and is none: {error}") from error
+        raise ValueError(f"{path} must be a model of `stickslip-train cloth train`: {error}") from error

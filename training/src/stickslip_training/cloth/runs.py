@@ -88,7 +88,7 @@ def load_runs(path: str | Path) -> Runs:
     try:
         return _load(path)
     except (BadZipFile, zlib.error, KeyError, EOFError) as error:
-        raise ValueError(f"{path} must be a packed file of simulations, and is damaged or is none: {error}") from error
+        raise ValueError(f"{path} must be a packed file of simulations: {error}") from error
 
 
 def _load(path: str | Path) -> Runs:

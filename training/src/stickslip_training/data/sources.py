@@ -47,7 +47,7 @@ class Source(ABC):
         return data
 
     def digest(self, file: FileEntry) -> str | None:
-        """Return the SHA-256 of the file; None where the whole file would have to be fetched."""
+        """Return the SHA-256 of the file; None if the whole file would have to be fetched."""
         return None
 
     def close(self) -> None:  # noqa: B027

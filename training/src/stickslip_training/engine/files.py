@@ -35,7 +35,7 @@ def load_tensors(path: str | Path, *, device: str = "cpu") -> dict[str, Any]:
 
 
 def report_json(report: "DataclassInstance") -> str:
-    """Return the report as JSON; a number that is none raises ValueError."""
+    """Return the report as JSON; NaN raises ValueError."""
     return json.dumps(asdict(report), indent=2, allow_nan=False, default=str) + "\n"
 
 

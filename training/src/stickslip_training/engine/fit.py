@@ -83,7 +83,7 @@ class Learner(ABC):
         return None
 
     def validate(self, net: nn.Module) -> float | None:
-        """Return the validation loss; None where there are no such data."""
+        """Return the validation loss; None if there are no such data."""
         return None
 
 

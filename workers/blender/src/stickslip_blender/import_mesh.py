@@ -53,7 +53,7 @@ def read(path: Path, *, frame_rate: int = 24, name: str | None = None, scale: fl
     if path.suffix.lower() not in READERS:
         raise ImportMeshError(f"{path}: must end in one of {', '.join(READERS)}")
     if not path.is_file():
-        raise ImportMeshError(f"{path}: must be a file, and there is none")
+        raise ImportMeshError(f"{path}: no such file")
     bpy = import_bpy()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene

@@ -149,7 +149,7 @@ def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def pictured(spec: JobSpec) -> ArrayLayout | None:
-    """Return the array that a dataset of `spec` is best seen by; None where it has no pictures."""
+    """Return the array that a dataset of `spec` is best seen by; None if it has no pictures."""
     seen = (array for array in layout(spec) if array.per_sample and array.dimensions[-3:] == ("y", "x", "rgb"))
     return next(seen, None)
 

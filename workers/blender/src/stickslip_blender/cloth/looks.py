@@ -54,7 +54,7 @@ PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.
 
 
 def look_of(material: str) -> Look:
-    """Return the look of a material, `PLAIN` where it is none of ours."""
+    """Return the look of a material, `PLAIN` for a custom one."""
     return looks().get(material, PLAIN)
 
 
