@@ -29,7 +29,7 @@ from typing import Any
 
 import httpx
 import numpy as np
-from plan import context, peak_megabytes, spec
+from plan import coordinator, peak_megabytes, spec
 from sqlalchemy import text
 from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
 from stickslip_schemas.format.codecs import encode_chunk, encode_shard
@@ -90,7 +90,7 @@ def told(seconds: list[float]) -> dict[str, float]:
 
 def plan(samples: int) -> dict[str, Any]:
     """Measure the submission and the planning of a job."""
-    with tempfile.TemporaryDirectory() as directory, context(Path(directory)) as (client, pid):
+    with tempfile.TemporaryDirectory() as directory, coordinator(Path(directory)) as (client, pid):
         key = (Path(directory) / "worker-key").read_text().strip()
         worker = Worker(client, key, client.get("/v1/workers").json()[0]["id"])
         client.post("/v1/jobs", json=spec(1000, start=900.0), params={"priority": 5}).raise_for_status()

@@ -17,6 +17,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    TextClause,
     text,
 )
 
@@ -28,6 +29,12 @@ metadata = MetaData(
         "pk": "pk_%(table_name)s",
     }
 )
+
+
+def _partial(condition: str) -> dict[str, TextClause]:
+    """Return the condition of a partial index."""
+    return {"sqlite_where": text(condition), "postgresql_where": text(condition)}
+
 
 _Wide = BigInteger().with_variant(Integer, "sqlite")
 """64 bits: SQLite's INTEGER has them, and it must be called so to be a rowid."""
@@ -59,8 +66,8 @@ jobs = Table(
     Column("spec", Text, nullable=False),  # JSON
     Column("sample_count", Integer, nullable=False),
     Column("builds", Text),  # JSON; null until its planning begins
-    Column("certificate", String),  # digest of the one that vouches for it, as of when its planning began
-    Column("planned", Integer, nullable=False, server_default="0"),  # samples whose tasks are written down
+    Column("certificate", String),  # digest of its certificate when planning began
+    Column("planned", Integer, nullable=False, server_default="0"),  # number of samples whose tasks are inserted
     Column("planner", String),  # the coordinator that plans it
     Column("planner_until", Float),  # when another coordinator may go on with that
     Column("publish_task", _Wide, index=True),  # null until the job is planned
@@ -78,8 +85,7 @@ jobs = Table(
     Index(
         "ix_jobs_open",
         "seq",
-        sqlite_where=text("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
-        postgresql_where=text("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
+        **_partial("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
     ),
     sqlite_autoincrement=True,
 )
@@ -132,20 +138,17 @@ tasks = Table(
         "job",
         "seq",
         "cost_group",
-        sqlite_where=text("state = 'pending' AND waiting_on = 0"),
-        postgresql_where=text("state = 'pending' AND waiting_on = 0"),
+        **_partial("state = 'pending' AND waiting_on = 0"),
     ),
     Index(
         "ix_tasks_leased",
         "owner",
-        sqlite_where=text("owner IS NOT NULL"),
-        postgresql_where=text("owner IS NOT NULL"),
+        **_partial("owner IS NOT NULL"),
     ),
     Index(
         "ix_tasks_retry",
         "retry_at",
-        sqlite_where=text("state = 'soft_failed'"),
-        postgresql_where=text("state = 'soft_failed'"),
+        **_partial("state = 'soft_failed'"),
     ),
 )
 
@@ -165,7 +168,7 @@ job_tasks = Table(
     metadata,
     Column("job", _Wide, primary_key=True, autoincrement=False),
     Column("task", _Wide, primary_key=True, autoincrement=False, index=True),
-    Column("cached", Boolean, nullable=False),  # it was settled before the job came
+    Column("cached", Boolean, nullable=False),  # it was settled before the job was submitted
     sqlite_with_rowid=False,
 )
 
@@ -189,7 +192,7 @@ previews = Table(
     Column("digest", String, nullable=False, index=True),
 )
 
-# Counters, kept by ledger.py in the transaction that moves the tasks, so that nobody counts rows to show progress.
+# Counters, updated by the ledger in the transaction that moves the tasks, so that showing progress counts no rows.
 
 job_counts = Table(
     "job_counts",
