@@ -12,6 +12,7 @@ from httpx_sse import ServerSentEvent, connect_sse
 from stickslip_services.api import sse
 from stickslip_services.app import make_app
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.jobs import show_job
 from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods
@@ -129,11 +130,10 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     """Twenty watchers, each from another event on, while old events have left the feed's memory."""
     monkeypatch.setattr(sse, "KEPT_EVENTS", 2)
     looks: list[int] = []
-    show = sse.show_job
 
     def look(context: Context, connection: Any, job: int) -> Any:
         looks.append(job)
-        return show(context, connection, job)
+        return show_job(context, connection, job)
 
     monkeypatch.setattr(sse, "show_job", look)
     job = submit(client, gamma=(1.0, 2.0, 3.0))

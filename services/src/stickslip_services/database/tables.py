@@ -4,6 +4,8 @@ Tasks are global and keyed by content; jobs point at the tasks that they need. I
 (8 bytes in five indexes, where its name would be 73); outside it is `<stage>-<key>`. Times are seconds since 1970.
 """
 
+from typing import Any
+
 from sqlalchemy import (
     BigInteger,
     Boolean,
@@ -17,7 +19,6 @@ from sqlalchemy import (
     String,
     Table,
     Text,
-    TextClause,
     text,
 )
 
@@ -31,7 +32,7 @@ metadata = MetaData(
 )
 
 
-def _partial(condition: str) -> dict[str, TextClause]:
+def _partial(condition: str) -> dict[str, Any]:
     """Return the condition of a partial index."""
     return {"sqlite_where": text(condition), "postgresql_where": text(condition)}
 
