@@ -48,9 +48,6 @@ def test_instants_are_those_of_the_scenes() -> None:
         cloth_sphere.FRAMES,
         cloth_sphere.FRAME_RATE,
     )
-    source = (ROOT / "workers/blender/src/stickslip_blender/scenes/cloth_sphere.py").read_text()
-    assert f"RADIUS = {cloth_sphere.RADIUS}\n" in source
-    assert f"SETTLING, FRAMES_PER_SECOND = {cloth_sphere.SETTLING}, {cloth_sphere.FRAME_RATE}\n" in source
 
 
 def test_the_figure_of_the_shawl_is_the_cores() -> None:

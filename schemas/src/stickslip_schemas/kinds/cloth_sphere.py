@@ -57,7 +57,6 @@ class ClothSphereRender(ClothRender):
     """How a cloth on a turning sphere is seen."""
 
     kind: Literal["cloth_sphere"] = "cloth_sphere"
-    angular_speed: float
 
 
 class ClothSphereSpec(ClothSpec):

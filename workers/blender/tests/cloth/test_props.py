@@ -1,4 +1,4 @@
-"""What stands on a stage besides the cloth: a figure that follows its bones, and a floor that is not seen on it."""
+"""Props: a figure that follows its bones, a ball that follows its poses, and a floor whose marks are not on them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 from stickslip_blender.cloth.geometry import Geometry, Holders
 from stickslip_blender.cloth.ground_truth import CLOTH, GROUND, PROP, ground_truth
 from stickslip_blender.cloth.shading import Composer
+from stickslip_blender.scenes.cloth_sphere import Ball
 from stickslip_blender.scenes.shawl import SUNK, Figure
 from stickslip_schemas.spec.cameras import load_rig
 
@@ -34,6 +35,17 @@ def test_a_figure_follows_its_bones() -> None:
     assert (np.linalg.norm(rest, axis=1) < np.linalg.norm(skin, axis=1)).all()
     assert np.allclose(moved - rest, upper[:, None] * [0.0, 0.5, 1.0])
     assert figure.props[0].is_smooth
+
+
+def test_a_ball_stands_on_the_floor_and_turns_with_its_poses() -> None:
+    poses = np.zeros((2, 3, 4))
+    poses[0, :, :3], poses[1, :, :3] = np.eye(3), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    poses[:, 2, 3] = 0.05
+    made = Ball(np.zeros((4, 2)), poses=poses)
+    still, turned = (np.concatenate(made.placed(instant, np.zeros((4, 3)))) for instant in (0, 1))
+    assert np.allclose(made.aim(1, still), [0.0, 0.0, 0.05])
+    assert np.allclose(np.linalg.norm(still - [0.0, 0.0, 0.05], axis=1), 0.05 - SUNK)
+    assert np.allclose(turned, np.column_stack([-still[:, 1], still[:, 0], still[:, 2]]))
 
 
 def test_marks_of_the_floor_are_not_on_props(make_sheet: Callable[..., Any]) -> None:

@@ -16,59 +16,50 @@ if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.cloth_sphere import ClothSphereRender
 
-RADIUS = 0.05
-"""Of the sphere in the simulation [m]."""
-SEEN = RADIUS - 0.0005
-"""Of the sphere in the picture [m]: half a thickness below the middle surface of a cloth that lies on it."""
-SETTLING, FRAMES_PER_SECOND = 2.0, 15.0
-"""How long the sphere rests and then gains its speed [s], and how many instants a second has, as in the simulation."""
+SUNK = 0.0005
+"""Distance of the visible ball from the sphere of the simulation [m]: half the thickness of a cloth that lies on it."""
 _GORES, _RINGS = 32, 16
 _COLORS = (
     (0.06, 0.06, 0.06),
     (0.4, 0.4, 0.4),
-)  # linear; gores by turns, so that the turning shows, and grey: see the gate
+)  # linear; alternating gores show the rotation; grey: see the gate
 
 Array = npt.NDArray[np.float64]
 
 
 def render(look: ClothSphereRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a cloth on a turning sphere."""
-    make = partial(Ball, angular_speed=look.angular_speed)
-    return render_clips(look, task, workshop, make, surroundings_key=look.angular_speed)
-
-
-def turned(instant: int, angular_speed: float) -> float:
-    """Return the angle by which the sphere has turned at an instant [rad], as `turned` of the simulation has it."""
-    t = max(instant / FRAMES_PER_SECOND - SETTLING, 0.0)
-    return angular_speed * (0.5 * t * t / SETTLING if t < SETTLING else t - 0.5 * SETTLING)
+    (poses,) = workshop.record(task.record, "sphere_pose")
+    return render_clips(look, task, workshop, partial(Ball, poses=poses), surroundings_key=poses.tobytes())
 
 
 class Ball:
-    """A ball of gores in two colours; the lamp points at its top."""
+    """A ball of gores in two colours; the lamp points at its centre."""
 
-    def __init__(self, _rest: npt.ArrayLike, *, angular_speed: float) -> None:
-        self._speed = angular_speed
-        parts = zip(_gores(), _COLORS, strict=True)
+    def __init__(self, _rest: npt.ArrayLike, *, poses: npt.ArrayLike) -> None:
+        """Take the pose of the sphere at each instant (instants, 3, 4), x -> A x + b [m]; it stands on the floor."""
+        self._poses = np.asarray(poses, dtype=np.float64)
+        radius = float(self._poses[0, 2, 3])
+        parts = zip(_gores(radius - SUNK), _COLORS, strict=True)
         self.props = tuple(Prop(f"ball-{n}", *part, color, 0.5) for n, (part, color) in enumerate(parts, 1))
 
     def placed(self, instant: int, _vertices: Array) -> list[Array]:
-        """Turn the ball to where it is at an instant."""
-        angle = turned(instant, self._speed)
-        c, s = np.cos(angle), np.sin(angle)
-        turn, center = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 0.0, RADIUS])
-        return [prop.vertices @ turn.T + center for prop in self.props]
+        """Turn the ball to its pose at an instant."""
+        pose = self._poses[instant]
+        return [prop.vertices @ pose[:, :3].T + pose[:, 3] for prop in self.props]
 
-    def aim(self, _instant: int, _vertices: Array) -> Array:
-        """Return the middle of the ball."""
-        return np.array([0.0, 0.0, RADIUS])
+    def aim(self, instant: int, _vertices: Array) -> Array:
+        """Return the centre of the ball."""
+        center: Array = self._poses[instant, :, 3]
+        return center
 
 
-def _gores() -> list[tuple[Array, Faces]]:
+def _gores(radius: float) -> list[tuple[Array, Faces]]:
     """Return the vertices and faces of both halves of the gores of a ball about the origin."""
     polar = np.pi * np.arange(_RINGS + 1) / _RINGS
     azimuth = 2.0 * np.pi * np.arange(_GORES) / _GORES
     p, a = np.meshgrid(polar, azimuth, indexing="ij")
-    vertices = SEEN * np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1).reshape(-1, 3)
+    vertices = radius * np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1).reshape(-1, 3)
     halves: tuple[Faces, Faces] = ([], [])
     for ring in range(_RINGS):
         for gore in range(_GORES):
