@@ -61,7 +61,7 @@ def test_the_figure_of_the_shawl_is_the_cores() -> None:
         TypeAdapter(Swing).validate_python(shawl.SWING_MAX + 1e-9)
 
 
-def test_cloth_feels_itself_by_one_default_and_by_certified_contact() -> None:
+def test_self_contact_has_one_default_and_certified_protocols() -> None:
     assert CORE_SELF_FRICTION == SELF_FRICTION
     asked = inspect.signature(cloth_drag.scene).parameters["self_friction"].default
     assert ClothDragSpec.model_fields["self_friction"].default == asked == SELF_FRICTION

@@ -1,5 +1,9 @@
-"""Codes of labels, which datasets store."""
+"""Kinds and the codes of labels, which datasets store."""
 
+from typing import get_args
+
+import pytest
+from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
 from stickslip_schemas.kinds.cloth.names import ThreeViewpoint
@@ -27,3 +31,11 @@ def test_codes_of_labels_are_pinned() -> None:
     assert list(ThreeViewpoint) == ["front", "side", "high"]
     assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
     assert SPLITS == ("train", "validation", "test")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_module_of_the_package_is_a_kind_of_its_name(name: str) -> None:
+    spec = KINDS[name]
+    assert spec.__module__ == f"stickslip_schemas.kinds.{name}"
+    for document in (spec, spec.simulation_type, spec.render_type):
+        assert get_args(document.model_fields["kind"].annotation) == (name,)
