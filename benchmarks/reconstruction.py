@@ -27,10 +27,9 @@ import numpy.typing as npt  # noqa: E402
 from stickslip_schemas.spec.cameras import load_rig  # noqa: E402
 from stickslip_sim_core import solve_general_rods, solve_rods  # noqa: E402
 from stickslip_training.reconstruction import Reconstruction, Verdict, reconstruct  # noqa: E402
-from stickslip_training.reconstruction.hull import moving_cylinder, visual_hull  # noqa: E402
 from stickslip_training.reconstruction.photographs import save_overlay  # noqa: E402
-from stickslip_training.reconstruction.silhouette import silhouette  # noqa: E402
-from stickslip_training.reconstruction.view import View  # noqa: E402
+from stickslip_training.reconstruction.silhouette import View, silhouette  # noqa: E402
+from stickslip_training.reconstruction.starts import moving_cylinder, visual_hull  # noqa: E402
 
 Floats = npt.NDArray[np.float64]
 

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.reconstruction import curve
-from stickslip_training.reconstruction.hull import HullTooLargeError, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.refinement import _Problem, draw, samples, start
-from stickslip_training.reconstruction.silhouette import NoRodError, silhouette, to_linear
-from stickslip_training.reconstruction.tracking import follow
+from stickslip_training.reconstruction.silhouette import NoRodError, View, silhouette, to_linear
+from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.tube_image import Shading, tube_image
-from stickslip_training.reconstruction.view import View
 
 RADIUS = 0.008
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -51,15 +51,8 @@ class Runs:
 
     def __getitem__(self, chosen: Array) -> "Runs":
         """Return some of the runs."""
-        return Runs(
-            self.positions[chosen],
-            self.instants,
-            self.materials,
-            self.material[chosen],
-            self.mu[chosen],
-            self.landed[chosen],
-            self.fabric[chosen],
-        )
+        names = ("positions", "material", "mu", "landed", "fabric")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def named(self, materials: tuple[str, ...]) -> "Runs":
         """Return the runs with the codes of other names; raise ValueError where one of theirs is missing."""
@@ -67,15 +60,6 @@ class Runs:
             raise ValueError(f"materials must have those of the runs, and lack {', '.join(sorted(missing))}")
         codes = np.array([materials.index(name) for name in self.materials])
         return replace(self, materials=materials, material=codes[self.material])
-
-    @staticmethod
-    def joined(first: "Runs", second: "Runs") -> "Runs":
-        """Return the runs of both, which must have the same instants and materials."""
-        if (first.instants, first.materials) != (second.instants, second.materials):
-            raise ValueError("runs that are joined must have the same instants and materials")
-        names = ("positions", "material", "mu", "landed", "fabric")
-        both = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
-        return Runs(instants=first.instants, materials=first.materials, **both)
 
     @property
     def side(self) -> int:

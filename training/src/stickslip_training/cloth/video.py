@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from pydantic import ValidationError
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.store import write_durably
@@ -135,7 +136,7 @@ def load_calibration(path: str | Path) -> Calibration:
         raise ValueError(f"distortion must be 4 or 5 finite numbers (k1, k2, p1, p2, k3) or none, and is {distortion}")
     rotation = content.get("rotation")
     if isinstance(rotation, list) and len(rotation) == 3 and all(isinstance(r, int | float) for r in rotation):
-        content["rotation"] = _matrix(np.array(rotation, dtype=np.float64)).tolist()
+        content["rotation"] = Rotation.from_rotvec(rotation).as_matrix().tolist()
     try:
         camera = Camera.model_validate({"name": "custom", **content})
     except ValidationError as error:
@@ -213,13 +214,6 @@ def load_clip(path: str | Path) -> Clips:
 
 
 # --- following the holders -------------------------------------------------------------------------------------
-
-
-def _matrix(vector: Floats) -> Floats:
-    """Return exp([v]) [Rodrigues 1840]."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def _frames(path: str | Path) -> Iterator[tuple[float, "NDArray[np.uint8]"]]:

@@ -18,13 +18,11 @@ GROUP_BYTES = 32 * 2**20
 
 
 def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write the directory."""
+    """Write the files into an empty directory."""
     import pyarrow
     from pyarrow import parquet
 
-    (directory / "data").mkdir(parents=True)
-    (directory / MANIFEST_COPY).write_bytes(content.manifest())
-    (directory / DESCRIPTION).write_bytes(content.description())
+    (directory / "data").mkdir()
     schema = _features(content).arrow_schema
     rows = max(1, GROUP_BYTES // content.sample_bytes)
     splits = []

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_training.arrays import Array
-from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes
+from stickslip_training.export.content import Content, OnBytes
 
 NEEDED = ("positions", "rest", "triangles")
 
@@ -22,7 +22,7 @@ def write_usd(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write `SLOT.usdc` for each sample: a mesh `/cloth` whose points move."""
     from pxr import Sdf, Usd, UsdGeom, Vt
 
-    rate = _begin(content, directory)
+    rate = _instants_per_second(content)
     for slot, positions, uv, triangles, labels in _samples(content):
         stage = Usd.Stage.CreateNew(str(directory / f"{slot:08d}.usdc"))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -53,21 +53,21 @@ def write_usd(content: Content, directory: Path, on_bytes: OnBytes) -> None:
 
 def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write `SLOT/0000.obj` and so on, one for each instant, and `SLOT/labels.json`."""
-    _begin(content, directory)
+    _instants_per_second(content)
     for slot, positions, uv, triangles, labels in _samples(content):
-        own = directory / f"{slot:08d}"
-        own.mkdir()
-        (own / "labels.json").write_text(json.dumps(labels, indent=2) + "\n")
+        folder = directory / f"{slot:08d}"
+        folder.mkdir()
+        (folder / "labels.json").write_text(json.dumps(labels, indent=2) + "\n")
         coordinates = "".join(f"vt {u:.9g} {v:.9g}\n" for u, v in uv.tolist())
         faces = "".join("f " + " ".join(f"{i}/{i}" for i in corners) + "\n" for corners in (triangles + 1).tolist())
         for instant, vertices in enumerate(positions.tolist()):
             moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
-            (own / f"{instant:04d}.obj").write_text(f"o cloth\n{moved}{coordinates}{faces}")
+            (folder / f"{instant:04d}.obj").write_text(f"o cloth\n{moved}{coordinates}{faces}")
         on_bytes(content.sample_bytes)
 
 
-def _begin(content: Content, directory: Path) -> float:
-    """Make the directory, and return how many instants a second has."""
+def _instants_per_second(content: Content) -> float:
+    """Return the instants per second of the meshes; raise ValueError where this part of the dataset has none."""
     arrays = {array.name: array for array in content.arrays}
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
@@ -75,9 +75,6 @@ def _begin(content: Content, directory: Path) -> float:
             f"a mesh needs the arrays {', '.join(NEEDED)}, and {', '.join(missing)} are not in this part of "
             f"{content.name}"
         )
-    directory.mkdir()
-    (directory / MANIFEST_COPY).write_bytes(content.manifest())
-    (directory / DESCRIPTION).write_bytes(content.description())
     return float(arrays["positions"].attributes["instants_per_second"])
 
 

@@ -11,21 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes
+from stickslip_training.export.content import Content, OnBytes
 
 
 def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write the directory."""
-    directory.mkdir()
-    (directory / MANIFEST_COPY).write_bytes(content.manifest())
-    (directory / DESCRIPTION).write_bytes(content.description())
+    """Write the files into an empty directory."""
     for part in content.parts():
         with tarfile.open(directory / f"{part.split}-{part.number:06d}.tar", "x", format=tarfile.USTAR_FORMAT) as tar:
             labels = {array.name: content.read(array.name, part.slots).tolist() for array in content.labels}
             for place, slot in enumerate(part.slots):
                 key = f"{slot:08d}"
-                own = {name: values[place] for name, values in labels.items()}
-                _add(tar, f"{key}.json", json.dumps(own).encode())
+                sample = {name: values[place] for name, values in labels.items()}
+                _add(tar, f"{key}.json", json.dumps(sample).encode())
                 for array in content.others:
                     _add(tar, f"{key}.{array.name}.npy", _npy(content.read(array.name, part.slots[place : place + 1])))
                 on_bytes(content.sample_bytes)

@@ -10,7 +10,7 @@ from pathlib import Path
 from stickslip_schemas.store import sync
 
 from stickslip_training.export import croissant, hdf5
-from stickslip_training.export.content import Content, OnBytes
+from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes
 
 
 def to_directory(
@@ -21,8 +21,11 @@ def to_directory(
     *,
     licence: str | None = None,
 ) -> None:
-    """Let `write` make a directory, and add Croissant metadata to it."""
+    """Let `write` fill a directory, and add the manifest, a description and Croissant metadata."""
     with made_whole(target) as scratch:
+        scratch.mkdir()
+        (scratch / MANIFEST_COPY).write_bytes(content.manifest())
+        (scratch / DESCRIPTION).write_bytes(content.description())
         write(content, scratch, on_bytes)
         files = {path.relative_to(scratch).as_posix(): path for path in scratch.rglob("*") if path.is_file()}
         metadata = croissant.document(content, files, licence=licence)

@@ -1,8 +1,8 @@
 """From calibrated views of a hanging rod to its centreline.
 
 1. Silhouettes: the coverage of each pixel [silhouette].
-2. Starts: ways through all silhouettes at once, from the clamp, as long as the rod [tracking], and the centroid of a
-   cylinder that moves through the visual hull, as in the thesis [hull].
+2. Starts: ways through all silhouettes at once, from the clamp, as long as the rod, and the centroid of a
+   cylinder that moves through the visual hull, as in the thesis [starts].
 3. Each start is moved until a tube about it looks as the views do [refinement]; the one that does so best wins.
 4. The winner is judged: what it leaves unexplained, what it claims that is not there, and whether another curve would
    do as well.
@@ -22,11 +22,9 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction import curve
-from stickslip_training.reconstruction.hull import HullTooLargeError, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
-from stickslip_training.reconstruction.silhouette import NoRodError, silhouette_of_light, to_linear
-from stickslip_training.reconstruction.tracking import follow
-from stickslip_training.reconstruction.view import View, shrink_image
+from stickslip_training.reconstruction.silhouette import NoRodError, View, shrink_image, silhouette_of_light, to_linear
+from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
 
 CONTROL_POINTS = 44
 STARTS = 4  # ways of the tracking that are refined

@@ -21,8 +21,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.curve import basis
+from stickslip_training.reconstruction.silhouette import View
 from stickslip_training.reconstruction.tube_image import Shading, TubeImage, tube_image
-from stickslip_training.reconstruction.view import View
 
 PIXEL = 0.12  # of the brightness of the rod: what a pixel may be off
 ROBUST = 3.0  # in units of PIXEL: beyond it a pixel's pull falls again

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.special import ndtr
 
 from stickslip_training.arrays import Floats, Integers
-from stickslip_training.reconstruction.view import View
+from stickslip_training.reconstruction.silhouette import View
 
 BAND = 2.5  # blurs beyond the edge of the rod that are looked at
 

@@ -1,8 +1,11 @@
-"""Follow the rod from the clamp through all views at once.
+"""Starts for the refinement: curves from the clamp to the free end.
 
-Steps of one length go from the clamp to the free end. Of all ways that can be gone so, those are kept (a beam) whose
-points lie in the middle of every silhouette and that bend evenly: at a crossing in one view the other views and the
-even bend say where to go on, and a way that takes a short cut has length left over that no silhouette has room for.
+`follow` goes through all views at once, in steps of one length. Of all ways, a beam of those is kept whose points lie
+in the middle of every silhouette and that bend evenly. At a crossing in one view, the other views and the even bend
+decide. A way that takes a short cut has length left over for which no silhouette has room.
+
+`visual_hull` is a cloud of points, and `moving_cylinder` the thesis's way from it to a centreline [thesis, 5.3.1]. A
+cloud has no order, and where turns of a curl come close in several views it has bridges and phantoms.
 """
 
 from __future__ import annotations
@@ -13,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from stickslip_training.arrays import Floats
-from stickslip_training.reconstruction.view import View
+from stickslip_training.reconstruction.silhouette import View
 
 STEPS = 100
 BEAM = 200  # ways that are kept
@@ -45,7 +49,7 @@ def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 
     parents: list[npt.NDArray[np.int64]] = []
     trail = [position]
     for _ in range(STEPS):
-        ahead = _rotate(heading, turn)
+        ahead = Rotation.from_rotvec(turn).apply(heading)
         candidates = _cone(ahead)  # (n, m, 3)
         n, m = candidates.shape[:2]
         middle = heading[:, None] + candidates
@@ -110,15 +114,6 @@ def _rotation(before: Floats, after: Floats) -> Floats:
     return rotation
 
 
-def _rotate(vectors: Floats, rotation: Floats) -> Floats:
-    """Rotate vectors that are at right angles to the axes of their rotations."""
-    angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-    axis = rotation / np.maximum(angle, 1e-12)
-    rotated: Floats = np.cos(angle) * vectors + np.sin(angle) * np.cross(axis, vectors)
-    rotated /= np.linalg.norm(rotated, axis=1, keepdims=True)
-    return rotated
-
-
 def _squared(vectors: Floats) -> Floats:
     squared: Floats = np.einsum("ij,ij->i", vectors, vectors)
     return squared
@@ -152,3 +147,72 @@ def _unlike(
             if len(tracks) == ways:
                 break
     return tracks
+
+
+ROOM = 1.05  # [L]: the rod cannot reach farther from its clamp
+HULL_CELL = 0.0025  # [L]: the cloud's spacing, about half a pixel of the views that the project renders
+MOST_CELLS = 400_000  # a hull this large is no rod's
+
+
+class HullTooLargeError(ValueError):
+    """The silhouettes leave room for far more than a slender rod."""
+
+
+def visual_hull(views: Sequence[View], cell: float = HULL_CELL) -> Floats:
+    """Return the points, at most `cell` [L] apart, whose images lie in every silhouette, (n, 3) [L].
+
+    Cubes are halved again and again; those are kept whose surrounding ball touches every silhouette.
+    """
+    outside = [ndimage.distance_transform_edt(view.coverage < 0.5) for view in views]
+    halvings = int(np.ceil(np.log2(2.0 * ROOM / cell)))
+    centers, side = np.zeros((1, 3)), 2.0 * ROOM
+    corners = np.array([[x, y, z] for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25)])
+    for level in range(halvings + 1):
+        if level > 0:
+            centers, side = (centers[:, None] + side * corners).reshape(-1, 3), side / 2.0
+        reach = 0.5 * np.sqrt(3.0) * side if level < halvings else 0.0
+        for view, distance in zip(views, outside, strict=True):
+            centers = centers[_touches(view, distance, centers, reach)]
+        if len(centers) > MOST_CELLS:
+            raise HullTooLargeError(
+                f"views: the silhouettes leave room for more than {MOST_CELLS} cells of {side:.3g} L; "
+                "they must be those of one slender rod"
+            )
+    return centers
+
+
+def _touches(view: View, distance: Floats, points: Floats, reach: float) -> npt.NDArray[np.bool_]:
+    pixels, depth = view.project(points)
+    height, width = distance.shape
+    nearest = np.rint(pixels)
+    inside = np.clip(nearest, 0, [width - 1, height - 1])
+    out_of_frame = np.linalg.norm(nearest - inside, axis=1)
+    u, v = inside.astype(np.int64).T
+    away = np.maximum(distance[v, u], out_of_frame)
+    allowed = float(view.f.max()) * reach / np.maximum(depth - reach, 1e-3) + 0.71  # half a pixel's diagonal
+    if reach == 0.0:
+        allowed = np.zeros(len(points))
+    touches: npt.NDArray[np.bool_] = away <= allowed
+    return touches
+
+
+def moving_cylinder(cloud: Floats, radius: float, direction: Floats, step: float = 0.01) -> Floats:
+    """Return a polyline (n, 3) [L] through a cloud: centroids of what a cylinder holds that moves along the rod.
+
+    The cylinder begins at the clamp, reaches two steps ahead and is three radii wide; it turns towards each centroid,
+    and the polyline ends where it is empty, or after twice the rod's length.
+    """
+    points, heading = [np.zeros(3)], direction / np.linalg.norm(direction)
+    for _ in range(int(2.0 / step)):
+        offset = cloud - points[-1]
+        ahead = offset @ heading
+        aside = np.linalg.norm(offset - ahead[:, None] * heading, axis=1)
+        held = (ahead > 0.0) & (ahead < 2.0 * step) & (aside < 3.0 * radius)
+        if not held.any():
+            break
+        toward = offset[held].mean(axis=0)
+        toward /= np.linalg.norm(toward)
+        heading = heading + toward
+        heading /= np.linalg.norm(heading)
+        points.append(points[-1] + step * toward)
+    return np.array(points)
