@@ -267,8 +267,8 @@ def dragged_forces(cloth: Cloth, hung: Hung, contact: Floats) -> Record:
     """
     if cloth.steps:
         return {"contact_force": contact, "holder_force": cloth.reactions[hung.held].sum(axis=0)}
-    weight = cloth.masses[: len(hung.positions)].sum() * np.array([0.0, 0.0, GRAVITY])
-    return {"contact_force": np.zeros(3), "holder_force": weight}
+    weight = cloth.masses[: len(hung.positions)].sum() * np.array([0.0, 0.0, -GRAVITY])
+    return {"contact_force": np.zeros(3), "holder_force": -weight}
 
 
 def drop_labels(run: ClothRun, hung: Hung) -> dict[str, float]:
