@@ -236,7 +236,7 @@ class QueueMachine(RuleBasedStateMachine):
                 assert self.manifests.setdefault(key, version.manifest) == version.manifest
 
     def teardown(self) -> None:
-        if not hasattr(self, "coordinator"):
+        if not hasattr(self, "context"):
             return
         # However it went: once no job is paused, a worker that does its work brings every job to its end.
         for job in list_jobs(self.context):
