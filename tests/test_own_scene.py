@@ -15,7 +15,7 @@ from stickslip_schemas.spec.scene_file import SceneFile
 from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS
 from stickslip_workers.builds import solver_build
-from stickslip_workers.own_scene import NotCertifiedError, SceneError, simulate_scene, why_uncertified
+from stickslip_workers.custom_scene import NotCertifiedError, SceneError, simulate_scene, why_uncertified
 
 SCENE: dict[str, Any] = {
     "format": "stickslip-scene/1",

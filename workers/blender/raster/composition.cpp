@@ -87,24 +87,24 @@ std::ptrdiff_t index_in(const Window& window, int column, int row) {
 
 }  // namespace
 
-void compose(const Trace& trace, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
+void compose(const Shading& shading, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
              const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
              std::size_t stride) {
   const std::vector<std::uint16_t>& table = encoding();
   const int colors = static_cast<int>(overall.size());
   std::vector<float> albedo(colors), factor(colors);
   std::vector<std::int32_t> codes(colors);
-  const std::size_t row_size = 3 * static_cast<std::size_t>(trace.width);
+  const std::size_t row_size = 3 * static_cast<std::size_t>(shading.width);
   std::vector<std::uint16_t> exact(row_size * (colors / 3));  // a row of each picture
-  for (int row = 0; row < trace.height; ++row) {
-    for (int column = 0; column < trace.width; ++column) {
-      const std::size_t pixel = static_cast<std::size_t>(row) * trace.width + column;
-      const std::uint16_t* const light = trace.light.data() + 3 * pixel;
+  for (int row = 0; row < shading.height; ++row) {
+    for (int column = 0; column < shading.width; ++column) {
+      const std::size_t pixel = static_cast<std::size_t>(row) * shading.width + column;
+      const std::uint16_t* const light = shading.light.data() + 3 * pixel;
       const float gloss = single(light[0]);
-      const float to_first = (single(light[1]) - gloss) / trace.first;
-      const float to_second = (single(light[2]) - gloss) / trace.second;
-      const float twice = (to_second - to_first) / (trace.second - trace.first);
-      const float once = to_first - trace.first * twice;
+      const float to_first = (single(light[1]) - gloss) / shading.first;
+      const float to_second = (single(light[2]) - gloss) / shading.second;
+      const float twice = (to_second - to_first) / (shading.second - shading.first);
+      const float once = to_first - shading.first * twice;
 
       const std::ptrdiff_t there = index_in(reflected.window, column, row);
       if (there < 0)
@@ -130,7 +130,7 @@ void compose(const Trace& trace, std::span<const float> overall, const Part& clo
       }
     }
     for (int n = 0; n < colors / 3; ++n)
-      settle(exact.data() + n * row_size, trace.width, pictures + n * stride + row * row_size);
+      settle(exact.data() + n * row_size, shading.width, pictures + n * stride + row * row_size);
   }
 }
 

@@ -1,5 +1,5 @@
-// Pictures of many textures from one trace, and what geometry adds to a frame. stickslip_blender.cloth.shading has the
-// formula.
+// Pictures of many textures from one shading, and marks of the floor. The formula stands in
+// stickslip_blender.cloth.shading.
 #pragma once
 
 #include <cstdint>
@@ -10,8 +10,8 @@
 
 namespace raster {
 
-// The light of a frame, for three albedos of the cloth.
-struct Trace {
+// The light of a frame at three albedos of the cloth.
+struct Shading {
   std::span<const std::uint16_t> light;  // half floats, height x width x 3
   int width, height;
   float first, second;  // the second and third albedo; the first is 0
@@ -29,13 +29,13 @@ struct Part {
 // light that met the cloth elsewhere; `reflected` what the floor shows of the cloth in its window, instead of it.
 // `floor` (height x width x 3) is a factor of the floor's light, and `reflectance` how bright the floor is beside the
 // cloth, where both are in a pixel.
-void compose(const Trace& trace, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
+void compose(const Shading& shading, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
              const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
              std::size_t stride);
 
-// 8-bit levels that a pixel of a clip may be away from its exact value.
+// Largest difference of a pixel of a clip from its exact value [8-bit levels].
 constexpr int tolerance = 1;
-// Pixels in a row that have to be near the pixel before them to take it over.
+// Number of consecutive pixels that must be near the pixel before them to take its level.
 constexpr int shortest_run = 3;
 
 // Write linear light (height x width x 3) as an 8-bit sRGB picture of few different pixels, which is smaller when

@@ -227,7 +227,7 @@ def _scene(options: argparse.Namespace) -> int:
     from stickslip_schemas.documents.certificate import Certificate
     from stickslip_schemas.spec.scene_file import SceneFile
 
-    from stickslip_workers.own_scene import simulate_scene
+    from stickslip_workers.custom_scene import simulate_scene
 
     def show(done: int, frames: int) -> None:
         if done == frames or done % max(frames // 20, 1) == 0:

@@ -1,7 +1,7 @@
-"""Which code runs here: the digests that go into content keys, for each kind and stage.
+"""Builds: digests of the code of each kind and stage, for content keys.
 
-A build covers the files that the work imports (see `stickslip_schemas.plan.sources`), the compiled core where it is
-used, and the versions of libraries that decide on bytes.
+A build covers the files that a stage imports (see `stickslip_schemas.plan.sources`), the compiled core where it is
+used, and the versions of the libraries that the output depends on.
 """
 
 from importlib import metadata
@@ -16,7 +16,7 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 
 
 def roots(stage: str, name: str) -> tuple[str, ...]:
-    """Return the modules that do the work of a stage for a kind."""
+    """Return the modules that run a stage for a kind."""
     if stage == "simulate":
         return (f"{_STAGES}.run", f"{_STAGES}.simulate", scene_module(name))
     if stage == "pack":
@@ -25,7 +25,7 @@ def roots(stage: str, name: str) -> tuple[str, ...]:
 
 
 def build(stage: str, name: str) -> str:
-    """Return the digest of everything that decides on what a stage makes for a kind."""
+    """Return the digest of all code that the output of a stage for a kind depends on."""
     libraries = {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
     core = "" if stage == "pack" else _core(kind(name).kernel())
     files = digests(sources(roots(stage, name), cut=UNCOUNTED))
@@ -56,6 +56,6 @@ def _core(kernel: str = "") -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return versions for people."""
+    """Return versions of libraries, for display."""
     names = ("stickslip-workers", "stickslip-schemas", "stickslip-sim-core", "ray", "zarr")
     return {name: metadata.version(name) for name in names}

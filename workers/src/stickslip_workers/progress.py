@@ -3,18 +3,18 @@
 _frames: tuple[int, int] | None = None
 
 
-def tell(done: int, frames: int) -> None:
-    """Note that so many frames of a simulation are done."""
+def note(done: int, frames: int) -> None:
+    """Set the progress of the simulation: frames done, frames total."""
     global _frames
     _frames = (done, frames)
 
 
-def forget() -> None:
-    """Note that nothing runs, or that what runs tells nothing."""
+def clear() -> None:
+    """Forget the progress, before and after a simulation."""
     global _frames
     _frames = None
 
 
-def told() -> tuple[int, int] | None:
-    """Return the frames that are done, and the frames; None where nothing runs that tells."""
+def current() -> tuple[int, int] | None:
+    """Return (frames done, frames total), or None if no simulation reports progress."""
     return _frames

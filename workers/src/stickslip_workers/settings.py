@@ -9,7 +9,7 @@ from stickslip_schemas.base.states import Stage
 
 RENDER_ACTOR = "stickslip_blender.actor:RenderActor"
 RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
-"""Environment variable that names the device that pictures are rendered on, and what it is by default."""
+"""Environment variable with the render device, and its default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,9 +25,9 @@ class Settings:
     key: str | None = None
     """What the coordinator wants to be shown by workers; None if it wants nothing."""
     tls_certificate: Path | None = None
-    """The coordinator's own certificate, which is then trusted by itself; None: certificates are checked as usual."""
+    """Certificate of the coordinator, trusted by itself; None: the usual check of certificates."""
     slots: int | None = None
-    """How many tasks run at once; by default the CPUs of the cluster."""
+    """Number of tasks that run at once; by default the CPUs of the cluster."""
     ray_address: str | None = None
     """An existing Ray cluster; by default one of its own on this machine, which ends with the dispatcher."""
 

@@ -1,8 +1,8 @@
-"""What a render process holds: it takes render tasks in JSON form and answers in JSON form.
+"""The object in a render process: render tasks in, results out, both as JSON.
 
-Nothing here knows of Ray, and nothing of any kind: the module of the kind renders. A fault of the sample is a rejection
-in the answer. Anything else is raised, and the owner of the process decides what it means. Results appear in the store
-by renaming whole files, so a crash of Blender leaves nothing that could be taken for one.
+It knows neither Ray nor any kind: the module of the kind renders. A fault of the sample gives a rejection; any other
+error is raised, and the owner of the process handles it. Results are published by renaming whole files, so a crash of
+Blender leaves no partial result.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from stickslip_blender.workshop import Workshop, check_rig
 
 
 class RenderActor:
-    """Renders samples from the store into the store. One to a process: Blender is one scene."""
+    """Renders samples from the store into the store. One per process, because Blender holds one scene."""
 
     def __init__(self, store_root: str, scratch: str | None = None) -> None:
         self._workshop = Workshop(store_root, scratch)
 
     def close(self) -> None:
-        """Let go of what the renderer holds outside Blender."""
+        """Release what the renderer holds outside Blender."""
         self._workshop.close()
 
     def describe(self) -> dict[str, Any]:
-        """Return the build of each kind and versions; the same for every process of one installation."""
+        """Return the build of each kind, and versions; they are equal in all processes of one installation."""
         return {
             "builds": {kind: build_digest(kind) for kind in kind_names()},
             "versions": blender_version() | {"device": " ".join(map(str, described().values()))},

@@ -21,7 +21,7 @@ def roots(kind: str) -> tuple[str, ...]:
 
 @cache
 def build_digest(kind: str) -> str:
-    """Return the SHA-256 over the sources that render a kind, and over versions; no path, time or machine is in it."""
+    """Return the SHA-256 over the sources that render a kind, and versions; no path, time or machine is part of it."""
     content = {
         "kind": kind,
         "sources": digests(sources(roots(kind), cut=UNCOUNTED)),

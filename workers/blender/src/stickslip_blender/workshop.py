@@ -1,4 +1,4 @@
-"""What the scenes of all kinds work with: records of the store, one renderer at a time, and where pictures go."""
+"""Services for the scenes of all kinds: records and pictures in the store, and one renderer at a time."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from stickslip_schemas.format.codecs import encode_chunk, encode_clip
 from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.store import open_store, write_durably
 
-if TYPE_CHECKING:  # documents are in the content key as a whole, so the modules that define them are in no build
+if TYPE_CHECKING:  # content keys hold whole documents; the modules that define them are in no build
     from stickslip_schemas.spec.jobs import Render
 
     from stickslip_blender.cloth.clips import Shading
 
 FRAME_MARGIN = 1.0
-"""How far inside the frame a rod or a cloth has to stay [px]."""
+"""Least distance of a rod or a cloth from the edge of the frame [px]."""
 
 SHADING_BYTES = 4 * 2**30
-"""Room that the shadings kept in a store may take: about 500 clips of 30 frames."""
+"""Limit of the shadings kept in a store [bytes]: about 500 clips of 30 frames."""
 _DIGEST_BYTES = 32
 
 Array = npt.NDArray[Any]
 
 
 class Renderer(Protocol):
-    """What holds a Blender scene."""
+    """The owner of a Blender scene."""
 
     def close(self) -> None:
-        """Let go of what it holds outside Blender."""
+        """Release what it holds outside Blender."""
 
 
 R = TypeVar("R", bound=Renderer)
@@ -46,21 +46,21 @@ R = TypeVar("R", bound=Renderer)
 class Workshop:
     """Reads records and publishes pictures.
 
-    It keeps the last record and the last renderer, for several tasks share them. Blender is one scene per process, so
-    there is one renderer at a time.
+    It keeps the last record and the last renderer, because several tasks share them. Blender holds one scene per
+    process, so there is one renderer at a time.
     """
 
     def __init__(self, store: str, scratch: str | None = None) -> None:
         self.store = open_store(store)
         self.shadings: OrderedDict[str, Shading] = OrderedDict()
-        """The last shadings of cloth, by what they depend on: clips that differ in their texture share one."""
+        """The last shadings of cloth, by key; clips that differ only in their texture share one."""
         self.scratch = scratch
-        """Folder for frames on their way out of Blender; None: memory."""
+        """Folder for the frames that Blender writes; None: memory."""
         self._renderer: tuple[object, Renderer] | None = None
         self._records: tuple[str, dict[str, Array]] = ("", {})
 
     def close(self) -> None:
-        """Let go of the renderer."""
+        """Close the renderer."""
         if self._renderer is not None:
             self._renderer[1].close()
             self._renderer = None
@@ -81,7 +81,7 @@ class Workshop:
     def keep_shading(self, key: str, data: bytes) -> None:
         """Keep a shading in the store for textures to come; the oldest are deleted where all take too much room.
 
-        No result depends on it: where it cannot be written, only time is lost.
+        No result depends on it; if it cannot be written, it is rendered again.
         """
         path = self._shading_path(key)
         if path is None:
@@ -113,11 +113,11 @@ class Workshop:
         return [arrays[name][record.row] for name in names]
 
     def renderer(self, scene: object, build: Callable[[], R]) -> R:
-        """Return the renderer of a scene: the last one, or else another in its place."""
+        """Return the renderer of a scene: the last one if it fits, or a new one in its place."""
         if self._renderer is None or self._renderer[0] != scene:
             self.close()
             self._renderer = scene, build()
-        return self._renderer[1]  # type: ignore[return-value]  # `scene` names what `build` makes
+        return self._renderer[1]  # type: ignore[return-value]  # `scene` identifies what `build` returns
 
     def rendered(self, name: str, pictures: Array, preview: bytes | None, labels: dict[str, Any]) -> TaskResult:
         """Publish pictures (n, height, width, 3) of one sample, and a preview, and return the result."""
@@ -141,7 +141,7 @@ class Workshop:
 
 
 def check_rig(render: Render) -> None:
-    """Refuse a render document whose cameras are not those of this installation."""
+    """Raise a ValueError if the cameras of a render document are not those of this installation."""
     if render.rig_digest != rig_digest(render.rig):
         raise ValueError(
             f"render.rig_digest must be that of {render.rig} here, {rig_digest(render.rig)}; got {render.rig_digest}"
@@ -149,7 +149,7 @@ def check_rig(render: Render) -> None:
 
 
 def why_unfit(what: str, points: Array, radius: float, cameras: tuple[Camera, ...]) -> TaskResult | None:
-    """Reject points (..., 3) that are not finite, or that leave the frame of a camera; None where nothing is wrong."""
+    """Return the rejection of points (..., 3) that are not finite or leave the frame of a camera, or None."""
     if not np.isfinite(points).all():
         return _rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
     overflow = {camera.name: camera.overflow(points, radius, FRAME_MARGIN) for camera in cameras}

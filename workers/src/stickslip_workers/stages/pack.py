@@ -1,6 +1,6 @@
 """Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write them.
 
-Labels are no files yet: those of many shard groups go into one, which the last task writes.
+Labels are no files yet: the task that publishes writes those of many shard groups into one file.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ def _check_slots(task: PackTask) -> None:
 
 
 class _Shard:
-    """A shard group while it fills, sample by sample: a record is megabytes of cloth and is read once."""
+    """A shard group, filled sample by sample; a record has megabytes and is read once."""
 
     def __init__(self, task: PackTask, store: Store) -> None:
         self._store = store
@@ -71,7 +71,7 @@ class _Shard:
         self._trajectories: dict[tuple[str, RecordRef], bytes] = {}
 
     def fill(self, row: int, slot: PackSlot) -> None:
-        """Put a sample in its place."""
+        """Add a sample."""
         self._check_labels(slot)
         for array in self._arrays:
             if not array.per_sample and not array.is_recorded:
@@ -86,7 +86,7 @@ class _Shard:
                 self._chunks[array.name][row] = self._rendered(array, slot)
 
     def _check_labels(self, slot: PackSlot) -> None:
-        """Refuse a label that no array takes: it would be lost without a word."""
+        """Raise a ValueError for a label without an array: it would be lost silently."""
         columns = {array.name for array in self._arrays if not array.per_sample and not array.is_recorded}
         if unknown := set(slot.labels) - columns:
             raise ValueError(f"labels of slot {slot.slot} must have an array each; there is none for {sorted(unknown)}")

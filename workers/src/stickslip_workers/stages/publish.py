@@ -41,7 +41,7 @@ def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:
 
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:
-    """Write what makes the shards a dataset. Doing it twice, or again after a crash, gives the same bytes."""
+    """Make the shards a dataset version. Repeating it, also after a crash, gives the same bytes."""
     given = [PublishSection.model_validate_json(store.read(digest)) for digest in task.sections]
     _check_complete(task, given, store)
     labels = _Labels(task, given, store)
@@ -92,7 +92,7 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
 
 
 def _check_complete(task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
-    """Refuse a version that lacks a file: a Zarr reader would take it for fill values and say nothing."""
+    """Raise if the version lacks a file: a Zarr reader would silently return fill values."""
     if task.dataset != dataset_id(task.spec):
         raise ValueError(f"dataset must be the id of its spec, {dataset_id(task.spec)}; got {task.dataset!r}")
     bounds = [0, *(section.end for section in given)]

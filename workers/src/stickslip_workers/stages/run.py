@@ -43,15 +43,15 @@ class StageActor:
 
     def run(self, tasks: str) -> str:
         """Run tasks, see `run_tasks`."""
-        progress.forget()
+        progress.clear()
         try:
             return _results.dump_json(run_tasks(_tasks.validate_json(tasks), self._store)).decode()
         finally:
-            progress.forget()
+            progress.clear()
 
     def frames(self) -> tuple[int, int] | None:
         """Return the progress of the running simulation, (frames done, frames total); another thread may call it."""
-        return progress.told()
+        return progress.current()
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:

@@ -9,7 +9,7 @@ from stickslip_schemas.documents.tasks import RecordRef, SimulateOutput, Simulat
 from stickslip_schemas.store import Store
 
 from stickslip_workers.kinds import kind
-from stickslip_workers.progress import tell
+from stickslip_workers.progress import note
 from stickslip_workers.stages.records import encode_records
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
     made = kind(names[0])
     simulations = [task.simulation.model_dump(mode="json", exclude={"kind"}) for task in tasks]
-    outcomes = made.simulate(simulations, tell)
+    outcomes = made.simulate(simulations, note)
     records = _stored(outcomes, made.batch, store)
     return [
         _rejection(physics, outcome.reason)

@@ -1,8 +1,8 @@
 """Clips of cloth: from a render task to a result, for every scene of cloth.
 
-One shading serves all textures (`stickslip_blender.cloth.shading`) where an image gate finds it good enough. The gate
-renders one frame directly, with one texture, and compares means of 4 x 4 pixels: they have little sampling noise left,
-and all that is wrong with the composition. Where it fails, every clip is rendered directly.
+One shading serves all textures (`stickslip_blender.cloth.shading`) if it passes an image gate. The gate renders one
+frame directly, with one texture, and compares means of 4 x 4 pixels: these have little sampling noise, but all errors
+of the composition. If the gate fails, every clip is rendered directly.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth.spec import ClothRender
 
 GATE = 32.0
-"""What composed pictures have to reach against direct ones, in means of 4 x 4 pixels of 8-bit sRGB [dB]."""
+"""Least PSNR of composed pictures against direct ones, in means of 4 x 4 pixels of 8-bit sRGB [dB]."""
 GATE_TEXTURE = Texture.floral
-"""Of the gate: with dark, light and saturated places."""
+"""Texture of the gate, with dark, light and saturated places."""
 _GATE_SAMPLES = 16
 _BLOCK = 4
 _PREVIEW_SIDE = 160  # [px]
@@ -57,11 +57,11 @@ class Shading:
     light: npt.NDArray[np.float16]
     """Linear, at the albedos of `shading.ALBEDOS`, shape (frames, height, width, 3)."""
     gate_db: float
-    """What the gate found [dB]; it fails below `GATE`."""
+    """PSNR at the gate [dB]; it fails below `GATE`."""
 
     @property
     def composed(self) -> bool:
-        """Whether pictures may be composed of it."""
+        """Whether the shading passed the gate, so that pictures are composed of it."""
         return self.gate_db >= GATE
 
 
@@ -80,7 +80,7 @@ class ClothRenderer:
         self.scene = ClothScene(self.geometry, scratch=scratch)
 
     def close(self) -> None:
-        """Let go of what the scene holds outside Blender."""
+        """Release what the scene holds outside Blender."""
         self.scene.close()
 
     def clip(

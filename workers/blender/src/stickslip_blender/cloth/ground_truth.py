@@ -23,7 +23,7 @@ Halves = npt.NDArray[np.float16]
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Of one frame."""
+    """The ground truth of one frame."""
 
     depth: Floats
     """Along the optical axis [m], infinite where there is nothing; shape (height, width)."""

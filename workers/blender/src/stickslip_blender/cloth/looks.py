@@ -24,7 +24,7 @@ SIDE = 0.2
 
 @dataclass(frozen=True)
 class Look:
-    """One fabric's look."""
+    """The look of one fabric."""
 
     roughness: float
     """Of its gloss, 0 to 1 as Blender's Principled shader takes it."""
@@ -37,7 +37,7 @@ class Look:
     hem: float
     """Half the thickness of its hem [mm]."""
     grain: Grain
-    """What the weave or knit does to the colour."""
+    """Pattern of the weave or knit in the colour."""
     contrast: float
     """Of the grain: 0 is none."""
 
@@ -59,7 +59,7 @@ def look_of(material: str) -> Look:
 
 
 def grained(picture: npt.NDArray[np.uint8], look: Look) -> npt.NDArray[np.uint8]:
-    """Return a texture (size, size, 3), 8-bit sRGB, printed on a fabric: darker and lighter as its grain wants it."""
+    """Return a texture (size, size, 3), 8-bit sRGB, printed on a fabric: with its grain and its stitches."""
     size = len(picture)
     across = (np.arange(size) + 0.5) / size * SIDE * 1e3
     u, v = np.meshgrid(across, across)
@@ -122,7 +122,7 @@ class Light:
 
     @property
     def numbers(self) -> list[float]:
-        """What a dataset's label holds: azimuth, elevation, power."""
+        """The numbers of the label: azimuth, elevation, power."""
         return list(astuple(self))
 
 

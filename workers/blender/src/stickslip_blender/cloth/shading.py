@@ -1,7 +1,7 @@
 """One shading for many textures.
 
-The cloth is traced once with the base colour ALBEDOS. Lamp and floor are grey, so red, green and blue are three samples
-of the light that a pixel sends to the camera, as a function of the cloth's albedo a:
+The cloth is rendered once with the base colour ALBEDOS. Lamp and floor are grey, so red, green and blue are three
+samples of the light that a pixel sends to the camera, as a function of the cloth's albedo a:
 
     L(a) = S + D a + I a^2        S: gloss and what is not cloth; D: light that cloth scattered once; I: twice
 
@@ -33,7 +33,7 @@ ALBEDOS = (0.0, 0.5, 0.9)
 """The cloth's base colour in a shading."""
 
 TOLERANCE: int = _raster.TOLERANCE
-"""How far the pixels of a clip may be from their exact values [8-bit levels]; raster/composition.hpp chooses them."""
+"""Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/composition.hpp sets it."""
 
 _MIRROR_GRID = 8
 _PROP_GRID = 3
@@ -55,7 +55,7 @@ def settled(light: Floats) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Sight:
-    """How much is seen of the cloth in a frame."""
+    """Visibility of the cloth in a frame."""
 
     frame_share: float
     """Share of the frame that is cloth."""
@@ -64,7 +64,7 @@ class Sight:
 
 
 class Composer:
-    """Makes pictures of textures from shadings of one cloth."""
+    """Composes pictures of textures from shadings of one cloth."""
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry

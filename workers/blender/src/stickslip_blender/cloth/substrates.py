@@ -1,4 +1,4 @@
-"""What the cloth is dragged over: finishes drawn from a seed within the ranges of substrates.toml."""
+"""Substrates: floor finishes, drawn from a seed within the ranges of substrates.toml."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ HARD = ("aluminium", "aluminium-pet", "ceramic", "rough-glass", "smooth-glass", 
 
 @dataclass(frozen=True)
 class Substrate:
-    """One floor. Floors are traced grey and plain: `floor_factor` has their marks and colour."""
+    """One floor. Cycles renders it grey and plain; `floor_factor` adds its marks and colour."""
 
     name: str
     albedo: float
-    """Share of the light that it scatters, or as a metal reflects."""
+    """Share of the light that it scatters or, as a metal, reflects."""
     roughness: float
     """Of its gloss."""
     metallic: float
@@ -40,7 +40,7 @@ class Substrate:
     specular: float
     """Strength of a dielectric's gloss, 0.5 for an index of refraction of 1.5."""
     grain: float
-    """Contrast of its marks: what moves over a floor without any does not seem to move."""
+    """Contrast of its marks; motion over a floor without marks is hard to see."""
     seed: int
     """Of the marks."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -48,12 +48,12 @@ class Substrate:
 
     @property
     def mirrors(self) -> bool:
-        """Whether shapes are seen in it: a rough floor that is no metal shows the cloth's mean colour at most."""
+        """Whether it mirrors shapes; a rough floor that is no metal shows only the mean colour of the cloth."""
         return self.metallic > 0.5 or self.roughness < 0.25
 
     @property
     def numbers(self) -> list[float]:
-        """What a dataset's label holds: albedo, roughness, metallic, specular, grain, tint."""
+        """The numbers of the label: albedo, roughness, metallic, specular, grain, tint."""
         return [self.albedo, self.roughness, self.metallic, self.specular, self.grain, *self.tint]
 
 
@@ -64,7 +64,7 @@ def _ranges() -> dict[str, dict[str, Any]]:
 
 
 def substrate_names() -> tuple[str, ...]:
-    """Name what `drawn_substrate` takes: the finishes, and `any` for one of the hard ones and the matt plate."""
+    """Return the names that `drawn_substrate` takes: the finishes, and `any` for a hard one or the matt plate."""
     return (*_ranges(), "any")
 
 

@@ -1,4 +1,4 @@
-"""The cloth that is seen: the solver's mesh refined, with weak creases and a hem of some thickness.
+"""The visible cloth: the solver's mesh, refined, with weak creases and a thick hem.
 
 The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at most; a label says
 how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer 6 mm.
@@ -32,7 +32,7 @@ Indices = npt.NDArray[np.int32]
 
 
 class Surface:
-    """A mesh refined, from positions of the solver's vertices to those that are seen."""
+    """A refined mesh: from positions of the solver's vertices to those of the visible ones."""
 
     triangles: Indices
     """Shape (T, 3)."""

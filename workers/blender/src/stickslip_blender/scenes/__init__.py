@@ -1,4 +1,4 @@
-"""How each kind of dataset is rendered. A kind is one module here, of the name of the kind; nothing lists them."""
+"""The scenes of all kinds: one module per kind, named after it."""
 
 from __future__ import annotations
 

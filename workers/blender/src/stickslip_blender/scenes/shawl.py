@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stickslip_schemas.kinds.shawl import ShawlRender
 
 SUNK = 0.0005
-"""How far inside the simulation's skin the figure is seen [m]: half the thickness of a cloth that lies on it."""
+"""Distance of the visible figure inside the skin of the simulation [m]: half the thickness of a cloth on it."""
 _COLOR = (0.18, 0.18, 0.18)  # linear, and grey: see the gate
 _AIM = (0.0, 0.0, 0.5)  # [m], its chest
 
