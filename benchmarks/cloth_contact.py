@@ -41,6 +41,7 @@ from stickslip_sim_core.reference import master_curves
 from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere
 from stickslip_sim_core.scenes.cloth_sphere import SETTLING
 from stickslip_testing import tumbles
+from stickslip_testing.spheres import of_triangles
 
 PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "capstan": {},
@@ -178,7 +179,8 @@ def turned_spheres() -> None:
     found = []
     for subdivisions in (None, 2, 3, 4):
         begin = time.process_time()
-        scene = cloth_sphere.scene(felt, 0.3, mesh=41, frames=75, subdivisions=subdivisions).run()
+        of_bodies = cloth_sphere.scene(felt, 0.3, mesh=41, frames=75)
+        scene = (of_bodies if subdivisions is None else of_triangles(of_bodies, 0.3, subdivisions)).run()
         found.append(scene)
         settled, off = scene.times > 0.75 * SETTLING, np.abs(scene.positions - found[0].positions).max(axis=(1, 2))
         print(

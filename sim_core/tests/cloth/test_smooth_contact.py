@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stickslip_testing.spheres import icosphere
 
 from stickslip_sim_core import Cloth, Surface, isotropic, plane, preset_named, self_intersections, sphere
 from stickslip_sim_core import _sim_core as core
@@ -29,7 +30,7 @@ def directions(count: int, seed: int = 0) -> Floats:
 
 def bumpy(subdivisions: int = 3) -> tuple[Floats, Triangles]:
     """A closed mesh whose curvature changes its sign."""
-    x, triangles = meshes.icosphere(subdivisions)
+    x, triangles = icosphere(subdivisions)
     return x * (1.0 + 0.1 * np.sin(3.0 * x[:, 0] + 1.0) * np.cos(4.0 * x[:, 1]))[:, None], triangles
 
 
@@ -39,7 +40,7 @@ class TestFeet:
         d = directions(1000)
         errors, turns = [], []
         for subdivisions in (2, 3, 4):
-            x, triangles = meshes.icosphere(subdivisions)
+            x, triangles = icosphere(subdivisions)
             found, normal, point, _ = core.feet(triangles, x, CREASE, (1.0 + height) * d)
             errors.append(np.abs(found - height).max())
             turns.append(np.linalg.norm(normal - d, axis=1).max())
@@ -114,7 +115,7 @@ class TestFeet:
         assert found[inside] == pytest.approx(p[inside, 2], abs=1e-12)
 
     def test_without_smooth_edges_it_is_the_triangles(self) -> None:
-        x, triangles = meshes.icosphere(1)
+        x, triangles = icosphere(1)
         p = 1.05 * directions(500, 6)
         found, normal, *_ = core.feet(triangles, x, 0.0, p)
         for i in range(0, 500, 25):
@@ -125,7 +126,7 @@ class TestFeet:
 
 
 def ball(radius: float, subdivisions: int) -> tuple[Floats, Triangles]:
-    x, triangles = meshes.icosphere(subdivisions)
+    x, triangles = icosphere(subdivisions)
     return radius * x, triangles
 
 

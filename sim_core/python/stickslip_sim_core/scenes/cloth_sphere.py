@@ -5,7 +5,6 @@ import numpy as np
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.bodies import Body, plane, sphere
-from stickslip_sim_core.cloth.contact import THICKNESS, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
@@ -52,22 +51,6 @@ def ball(mu: float, angle: float) -> Body:
     return sphere(mu, RADIUS, origin=(0.0, 0.0, RADIUS), rotation=[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def triangulated(mu: float, speed: float, subdivisions: int) -> Surface:
-    """Return the sphere as triangles that turn: an icosahedron whose triangles are cut into four, again and again.
-
-    Its corners lie half a thickness of the cloth inside: so the middle of the cloth touches at the sphere's radius.
-    """
-    corners, triangles = meshes.icosphere(subdivisions)
-    corners *= RADIUS - 0.5 * THICKNESS
-
-    def at(time: float) -> Floats:
-        turn = ball(mu, turned(time, speed))
-        placed: Floats = corners @ turn.rotation.T + turn.origin
-        return placed
-
-    return Surface(triangles, at, mu, thickness=0.0)
-
-
 def scene(
     material: str | Fabric,
     mu: float,
@@ -79,7 +62,6 @@ def scene(
     frames: int = FRAMES,
     frame_rate: float = FRAME_RATE,
     seed: int = 0,
-    subdivisions: int | None = None,
     kernel: str | None = None,
 ) -> Scene:
     """Return the scene of a square of cloth that falls on a sphere, which then turns and drags it.
@@ -96,7 +78,6 @@ def scene(
         frames: Frames, from time 0 on, 1 ... 3000.
         frame_rate: Frames a second.
         seed: Of the bias.
-        subdivisions: Of an icosahedron, 1 ... 7, for a sphere of triangles; None: the sphere is round.
         kernel: Level of the kernels, see `Cloth`.
 
     Raises:
@@ -107,8 +88,6 @@ def scene(
     check_range("angular_speed", angular_speed, -SPEED_MAX, SPEED_MAX)
     if not (np.isfinite(frame_rate) and frame_rate > 0.0):
         raise ValueError(f"frame_rate: must be finite and > 0, got {frame_rate}")
-    if subdivisions is not None:
-        check_range("subdivisions", subdivisions, 1, 7)
     floor = plane(mu if mu_floor is None else mu_floor)
     square = meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
     bias = np.random.default_rng(seed).uniform(-BIAS, BIAS, 2)
@@ -116,7 +95,7 @@ def scene(
     tilted = down + GRAVITY * np.append(bias, 0.0)
 
     def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
-        bodies = [floor, ball(mu, turned(time, angular_speed))] if subdivisions is None else [floor]
+        bodies = [floor, ball(mu, turned(time, angular_speed))]
         return (tilted if time < SETTLING else down), np.empty((0, 3)), bodies
 
     return Scene(
@@ -125,7 +104,6 @@ def scene(
         preset=preset_named(preset),
         start=np.column_stack([square.rest, np.full(len(square.rest), 2.0 * RADIUS + CLEARANCE)]),
         motion=motion,
-        surfaces=[] if subdivisions is None else [triangulated(mu, angular_speed, subdivisions)],
         frames=frames,
         frame_rate=frame_rate,
         forces=forces,

@@ -1,0 +1,58 @@
+"""Spheres of triangles, and the scene of cloth on a sphere with one of them."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from stickslip_sim_core import Scene, Surface
+from stickslip_sim_core.cloth.contact import THICKNESS
+from stickslip_sim_core.scenes.cloth_sphere import RADIUS
+
+
+def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the vertices (V, 3) and the outward triangles (T, 3) of a sphere of radius 1.
+
+    It is an icosahedron whose 20 triangles are each cut into four so many times.
+    """
+    t = 0.5 * (1.0 + np.sqrt(5.0))
+    vertices = np.array([np.roll([0.0, s, r * t], k) for k in range(3) for s in (-1.0, 1.0) for r in (-1.0, 1.0)])
+    near = np.linalg.norm(vertices[:, None] - vertices, axis=2) < 2.1
+    triangles = np.array(
+        [
+            (a, b, c) if np.linalg.det(vertices[[a, b, c]]) > 0.0 else (a, c, b)
+            for a in range(12)
+            for b in range(a)
+            for c in range(b)
+            if near[a, b] and near[b, c] and near[c, a]
+        ]
+    )
+    for _ in range(subdivisions):
+        edges = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
+        unique, which = np.unique(edges, axis=0, return_inverse=True)
+        a, b, c = triangles.T
+        x, y, z = which.reshape(-1, 3).T + len(vertices)
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        triangles = np.concatenate(
+            [np.stack(corner, axis=1) for corner in ((a, z, y), (z, b, x), (y, x, c), (x, y, z))]
+        )
+    return vertices / np.linalg.norm(vertices, axis=1)[:, None], triangles.astype(np.int32)
+
+
+def of_triangles(scene: Scene, mu: float, subdivisions: int) -> Scene:
+    """Return a scene of `cloth_sphere` with a sphere of triangles that turns as the round one does.
+
+    Its corners lie half a thickness of the cloth inside: so the middle of the cloth touches at the sphere's radius.
+    """
+    corners, triangles = icosphere(subdivisions)
+    corners *= RADIUS - 0.5 * THICKNESS
+
+    def at(time: float) -> NDArray[np.float64]:
+        pose = scene.motion(time)[2][1].pose
+        placed: NDArray[np.float64] = corners @ pose[:, :3].T + pose[:, 3]
+        return placed
+
+    def floor_only(time: float):  # type: ignore[no-untyped-def]
+        gravity, held, bodies = scene.motion(time)
+        return gravity, held, bodies[:1]
+
+    return replace(scene, surfaces=[Surface(triangles, at, mu, thickness=0.0)], motion=floor_only)
