@@ -12,7 +12,7 @@ from stickslip_schemas.store import Store
 from stickslip_services.access.audit_log import note
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
-from stickslip_services.database.paging import PageRequest, make_page
+from stickslip_services.database.paging import PageRequest, read_page
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import NotFoundError
 
@@ -87,11 +87,7 @@ def _insert(
 
 def list_certificates(connection: Connection, page: PageRequest) -> Page[CertificateEntry]:
     """Return a page of certificates, newest first."""
-    query = select(certificates).order_by(certificates.c.seq.desc()).limit(page.size + 1)
-    if page.after is not None:
-        query = query.where(certificates.c.seq < page.after)
-    rows = connection.execute(query).all()
-    return make_page(rows, page, position=lambda row: int(row.seq), item=_entry)
+    return read_page(connection, select(certificates), page, certificates.c.seq, lambda rows: map(_entry, rows))
 
 
 def find_certificate(connection: Connection, digest: str) -> StoredCertificate:

@@ -1,6 +1,6 @@
 """Datasets, their versions and their files, as the API shows them."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from sqlalchemy import Connection, Row, select
@@ -19,18 +19,15 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.store import Store
 
 from stickslip_services.clock import as_datetime
-from stickslip_services.database.paging import PageRequest, make_page
+from stickslip_services.database.paging import PageRequest, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
 from stickslip_services.errors import MissingArtifactError, NotFoundError
 
 
 def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
     """Return a page of datasets, newest first."""
-    query = select(datasets).order_by(datasets.c.seq.desc()).limit(page.size + 1)
-    if page.after is not None:
-        query = query.where(datasets.c.seq < page.after)
-    rows = connection.execute(query).all()
-    return make_page(rows, page, position=lambda row: int(row.seq), item=lambda row: _shown_dataset(connection, row))
+    shown = partial(_shown_dataset, connection)
+    return read_page(connection, select(datasets), page, datasets.c.seq, lambda rows: map(shown, rows))
 
 
 def find_dataset(connection: Connection, dataset: str) -> Dataset:

@@ -1,9 +1,10 @@
 """Pages of lists. A token names the last item, so that a page does not change while the list grows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from sqlalchemy import Column, Connection, Row, Select
 from stickslip_schemas.documents.responses import Page
 
 MAX_PAGE_SIZE = 1000
@@ -11,7 +12,6 @@ MAX_PAGE_SIZE = 1000
 TOKEN_PATTERN = r"^[0-9]{1,18}$"
 """Pattern of page tokens; every number is a valid position in a list."""
 
-S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -28,11 +28,20 @@ class PageRequest:
         return cls(page_size, None if page_token is None else int(page_token))
 
 
-def make_page(
-    rows: Sequence[S], request: PageRequest, *, position: Callable[[S], int], item: Callable[[S], T]
+def read_page(
+    connection: Connection,
+    query: Select[Any],
+    page: PageRequest,
+    position: Column[Any],
+    items: Callable[[Sequence[Row[Any]]], Iterable[T]],
+    *,
+    newest_first: bool = True,
 ) -> Page[T]:
-    """Return the page of `rows`; one row more than a page tells that there is a next page."""
-    shown = rows[: request.size]
-    more = len(rows) > request.size
-    token = str(position(shown[-1])) if more else None
-    return Page[T](items=tuple(item(row) for row in shown), next_page_token=token)
+    """Return a page of the rows of `query`, ordered by the column `position`; `items` converts rows."""
+    query = query.order_by(position.desc() if newest_first else position).limit(page.size + 1)
+    if page.after is not None:
+        query = query.where(position < page.after if newest_first else position > page.after)
+    rows = connection.execute(query).all()
+    shown = rows[: page.size]
+    token = str(getattr(shown[-1], position.key)) if len(rows) > page.size else None  # one row more than a page
+    return Page[T](items=tuple(items(shown)), next_page_token=token)

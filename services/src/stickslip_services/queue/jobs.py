@@ -11,7 +11,7 @@ from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Pa
 from stickslip_schemas.kinds import job_spec_adapter
 
 from stickslip_services.clock import as_datetime
-from stickslip_services.database.paging import PageRequest, make_page
+from stickslip_services.database.paging import PageRequest, read_page
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_stages, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
@@ -74,12 +74,7 @@ def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
 def list_jobs(context: Context, connection: Connection, page: PageRequest) -> Page[Job]:
     """Return a page of jobs, newest first."""
     workers = alive_workers(context, connection)
-    query = select(jobs).order_by(jobs.c.seq.desc()).limit(page.size + 1)
-    if page.after is not None:
-        query = query.where(jobs.c.seq < page.after)
-    rows = connection.execute(query).all()
-    shown = dict(zip((row.seq for row in rows), _shown(connection, rows, workers, {}), strict=True))
-    return make_page(rows, page, position=lambda row: int(row.seq), item=lambda row: shown[row.seq])
+    return read_page(connection, select(jobs), page, jobs.c.seq, lambda rows: _shown(connection, rows, workers, {}))
 
 
 def list_samples(connection: Connection, job: int, page: PageRequest, state: TaskState | None) -> Page[SampleState]:
@@ -97,18 +92,12 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
         )
         .join(tasks, tasks.c.seq == last)
         .where(samples.c.job == job)
-        .order_by(samples.c.slot)
-        .limit(page.size + 1)
     )
-    if page.after is not None:
-        query = query.where(samples.c.slot > page.after)
     if state is not None:
         query = query.where(tasks.c.state == state)
-    return make_page(
-        connection.execute(query).all(),
-        page,
-        position=lambda row: int(row.slot),
-        item=lambda row: SampleState(
+
+    def shown(row: Row[Any]) -> SampleState:
+        return SampleState(
             slot=row.slot,
             sample_key=row.key.hex(),
             split=row.split,
@@ -116,8 +105,9 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
             state=row.state,
             reason=row.reason,
             message=row.message,
-        ),
-    )
+        )
+
+    return read_page(connection, query, page, samples.c.slot, lambda rows: map(shown, rows), newest_first=False)
 
 
 def list_previews(connection: Connection, job: int) -> list[Preview]:
