@@ -4,16 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stickslip_training.data.reader import DatasetReader
 from stickslip_training.engine import fit as engine
 from stickslip_training.rods.curvature import (
     CurvatureTraining,
     load_model,
     read_test_rods,
     train_curvature,
-    train_on_rods,
 )
-from stickslip_training.rods.dataset import read_rods
 from stickslip_training.rods.evaluation import estimate_strains
 
 
@@ -189,14 +186,3 @@ def test_the_number_of_threads_is_put_back(config):
     before = torch.get_num_threads()
     train_curvature(replace(config, epochs=1))
     assert torch.get_num_threads() == before
-
-
-@pytest.mark.physics
-def test_rods_in_memory_train_as_those_of_a_dataset(config, rods, tmp_path):
-    with DatasetReader(rods.root) as reader:
-        parts = [read_rods(reader, reader.slots(split)) for split in ("train", "validation")]
-    net = train_on_rods(replace(config, dataset="none", out=tmp_path / "memory"), *parts)
-    train_curvature(config)
-    expected = weights(config)
-    assert all(torch.equal(value, expected[name]) for name, value in net.state_dict().items())
-    assert not net.training

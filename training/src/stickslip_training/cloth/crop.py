@@ -23,9 +23,6 @@ SCALE = 290.0
 ANCHOR = (14.0, (WIDTH - 1) / 2)
 """Row and column of the middle of the holders."""
 
-HALF_EDGE = 0.1
-"""Half the held edge [m]."""
-
 
 @dataclass(frozen=True)
 class Cameras:

@@ -34,14 +34,10 @@ def load_tensors(path: str | Path, *, device: str = "cpu") -> dict[str, Any]:
     return content
 
 
-def report_json(report: "DataclassInstance") -> str:
-    """Return the report as JSON; NaN raises ValueError."""
-    return json.dumps(asdict(report), indent=2, allow_nan=False, default=str) + "\n"
-
-
 def write_report(out: Path, report: "DataclassInstance") -> None:
-    """Write the report of a run below `out`, whole or not at all."""
-    write_durably(out / REPORT_NAME, report_json(report).encode())
+    """Write the report of a run below `out`, whole or not at all; a number that is none raises ValueError."""
+    text = json.dumps(asdict(report), indent=2, allow_nan=False, default=str)
+    write_durably(out / REPORT_NAME, f"{text}\n".encode())
 
 
 def versions() -> dict[str, str]:

@@ -15,7 +15,6 @@ from stickslip_training.engine.files import MODEL_NAME, load_tensors, save_tenso
 from stickslip_training.engine.fit import (
     EpochReport,
     FitSettings,
-    Fitted,
     Learner,
     check_positive,
     fit,
@@ -64,15 +63,24 @@ class CurvatureTraining:
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.epochs is None):
             raise ValueError("exactly one of minutes and epochs must be given")
-        check_positive(self, "minutes", "epochs", "batch_size", "learning_rate", "threads", "evaluation_rods")
+        check_positive(self, "epochs", "batch_size", "learning_rate", "evaluation_rods")
         if not 0 <= self.noise < 1:
             raise ValueError(f"noise must be a share of L, from 0 to less than 1, and is {self.noise}")
         if not 0 < self.decay < 1:
             raise ValueError(f"decay must be between 0 and 1, and is {self.decay}")
-        if not 0 <= self.averaging < 1:
-            raise ValueError(f"averaging must be from 0 to less than 1, and is {self.averaging}")
-        if not 0 <= self.seed < 2**31:
-            raise ValueError(f"seed must be from 0 to 2**31 - 1, and is {self.seed}")
+        self.fit_settings(1)  # checks the others
+
+    def fit_settings(self, steps_per_epoch: int) -> FitSettings:
+        """Return the settings of the training loop."""
+        return FitSettings(
+            steps=None if self.epochs is None else self.epochs * steps_per_epoch,
+            minutes=self.minutes,
+            epoch=steps_per_epoch,
+            seed=self.seed,
+            averaging=self.averaging,
+            threads=self.threads,
+            device=self.device,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +122,11 @@ def train_curvature(
     with DatasetReader(config.dataset) as reader:
         rods, notes = load_splits(reader, config.evaluation_rods)
         manifest, digest = reader.manifest, reader.manifest_digest
-    fitted = _fit(config, rods["train"], rods["validation"], digest, config.out, resume, on_epoch)
+    learner = _CurvatureLearner(config, rods["train"], rods["validation"])
+    names = ("noise", "batch_size", "learning_rate", "decay")
+    identity = {"manifest": digest, **{name: getattr(config, name) for name in names}}
+    settings = config.fit_settings(learner.steps_per_epoch)
+    fitted = fit(learner, settings, out=config.out, identity=identity, resume=resume, on_epoch=on_epoch)
     with torch_threads(config.threads):
         noisy = noisy_test_centerline(rods["test"], config.noise, config.seed)
         methods, test_loss = evaluate(fitted.net, rods["test"], noisy)
@@ -139,11 +151,6 @@ def train_curvature(
     save_tensors(config.out / MODEL_NAME, content)
     write_report(config.out, report)
     return report
-
-
-def train_on_rods(config: CurvatureTraining, train: Rods, validation: Rods) -> nn.Module:
-    """Train on rods in memory instead of a dataset, and return the network; nothing is written."""
-    return _fit(config, train, validation, "", None, False, None).net
 
 
 def load_model(path: str | Path) -> CurvatureNet:
@@ -189,27 +196,3 @@ class _CurvatureLearner(Learner):
         if not len(self.validation):
             return None
         return rms(estimate_strains(net, self.noisy_validation) - self.validation.strains)
-
-
-def _fit(
-    config: CurvatureTraining,
-    train: Rods,
-    validation: Rods,
-    manifest: str,
-    out: Path | None,
-    resume: bool,
-    on_epoch: Callable[[EpochReport], None] | None,
-) -> Fitted:
-    learner = _CurvatureLearner(config, train, validation)
-    settings = FitSettings(
-        steps=None if config.epochs is None else config.epochs * learner.steps_per_epoch,
-        minutes=config.minutes,
-        epoch=learner.steps_per_epoch,
-        seed=config.seed,
-        averaging=config.averaging,
-        threads=config.threads,
-        device=config.device,
-    )
-    names = ("noise", "batch_size", "learning_rate", "decay")
-    identity = {"manifest": manifest, **{name: getattr(config, name) for name in names}}
-    return fit(learner, settings, out=out, identity=identity, resume=resume, on_epoch=on_epoch)
