@@ -284,7 +284,7 @@ def test_every_function_that_renders_is_in_the_build(
         assert ours - uncounted - documents <= built, ours - built
 
 
-def test_a_clip_has_the_same_bytes_however_its_trace_was_made(
+def test_a_clip_has_the_same_bytes_however_its_shading_was_made(
     actor: RenderActor, store: DirectoryStore, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Alone; with others; from a shading in the store; by an actor that has rendered something else."""
@@ -304,7 +304,7 @@ def test_a_clip_has_the_same_bytes_however_its_trace_was_made(
     assert later.labels == several.labels == alone.labels
 
 
-def test_nothing_is_traced_again_for_another_texture(
+def test_nothing_is_shaded_again_for_another_texture(
     actor: RenderActor, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traced: list[int] = []

@@ -178,7 +178,7 @@ def test_lamps_and_floors_of_the_users_own(actor: RenderActor, store: DirectoryS
     assert corner[2] > 1.5 * corner[0] > 20, "a pale floor that is bluish"
 
 
-def test_what_is_drawn_from_is_in_the_trace_and_pictures_are_not() -> None:
+def test_what_is_drawn_from_is_in_the_shading_and_pictures_are_not() -> None:
     plain = {
         "rig": "drag",
         "rig_digest": rig_digest("drag"),

@@ -122,7 +122,7 @@ class Fabric:
             self._from = node
 
 
-def set_pixels(image: Any, color: npt.NDArray[np.float32]) -> None:
+def set_pixels(image: Any, color: npt.NDArray[np.floating[Any]]) -> None:
     """Set the pixels of an image from colours (height, width, 3), or (height, width, 1) for grey."""
     rgba = np.ones((*color.shape[:2], 4), dtype=np.float32)
     rgba[..., :3] = color
