@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stickslip_testing.constants import SCENES
 
 from stickslip_sim_core import (
     Cloth,
@@ -93,6 +94,12 @@ def dragged(material: str, mu: float, vertices: int, frames: int, preset: str) -
     return digest(scene.positions, scene.contact_force, scene.holder_force, scene.self_intersections, counts)
 
 
+def touching(scene: str) -> str:
+    """Run a scene in which cloth touches itself."""
+    cloth = SCENES[scene](preset_named("certified"))
+    return digest(cloth.positions, cloth.velocities, cloth.pair_forces.forces, np.array([cloth.newton, cloth.krylov]))
+
+
 def rods() -> str:
     """Solve 64 rods of the thesis's ranges."""
     gamma, phi0, phi1 = np.random.default_rng(1).uniform([100, 0.2, 6], [1300, 12, 20], (64, 3)).T
@@ -127,6 +134,10 @@ CLOTH: dict[str, Callable[[], str]] = {
     "clamped strip": clamped,
     "drop and drag, 11, first turn": lambda: dragged("gray-interlock", 0.5, 11, 100, "certified"),
     "drop and drag, 21, touchdown": lambda: dragged("11oz-black-denim", 1.2, 21, 30, "certified"),
+    "three sheets in a pile": lambda: touching("pile"),
+    "a strip that folds": lambda: touching("fold"),
+    "a sheet on a ball of triangles": lambda: touching("ball"),
+    "a sheet between walls": lambda: touching("squeeze"),
     "drop and drag, 15, fast": lambda: dragged("camel-ponte-roma", 0.3, 15, 60, "fast"),
 }
 RODS: dict[str, Callable[[], str]] = {"rods": rods, "general rods": general_rods_anywhere}

@@ -22,7 +22,7 @@ def presets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two presets that are quick to certify: one that passes, one whose second protocol breaks off."""
     made = {
         "good": Certification(
-            ("rod-lateral-buckling", "rod-cantilever"), ROD_SOLVER, {"dt": 0.01, "solver": "<b>"}, LITTLE
+            ("rod-lateral-buckling", "rod-cantilever"), ROD_SOLVER, lambda: {"dt": 0.01, "solver": "<b>"}, LITTLE
         ),
         "coarse": Certification(
             ("rod-cantilever", "rod-lateral-buckling"),

@@ -155,7 +155,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && !smoothly && norms.largest <= settings_.tolerance && arrived(x)) break;
     if (!std::isfinite(norms.squared)) break;
-    if (smoothly && norms.squared > constants_.diverged * first) break;
+    if (smoothly && norms.squared > constants_.last_growth * constants_.last_growth * first) break;
     strained = strained_ ? strained + 1 : 0;
     if (strained > strained_max && iterations < settings_.newton_max) break;
     ++report.newton;

@@ -1,6 +1,6 @@
-// The preconditioner while pairs bear: a factor with an order of its own, by nested dissection in the space where the
-// cloth is. In the plane at rest, layers of a fold would couple everywhere. Nodes that stick to bodies couple nothing:
-// sheets that lie on a floor do not hang together through it.
+// The preconditioner while pairs are active: a factor with an order of its own, by nested dissection in the space where
+// the cloth is. In the plane at rest, layers of a fold would couple everywhere. Nodes that stick to bodies couple
+// nothing: sheets that lie on a floor do not hang together through it.
 #pragma once
 
 #include <Eigen/Core>
@@ -32,7 +32,7 @@ class PairFactor {
   void spent(int iterations) { cost_.spent(iterations); }
 
  private:
-  // A pair that bears: w_a w_b stiffness for each two of its nodes, which are -1 where they are held or pinned.
+  // An active pair: w_a w_b stiffness for each two of its nodes, which are -1 where they are held or pinned.
   struct Entry {
     std::array<int, 4> node;
     std::array<float, 4> weight;

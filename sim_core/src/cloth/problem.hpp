@@ -60,7 +60,7 @@ struct FoldData {
   float* coefficients;  // (triangles, 2): aa, ab
 };
 
-// Pairs of cloth with cloth that bear. Each has three weights of its four nodes: those of its closest points, and their
+// Active pairs of closest points. Each has three weights of its four nodes: those of its closest points, and their
 // derivatives by where these lie. Its motions v_a = sum w_ai dx_i make forces f_a = sum C_ab v_b, of which node i gets
 // sum w_ai f_a.
 struct PairData {

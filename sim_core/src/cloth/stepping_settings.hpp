@@ -1,24 +1,31 @@
-// Constants of halving steps.
+// Constants of steps that are halved.
 #pragma once
 
 namespace sim_core {
 
 struct SteppingSettings {
+  // Tolerance of GMRES where a step does not converge with that of the preset: modes of contact that flip under exact
+  // solves settle under loose ones. Sweep: nothing changes.
   double loose = 0.1;
+  // Share of the patience up to which a step is easy, so that longer ones may follow. Sweep: 0.3 takes 24 % less and
+  // 1.2 takes 17 % more in a crumple.
   double easy = 0.6;
+  // Factor of the patience near other cloth, where halves of a step are hardly easier than the whole. Sweep: 1.25 takes
+  // 27 % less and 5 takes 63 % more in a crumple; in a fold both take 6 % less.
   double near_patience = 2.5;
+  // Strained iterations in a row, stopped short or with all rounds taken, after which an attempt that the controller
+  // may halve at once is given up. Sweep: 1 takes four times as many where walls push, 4 takes 12 % less.
   int strained_soon = 2;
+  // The same of an attempt for which halving comes last. Sweep: 2 takes 20 % more in a crumple, 8 takes 6 % more.
   int strained_long = 4;
+  // Iterations of an attempt by way of the smoothed law. Sweep: 50 takes 9 % less and 200 takes 38 % more in a crumple.
   int smooth_iterations = 100;
 
   template <class Self, class Call>
   static void each(Self& s, const Call& call) {
-    call("loose", s.loose);
-    call("easy", s.easy);
-    call("near_patience", s.near_patience);
-    call("strained_soon", s.strained_soon);
-    call("strained_long", s.strained_long);
-    call("smooth_iterations", s.smooth_iterations);
+    call("loose", s.loose), call("easy", s.easy), call("near_patience", s.near_patience),
+        call("strained_soon", s.strained_soon), call("strained_long", s.strained_long),
+        call("smooth_iterations", s.smooth_iterations);
   }
 };
 

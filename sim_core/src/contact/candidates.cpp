@@ -60,6 +60,7 @@ class Grid {
   const int* end(int cell) const { return items_.data() + begin_[cell + 1]; }
 
  private:
+  // Bounds memory where boxes lie far apart. Results are the same for any number.
   static constexpr double cells_per_item = 8.0;
 
   Eigen::Array3i place(const Array3d& p) const { return ((p - low_) / size_).floor().cast<int>(); }

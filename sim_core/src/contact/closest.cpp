@@ -12,9 +12,9 @@ using Eigen::Vector4d;
 
 namespace {
 
-// Segments whose squared sine is below this are taken for parallel: their closest points are not unique to rounding.
+// Squared sine below which segments count as parallel: the determinant a e - b b then has lost all but 2 of 16 digits.
 constexpr double parallel = 1e-14;
-// Advances that end a search which converges no further.
+// Bounds the work where pieces slide past each other much slower than the bound of their speed.
 constexpr int advances_max = 1000;
 
 Eigen::Vector2d closest_on_segments(const FourPoints& x) {
@@ -101,7 +101,7 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, cons
     // The distance is at least `least` up to here, and above 0 up to `next`.
     const double safe = share + (distance - least) / fastest;
     if (safe >= 1.0) return 1.0;
-    const double next = std::min(1.0, share + std::max(leaves.advance * distance, distance - least) / fastest);
+    const double next = std::min(1.0, share + std::max((1.0 - leaves.rest) * distance, distance - least) / fastest);
     for (int i = 0; i < 4; ++i) at[i] = x[i] + next * motion[i];
     const double before = std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());
     if (distance < least) return share + (before - least) / fastest;

@@ -38,7 +38,7 @@ struct Leaves {
   double share;
   double most;
   double floor = 0.0;
-  double advance = 0.9;  // see PathSettings
+  double rest = 0.1;  // see PathSettings
 
   double of(double distance) const;
 };

@@ -21,7 +21,7 @@
 
 namespace sim_core {
 
-// What a contact sees at the iterate at hand.
+// State of a contact at an iterate.
 struct ContactKinematics {
   double gap;              // m
   Eigen::Vector3d normal;  // of the body, outward

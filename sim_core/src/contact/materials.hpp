@@ -21,10 +21,10 @@ struct ContactMaterials {
   double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
 
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
-  // What pairs of closest points keep apart, m. Nodes feel surfaces by themselves: pairs only catch what comes nearer
-  // between the nodes than the facets of a curved surface do.
+  // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves (contact/smooth.hpp): pairs only
+  // hold what comes nearer between the nodes.
   double apart(int a, int b) const { return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b); }
-  // The same of a pair whose first piece is of one sheet and whose second is of another.
+  // The same by kind of pair; `first` and `second`: sheets of its pieces.
   double apart(PairKind kind, int first, int second) const {
     const bool other = first != second && std::max(first, second) < sheets;
     const double share = !other ? 1.0 : kind == PairKind::edge_edge ? edge_share : first > second ? second_share : 1.0;

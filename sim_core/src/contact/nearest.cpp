@@ -13,6 +13,7 @@ namespace {
 using Eigen::Array3d;
 using Eigen::Vector3d;
 
+// Triangles in a leaf. Results are the same for any number.
 constexpr int leaf_max = 4;
 
 }  // namespace

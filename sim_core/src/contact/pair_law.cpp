@@ -53,8 +53,9 @@ struct Smoothed {
   double by_bound;       // drho/d(mu R_N)
 };
 
+// Halvings of an interval of doubles: 53 bits of one, and as many to bracket the root.
 constexpr int bisections_max = 100;
-// Pairs that give way by less than this share of k are left out of the matrix.
+// Pairs whose stiffness is below this share of k are left out of the matrix: that is the tolerance of GMRES with pairs.
 constexpr double share_least = 1e-4;
 
 // y >= 0 with y (f^2 (1 + y)^2 - a^2) = 2 q (1 + y)^2: then rho = a/(1 + y).

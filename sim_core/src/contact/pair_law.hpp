@@ -34,6 +34,7 @@
 
 namespace sim_core {
 
+// State of a pair at an iterate.
 struct PairKinematics {
   double gap;              // m
   Eigen::Vector3d normal;  // from the second to the first
@@ -44,6 +45,7 @@ struct PairKinematics {
   double smoothing = 0.0;  // epsilon, J
 };
 
+// Its row of Newton's system: dr = force - stiffness v + turning dn.
 struct PairLinearization {
   int mode = 0;                                         // ContactMode
   Eigen::Matrix3d stiffness = Eigen::Matrix3d::Zero();  // N/m

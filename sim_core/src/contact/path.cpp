@@ -33,7 +33,7 @@ double fastest(const Candidate& pair, const std::vector<double>& ways) {
 Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin, const PathSettings& settings)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
-      leaves{settings.keep, thickness_in, settings.floor * thickness_in, settings.advance},
+      leaves{settings.keep, thickness_in, settings.floor * thickness_in, settings.rest},
       margin_(margin),
       rounds_max_(settings.rounds_max),
       share_(surface.sheet_of_node.size(), 1.0),

@@ -12,7 +12,8 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-// Newton's iterations for a foot, and the change of its barycentric coordinates at which they end.
+// Newton's method for a foot ends at changes of its barycentric coordinates that square to below rounding. More
+// iterations than these mean that there is no foot.
 constexpr int iterations_max = 12;
 constexpr double converged = 1e-12;
 

@@ -11,9 +11,9 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-// Barycentric coordinates that count as inside.
+// Rounding of barycentric coordinates: they count as inside from here.
 constexpr double inside = -1e-9;
-// Triangles that a foot may move over in a search.
+// Triangles that a foot may move over in a search, which starts from the nearest: a bound against cycles.
 constexpr int hops_max = 100;
 
 }  // namespace

@@ -47,6 +47,14 @@ def test_roots(seed: int) -> None:
         assert found[4] == pytest.approx(0.0, abs=1e-24)
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4, 1.0, np.pi / 2, 2.5])
+def test_the_cone_of_friction_is_round(angle: float) -> None:
+    """In the axes of space, so that no other norm passes."""
+    n, along = np.array([0.0, 0.0, 1.0]), np.array([np.cos(angle), np.sin(angle), 0.0])
+    for size, mode in ((0.999, STICK), (1.001, SLIP)):
+        assert law(0.0, n, np.zeros(3), 2.0 * n + size * along, 0.5)[0] == mode
+
+
 @pytest.mark.parametrize(
     ("gap", "slip", "force", "error"),
     [

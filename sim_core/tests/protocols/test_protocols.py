@@ -82,7 +82,7 @@ class TestCertification:
         assert certification.protocols
         assert set(certification.protocols) <= set(protocols.PROTOCOLS)
         assert set(certification.quick) <= set(certification.protocols)
-        json.dumps(dict(certification.numbers), allow_nan=False)
+        json.dumps(dict(certification.numbers()), allow_nan=False)
 
     def test_rods_take_no_notice_of_a_preset(self) -> None:
         first, second = (protocols.run("rod-cantilever", preset, gamma=(1.0,), elements=64) for preset in (None, "x"))

@@ -139,7 +139,7 @@ class TestPresets:
         always = {"stick-slip", "cantilever", "lateral-buckling", "inclined-plane"}
         contact = {"capstan", "heavy-fold", "stacked-incline", "pull-out"}
         assert set(certification.protocols) == (always if preset.startswith("thesis-") else always | contact)
-        assert certification.numbers["time_step"] == PRESETS[preset].time_step
+        assert certification.numbers()["time_step"] == PRESETS[preset].time_step
 
     @pytest.mark.parametrize("preset", ["thesis-high", "thesis-low-small-dt", "thesis-low-big-dt", "fast"])
     def test_every_preset_is_run(self, preset: str) -> None:

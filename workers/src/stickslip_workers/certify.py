@@ -67,7 +67,7 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         say(f"    {verdict(report)}; {spent:.1f} CPU s in {time.monotonic() - wall:.1f} s")
     certificate = Certificate(
         preset=preset,
-        numbers=dict(certification.numbers),
+        numbers=dict(certification.numbers()),
         sim_core=solver_build(certification.solver),
         protocol_sources=_protocol_sources(),
         extent="quick" if quick else "full",

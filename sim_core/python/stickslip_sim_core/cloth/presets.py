@@ -1,11 +1,13 @@
 """Named, frozen sets of solver settings for cloth."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+
+from stickslip_sim_core import _sim_core
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,14 @@ class SolverSettings:
 
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
+
+    constants: Mapping[str, float] = field(default_factory=dict, hash=False)
+    """Constants of the C++ solver to replace, by their names in `numbers`: for tests of how results depend on them."""
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all numbers that the preset stands for, by name, those of the C++ solver as "group.name"."""
+        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "constants"}
+        return {**own, **_sim_core.cloth_constants(), **self.constants}
 
     def __post_init__(self) -> None:
         if not self.name:

@@ -112,6 +112,7 @@ class Cloth:
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
             surface_positions=self._surfaces_at(self.time),
             crease=[surface.crease for surface in self.surfaces],
+            constants=dict(preset.constants),
         )
         self.least_distance = np.inf
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""

@@ -1,7 +1,7 @@
 """Protocols that a preset must pass before data are made with it, and the settings that it stands for."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -18,8 +18,8 @@ class Certification:
     solver: str
     """The module whose build the certificate is of."""
 
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-    """The settings that the preset stands for, in JSON's types."""
+    numbers: Callable[[], Mapping[str, Any]] = dict
+    """Returns the settings that the preset stands for, constants of the solver included, in JSON's types."""
 
     quick: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Settings by protocol for a first look; a certificate made with them certifies nothing."""
@@ -55,7 +55,7 @@ def _of_cloth(preset: SolverSettings) -> Certification:
     return Certification(
         SCENE_PROTOCOLS if touches else _CLOTH,
         "stickslip_sim_core.cloth",
-        asdict(preset),
+        preset.numbers,
         {**_CLOTH_QUICK, **_CONTACT_QUICK} if touches else _CLOTH_QUICK,
     )
 

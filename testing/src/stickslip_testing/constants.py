@@ -1,0 +1,206 @@
+"""Sensitivity of the cloth solver to its constants: small scenes that run with each of them halved and doubled.
+
+`python -m stickslip_testing.constants OUT.json` runs them all and writes what changes (4 CPU minutes).
+"""
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from stickslip_sim_core import _sim_core
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body, plane
+from stickslip_sim_core.cloth.contact import SelfContact, Surface
+from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+
+from stickslip_testing.tumbles import STEP, Tumble, crumple, folding, pile, squeeze
+
+FABRIC = "gray-interlock"
+COUNTS = frozenset(
+    {
+        *(f"newton.{name}" for name in ("reversals_from", "rounds_max", "window", "cuts_max", "smooth_hops", "hops")),
+        *("newton.halving_iterations", "newton.longest", "path.rounds_max", "factor.pool"),
+        *("stepping.strained_soon", "stepping.strained_long", "stepping.smooth_iterations"),
+        *("control.halvings", "control.halvings_near"),
+    }
+)
+"""Constants that are integers >= 1."""
+
+LARGEST: Mapping[str, float] = MappingProxyType({"path.keep": 0.75})
+"""Bounds where twice the constant makes no sense: with `path.keep` = 1 nothing may approach."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a scene ends with, and what it costs."""
+
+    positions: Floats
+    """(V, 3) [m]"""
+
+    newton: int
+    krylov: int
+    factors: float
+    unconverged: int
+    least_distance: float
+    """[m]"""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Outcome with another constant, against the default."""
+
+    moved: float
+    """Largest distance of a vertex from where it was [m]."""
+
+    newton: float
+    krylov: float
+    factors: float
+    """Ratios."""
+
+    unconverged: int
+    least_distance: float
+    """[m]"""
+
+
+def scaled(name: str, factor: float) -> float:
+    """Return a constant times a factor, within `LARGEST`, and rounded to an integer >= 1 where it is a count."""
+    value = min(_sim_core.cloth_constants()[name] * factor, LARGEST.get(name, np.inf))
+    return float(max(1, round(value))) if name in COUNTS else value
+
+
+def outcome(scene: str, constants: Mapping[str, float] = MappingProxyType({})) -> Outcome:
+    """Run a scene of `SCENES` with some constants replaced."""
+    cloth = SCENES[scene](replace(preset_named("certified"), constants=dict(constants)))
+    return Outcome(
+        cloth.positions, cloth.newton, cloth.krylov, cloth.factorizations, cloth.unconverged_steps, cloth.least_distance
+    )
+
+
+@cache
+def default(scene: str) -> Outcome:
+    """Run a scene with the solver's constants, once."""
+    return outcome(scene)
+
+
+def change(scene: str, name: str, factor: float) -> Change:
+    """Run a scene with one constant times a factor, and compare."""
+    now, before = outcome(scene, {name: scaled(name, factor)}), default(scene)
+    return Change(
+        float(np.linalg.norm(now.positions - before.positions, axis=1).max()),
+        now.newton / before.newton,
+        now.krylov / before.krylov,
+        now.factors / before.factors,
+        now.unconverged,
+        now.least_distance,
+    )
+
+
+def _steps(tumble: Tumble, steps: int) -> Cloth:
+    for step in range(1, steps + 1):
+        tumble.cloth.step(STEP, held=tumble.held(step * STEP), bodies=tumble.bodies)
+    return tumble.cloth
+
+
+def _sphere(radius: float, rings: int = 6) -> tuple[NDArray[np.int32], Floats]:
+    down, round_ = np.meshgrid(
+        np.linspace(0.0, np.pi, rings + 1)[1:-1], np.arange(2 * rings) * np.pi / rings, indexing="ij"
+    )
+    at = np.stack([np.sin(down) * np.cos(round_), np.sin(down) * np.sin(round_), np.cos(down)], axis=-1).reshape(-1, 3)
+    points = radius * np.concatenate([at, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+    around, top, bottom = 2 * rings, len(at), len(at) + 1
+    triangles = []
+    for i in range(around):
+        j = (i + 1) % around
+        triangles += [(top, i, j), (bottom, len(at) - around + j, len(at) - around + i)]
+        for ring in range(0, len(at) - around, around):
+            triangles += [(ring + i, ring + around + i, ring + j), (ring + j, ring + around + i, ring + around + j)]
+    return np.array(triangles, np.int32), points
+
+
+def ball(preset: SolverSettings) -> Cloth:
+    """A sheet falls onto a coarse sphere of triangles, which turns, and hangs down to a floor."""
+    triangles, points = _sphere(0.03)
+
+    def at(time: float) -> Floats:
+        c, s = np.cos(2.0 * time), np.sin(2.0 * time)
+        turned: Floats = points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return turned
+
+    mesh = meshes.unstructured(0.08, 0.08, 0.01, 5)
+    surfaces = [Surface(triangles, at, 0.5)]
+    cloth = Cloth(mesh, fabric(FABRIC), preset, self_contact=SelfContact(0.4), surfaces=surfaces)
+    cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), 0.032)]))
+    for _ in range(25):
+        cloth.step(STEP, bodies=[plane(0.4, origin=(0.0, 0.0, -0.032))])
+    return cloth
+
+
+def strip(preset: SolverSettings) -> Cloth:
+    """A wavy strip is pushed and pulled over a floor by its end, by steps of the controller's choice."""
+    mesh = meshes.grid(0.02, 0.12, 3, 16)
+    held = np.flatnonzero(mesh.rest[:, 1] > 0.06 - 1e-9)
+    cloth = Cloth(mesh, fabric(FABRIC), preset, held=held, self_contact=SelfContact(0.5))
+    start = np.column_stack([mesh.rest, 0.004 + 0.003 * np.sin(120.0 * mesh.rest[:, 1])])
+    cloth.set_state(start)
+    gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
+
+    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+        along = 0.06 * (1.0 - np.cos(6.0 * time))
+        down = 0.002 * min(time / 0.1, 1.0)
+        return gravity, start[held] - np.array([0.0, along, down]), [plane(0.6)]
+
+    for frame in range(1, 25):
+        cloth.advance(frame * 0.104, motion)
+    return cloth
+
+
+def controlled(tumble: Tumble, interval: float, intervals: int) -> Cloth:
+    """A tumble, by steps of the controller's choice in intervals [s] that are equally long."""
+    gravity = np.tile([0.0, 0.0, -GRAVITY], (len(tumble.cloth.positions), 1))
+    for k in range(1, intervals + 1):
+        tumble.cloth.advance(k * interval, lambda time: (gravity, tumble.held(time), tumble.bodies))
+    return tumble.cloth
+
+
+SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
+    {
+        "pile": lambda preset: _steps(pile(2, preset, sheets=3), 22),
+        "fold": lambda preset: _steps(folding(1, preset), 100),
+        "crumple": lambda preset: _steps(crumple(1, preset), 14),
+        "squeeze": lambda preset: _steps(squeeze(1, preset), 9),
+        "ball": ball,
+        "strip": strip,
+        "push": lambda preset: controlled(crumple(1, preset), 0.05, 3),
+        "let down": lambda preset: controlled(folding(1, preset), 0.1, 10),
+    }
+)
+"""Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
+within its plane, one on a ball, one that slides; the crumple and the fold by steps of the controller's choice."""
+
+
+def main(out: Path) -> None:
+    """Halve and double every constant in every scene, and write what changes."""
+    rows: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for name in _sim_core.cloth_constants():
+        rows[name] = {
+            str(factor): {
+                scene: {key: float(f"{value:.3g}") for key, value in asdict(change(scene, name, factor)).items()}
+                for scene in SCENES
+            }
+            for factor in (0.5, 2.0)
+            if scaled(name, factor) != scaled(name, 1.0)
+        }
+    out.write_text(json.dumps({"constants": _sim_core.cloth_constants(), "changes": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
