@@ -15,6 +15,8 @@ from stickslip_sim_core.protocols import ProtocolResult, cantilever, inclined_pl
 from stickslip_sim_core.protocols.strip import LENGTH, strip
 from stickslip_sim_core.reference import master_curves
 
+pytestmark = pytest.mark.physics
+
 CERTIFIED = preset_named("certified")
 
 

@@ -7,6 +7,8 @@ from stickslip_sim_core import SelfContact, cylinder, preset_named, protocols
 from stickslip_sim_core.protocols import capstan, heavy_fold, pull_out
 from stickslip_sim_core.reference import master_curves
 
+pytestmark = pytest.mark.physics
+
 
 class TestCapstan:
     def test_measures_tensions(self) -> None:

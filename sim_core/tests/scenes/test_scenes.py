@@ -13,6 +13,8 @@ from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere, 
 from stickslip_sim_core.scenes.character import STILL, bones, distance, figure
 from stickslip_sim_core.scenes.cloth_sphere import RADIUS, SETTLING, SPEED, turned
 
+pytestmark = pytest.mark.physics
+
 
 @pytest.fixture(scope="module")
 def dragged() -> ClothRun:
