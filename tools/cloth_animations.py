@@ -56,7 +56,6 @@ LOOKS: Mapping[str, Mapping[str, Any]] = {
         "material": "gray-interlock",
         "texture": "checker",
         "viewpoint": "front",
-        "angular_speed": 1.5,
     },
     "shawl": {
         "kind": "shawl",
@@ -67,7 +66,7 @@ LOOKS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
-FIGURE = ("skin_rest", "skin_weights", "skin_triangles", "bones")
+PROPS = ("skin_rest", "skin_weights", "skin_triangles", "bones", "sphere_pose")
 """What a run of a shawl has besides the cloth."""
 
 ZOOM: Mapping[str, float] = {"cloth-drag": 1.3, "cloth-on-cloth": 1.1, "cloth-sphere": 1.6}
@@ -83,9 +82,7 @@ def simulate(folder: Path, names: list[str]) -> None:
         "cloth-on-cloth": lambda material: cloth_on_cloth.scene(
             material, material, 0.4, mesh=COARSER, frames=SHOWN["cloth-on-cloth"][1], seed=1
         ).run(),
-        "cloth-sphere": lambda material: cloth_sphere.scene(
-            material, 0.4, angular_speed=LOOKS["cloth-sphere"]["angular_speed"], mesh=VERTICES
-        ).run(),
+        "cloth-sphere": lambda material: cloth_sphere.scene(material, 0.4, angular_speed=1.5, mesh=VERTICES).run(),
         "shawl": lambda material: shawl.scene(material, 0.5, mesh=VERTICES).run(),
     }
     folder.mkdir(parents=True, exist_ok=True)
@@ -103,7 +100,7 @@ def simulate(folder: Path, names: list[str]) -> None:
             positions=run.positions[None].astype(np.float32),
             rest=run.rest[None],
             triangles=run.triangles[None],
-            **{part: run.record[part][None] for part in FIGURE if part in run.record},
+            **{part: run.record[part][None] for part in PROPS if part in run.record},
         )
 
 
