@@ -181,7 +181,7 @@ def test_each_of_the_three_files_vouches_for_the_others() -> None:
         check_seal(manifest + b" ", group, seal)
     with pytest.raises(BrokenSealError, match=r"^zarr\.json has SHA-256"):
         check_seal(manifest, group + b" ", seal)
-    with pytest.raises(BrokenSealError, match="a line each"):
+    with pytest.raises(BrokenSealError, match="one line each"):
         check_seal(manifest, group, seal + b"0  other\n")
     with pytest.raises(BrokenSealError, match="a digest and a name"):
         check_seal(manifest, group, b"\xff")

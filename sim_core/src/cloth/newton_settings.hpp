@@ -36,7 +36,7 @@ struct NewtonSettings {
   // Margins (path.margin) that a node may go in an iteration under the smoothed law, and hops of its search. Sweep: 2
   // takes 5 % more and 8 takes 1 % less in a crumple.
   int smooth_hops = 4;
-  // Hops of the search for candidates that a correction may take: beyond what is known to be near it is no guide.
+  // Hops of the search for candidates that a correction may take: farther away, nodes meet pairs outside the list.
   // Sweep: 2 takes 1 % more in a fold and a crumple.
   int hops = 1;
   // Decrease of the squares of forces that is slow for the matrix of a convex energy: Newton's method with the exact

@@ -6,11 +6,14 @@ Results stay right in both cases; only the cost grows. So they do where cloth sl
 """
 
 import numpy as np
+import pytest
 
 from stickslip_sim_core import Cloth, SelfContact, fabric, plane, preset_named, sphere
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import THICKNESS
 from stickslip_sim_core.protocols.capstan import Strip
+
+pytestmark = pytest.mark.physics
 
 
 def _cloth(cells: int, height: float, held: bool = False) -> Cloth:

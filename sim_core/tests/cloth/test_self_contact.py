@@ -24,6 +24,8 @@ from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import stacked_incline
 from stickslip_sim_core.protocols.inclined_plane import tilted
 
+pytestmark = pytest.mark.physics
+
 Floats = NDArray[np.float64]
 
 CERTIFIED = preset_named("certified")

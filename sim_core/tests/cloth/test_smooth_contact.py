@@ -14,6 +14,8 @@ from stickslip_sim_core.cloth.contact import CREASE, THICKNESS
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols.inclined_plane import tilted
 
+pytestmark = pytest.mark.physics
+
 Floats = NDArray[np.float64]
 Triangles = NDArray[np.int32]
 

@@ -15,6 +15,8 @@ from stickslip_sim_core.protocols.plots import dense_master
 from stickslip_sim_core.protocols.rods import extrapolated, loss_of_stability, planar_frames, round_rod, tip
 from stickslip_sim_core.reference import master_curves
 
+pytestmark = pytest.mark.physics
+
 
 class TestBendTwist:
     def test_passes(self) -> None:

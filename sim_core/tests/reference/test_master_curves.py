@@ -59,6 +59,7 @@ def test_lateral_buckling_rod() -> None:
     assert master_curves.lateral_buckling_rod() == pytest.approx(12.8538, abs=5e-5)
 
 
+@pytest.mark.physics
 class TestLateralBuckling:
     """Of a plate strip; how it is solved has tests of its own in test_plate_buckling.py."""
 
@@ -151,6 +152,7 @@ def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Flo
     return found.sol(x)[4], found.sol(x)[5]
 
 
+@pytest.mark.physics
 class TestBendTwist:
     @pytest.mark.parametrize(("phi", "poisson"), [(6.5, 0.0), (6.0, 0.3), (6.0, 0.5)])
     def test_definition(self, phi: float, poisson: float) -> None:
