@@ -39,6 +39,7 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
             running.stop()
 
 
+@pytest.mark.slow
 def test_a_dataset_is_made_read_and_collected_in_a_bucket(service: Service, tmp_path: Path) -> None:
     over = service.finished(service.submit(SPEC))
     assert over["state"] == "succeeded", over["message"]

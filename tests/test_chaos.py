@@ -45,6 +45,7 @@ def service(tmp_path: Path) -> Any:
     running.stop()
 
 
+@pytest.mark.slow
 def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
     job = service.submit(SPEC)
 

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.physics
+
 ROOT = Path(__file__).parents[1]
 
 

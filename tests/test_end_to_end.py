@@ -152,6 +152,7 @@ def test_a_grown_grid_runs_what_is_new(service: Service, job: dict[str, Any]) ->
     assert sum(grown["progress"]["stages"]["simulate"]["counts"].values()) == 12
 
 
+@pytest.mark.slow
 def test_training_learns_from_the_pulled_dataset(directory: Path) -> None:
     rods = Samples(directory, arrays=["centerline", "curvature", "views"])
     (batch,) = rods.loader(8)

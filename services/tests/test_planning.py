@@ -312,6 +312,7 @@ def test_urgent_jobs_are_planned_first(context: Context, worker: PretendWorker, 
     assert [show_job(context, job).progress.planned for job in (first, urgent)] == [0, 4]
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_a_coordinator_that_is_killed_while_it_plans_goes_on_after_its_start(
     tmp_path: Path, database: str, monkeypatch: pytest.MonkeyPatch

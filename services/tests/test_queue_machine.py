@@ -292,6 +292,7 @@ def run_machine(machine: type[QueueMachine]) -> None:
         run_state_machine_as_test(machine, settings=profile)
 
 
+@pytest.mark.physics
 def test_the_queue_in_any_order() -> None:
     run_machine(QueueMachine)
 

@@ -65,6 +65,7 @@ def finish(context: Context, worker: PretendWorker, clock: ManualClock, job: str
     check(context)
 
 
+@pytest.mark.slow
 def test_200_rotten_artifacts_are_mended(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
     rng = random.Random(3)
     gammas = [1.0, 2.0, 3.0]

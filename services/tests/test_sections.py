@@ -129,6 +129,7 @@ def test_a_part_needs_only_the_sections_of_its_samples(origin: tuple[str, str, P
         assert set(SECTIONS) < files(target)
 
 
+@pytest.mark.physics
 def test_no_flipped_bit_of_a_section_or_the_manifest_is_silent(
     origin: tuple[str, str, PretendWorker], tmp_path: Path
 ) -> None:

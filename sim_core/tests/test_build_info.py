@@ -7,6 +7,8 @@ import sys
 import sysconfig
 from pathlib import Path
 
+import pytest
+
 from stickslip_sim_core import build_info
 from stickslip_sim_core._sim_core import cloth_kernels
 
@@ -43,6 +45,7 @@ def test_fields() -> None:
     assert info.cloth_kernel in cloth_kernels()
 
 
+@pytest.mark.physics
 def test_hash_follows_what_matters(tmp_path: Path) -> None:
     def copy(name: str) -> Path:
         ignored = shutil.ignore_patterns("build", "__pycache__")

@@ -38,6 +38,8 @@ from stickslip_sim_core import (
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
 
+pytestmark = pytest.mark.physics
+
 RECORDED = Path(__file__).with_name("golden.json")
 KERNEL = "STICKSLIP_CLOTH_KERNEL"
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")

@@ -13,6 +13,8 @@ from stickslip_workers.__main__ import main
 from stickslip_workers.builds import solver_build
 from stickslip_workers.certify import certify
 
+pytestmark = pytest.mark.physics
+
 ROD_SOLVER = "stickslip_sim_core.rods"
 LITTLE = {"rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512}}
 

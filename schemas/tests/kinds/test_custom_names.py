@@ -210,6 +210,7 @@ def test_files_that_are_no_textures_are_refused(data: bytes, rule: str) -> None:
         read_picture(data)
 
 
+@pytest.mark.physics
 def test_a_small_file_of_a_huge_picture_is_not_decoded() -> None:
     """A PNG of 30,000 x 30,000 black pixels has some kilobytes: it is refused for its header."""
     bomb = _file(Image.new("1", (30_000, 30_000)), optimize=False)

@@ -54,6 +54,7 @@ def specs(draw: st.DrawFn) -> dict[str, Any]:
     return {"kind": "cloth_drag", "axes": axes, **rest}
 
 
+@pytest.mark.physics
 @settings(deadline=None, max_examples=150)
 @given(document=specs())
 def test_counts_are_those_of_the_grid(document: dict[str, Any]) -> None:

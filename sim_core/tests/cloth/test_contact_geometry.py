@@ -9,6 +9,8 @@ from stickslip_sim_core import _sim_core as core
 from stickslip_sim_core import self_intersections
 from stickslip_sim_core.cloth import meshes
 
+pytestmark = pytest.mark.physics
+
 Floats = NDArray[np.float64]
 
 KINDS = pytest.mark.parametrize("edges", [False, True], ids=["vertex-triangle", "edge-edge"])

@@ -65,6 +65,7 @@ class TestCantilever:
         assert result.error < 0.03
         assert protocols.run("cantilever", gamma=(0.01, 30.0), unstructured=1).passed
 
+    @pytest.mark.slow
     def test_locking_is_seen(self) -> None:
         """Ten times as stiff against stretching as it should be, an unstructured mesh is not passed at a sharp bend."""
         loose = strip(cantilever.WIDTH, 25, 0)

@@ -15,6 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class TestCantilever:
+    @pytest.mark.physics
     @pytest.mark.parametrize("gamma", [1e-3, 0.5, 30.0, 300.0, 3000.0, 1e5])
     def test_against_scipy(self, gamma: float) -> None:
         def rate(s: Floats, y: Floats) -> Floats:
@@ -63,6 +64,7 @@ def test_lateral_buckling_rod() -> None:
 class TestLateralBuckling:
     """Of a plate strip; how it is solved has tests of its own in test_plate_buckling.py."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.5])
     def test_narrow_strip_is_a_rod(self, poisson: float) -> None:
         rod = master_curves.lateral_buckling_rod() * np.sqrt(2 / (1 + poisson)) * (1 - poisson**2)
@@ -164,6 +166,7 @@ class TestBendTwist:
             assert (eta[:-1] > 0).all()
             assert (in_plane > 0).all()
 
+    @pytest.mark.slow
     def test_long_rods_are_alike(self) -> None:
         """Gamma^(1/3) / phi tends to a constant of Poisson's ratio."""
         for poisson, constant in ((0.0, 0.516542), (0.3, 0.580823), (0.5, 0.620688)):
@@ -172,6 +175,7 @@ class TestBendTwist:
             np.testing.assert_allclose(scaled, constant, atol=1e-6)
             np.testing.assert_allclose(scaled, scaled[0], rtol=1e-10)
 
+    @pytest.mark.slow
     def test_nothing_below_the_onset(self) -> None:
         phi, gamma = master_curves.bend_twist_onset(0.5)
         assert phi / np.pi == pytest.approx(1.767, abs=1e-3)
@@ -184,6 +188,7 @@ class TestBendTwist:
         onsets = [master_curves.bend_twist_onset(nu)[0] for nu in (0.0, 0.3, 0.5)]
         assert onsets[0] > onsets[1] > onsets[2]
 
+    @pytest.mark.slow
     def test_independent_of_what_was_asked_before(self) -> None:
         master_curves._boundary.cache_clear()
         first = master_curves.bend_twist(10.0, 0.4)
@@ -192,6 +197,7 @@ class TestBendTwist:
         assert first.tobytes() == master_curves.bend_twist(10.0, 0.4).tobytes()
 
 
+@pytest.mark.slow
 def test_shapes() -> None:
     assert master_curves.cantilever(1.0).shape == ()
     assert master_curves.cantilever(np.ones((2, 3))).shape == (2, 3)
@@ -203,6 +209,7 @@ def test_shapes() -> None:
 
 
 class TestHeavyFold:
+    @pytest.mark.physics
     @pytest.mark.parametrize("gap", [1e-4, 1.0 / 16.0, 0.3])
     def test_against_scipy(self, gap: float) -> None:
         """In one part, and with the tangent's angle from a guess of its own."""

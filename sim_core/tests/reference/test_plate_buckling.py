@@ -8,6 +8,8 @@ from scipy.linalg import eigh
 from stickslip_sim_core.reference import plate_buckling
 from stickslip_sim_core.reference.plate_buckling import buckling_weight
 
+pytestmark = pytest.mark.physics
+
 Floats = NDArray[np.float64]
 
 
@@ -63,6 +65,7 @@ def test_another_discretisation(aspect: float, poisson: float) -> None:
     assert buckling_weight(aspect, poisson) == pytest.approx(ritz_weight(aspect, poisson, 11), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aspect", [0.05, 1.0])
 @pytest.mark.parametrize("poisson", [0.0, 0.5])
 def test_converged(aspect: float, poisson: float) -> None:

@@ -52,6 +52,7 @@ def test_straight_rod_hangs_straight(gamma: float) -> None:
     ("gamma", "phi0", "phi1"),
     [(100.0, 0.2, 6.0), (400.0, 3.0, 12.0), (1300.0, 12.0, 20.0), (1300.0, 0.2, 20.0), (20.0, 0.0, 3.0)],
 )
+@pytest.mark.physics
 def test_strong_form_by_collocation(gamma: float, phi0: float, phi1: float) -> None:
     """scipy's solve_bvp on the Kirchhoff equations in the material frame, 6 unknowns (m, g)."""
     natural = np.array([phi0, 0.0, phi1])

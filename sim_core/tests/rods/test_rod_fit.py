@@ -16,6 +16,8 @@ from stickslip_sim_core.rods.fit import _Model, _parameters, _State
 from stickslip_sim_core.rods.general import CLAMP_FRAME
 from stickslip_sim_core.rods.splines import bspline_matrix
 
+pytestmark = pytest.mark.physics
+
 Floats = NDArray[np.float64]
 
 S = np.linspace(0, 1, 150)
@@ -112,6 +114,7 @@ class TestParameters:
 
 
 class TestNaturalCurvature:
+    @pytest.mark.slow
     def test_round_trip_outside_the_family(self, outside: tuple[Floats, Floats, RodSolution]) -> None:
         """Noisy centreline, fit, hung again: to the true centreline and curvature."""
         natural, gamma, rods = outside

@@ -189,17 +189,15 @@ within its plane, one on a ball, one that slides; the crumple and the fold by st
 
 def main(out: Path) -> None:
     """Halve and double every constant in every scene, and write what changes."""
-    rows: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
-    for name in _sim_core.cloth_constants():
-        rows[name] = {
-            str(factor): {
-                scene: {key: float(f"{value:.3g}") for key, value in asdict(change(scene, name, factor)).items()}
-                for scene in SCENES
-            }
-            for factor in (0.5, 2.0)
-            if scaled(name, factor) != scaled(name, 1.0)
-        }
-    out.write_text(json.dumps({"constants": _sim_core.cloth_constants(), "changes": rows}, indent=1) + "\n")
+    rows = [
+        {"constant": name, "factor": factor, "scene": scene}
+        | {key: float(f"{value:.3g}") for key, value in asdict(change(scene, name, factor)).items()}
+        for name in _sim_core.cloth_constants()
+        for factor in (0.5, 2.0)
+        if scaled(name, factor) != scaled(name, 1.0)
+        for scene in SCENES
+    ]
+    out.write_text(json.dumps({"constants": _sim_core.cloth_constants(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

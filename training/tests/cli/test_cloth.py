@@ -12,6 +12,8 @@ from stickslip_training.cloth.runs import load_runs
 from stickslip_training.data.reader import DatasetReader
 from typer.testing import CliRunner
 
+pytestmark = pytest.mark.physics
+
 runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
 AXES = {"material": ["gray-interlock", "11oz-black-denim"], "mu": [0.1, 0.4], "texture": "plaid", "viewpoint": "left"}
 

@@ -88,5 +88,5 @@ def test_a_damaged_packed_file_is_refused(packed, tmp_path):
     data = bytearray(packed.read_bytes())
     data[len(data) // 2] ^= 1
     damaged.write_bytes(data)
-    with pytest.raises(ValueError, match=r"runs\.npz .*damaged"):
+    with pytest.raises(ValueError, match=r"runs\.npz must be a packed file .*CRC"):
         load_runs(damaged)

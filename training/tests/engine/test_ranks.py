@@ -13,6 +13,8 @@ from stickslip_training.engine.fit import FitSettings, Learner, fit, seeded
 from stickslip_training.engine.ranks import Rank, averaged, current_rank, joined
 from torch import nn
 
+pytestmark = pytest.mark.physics
+
 SETTINGS = FitSettings(steps=23, epoch=5, seed=3, averaging=0.9, clip=0.05, threads=1)
 
 

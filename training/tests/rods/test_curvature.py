@@ -13,6 +13,8 @@ from stickslip_training.rods.curvature import (
 )
 from stickslip_training.rods.evaluation import estimate_strains
 
+pytestmark = pytest.mark.physics
+
 
 @pytest.fixture
 def config(rods, tmp_path):
@@ -67,6 +69,7 @@ def test_few_test_rods_are_told(trained):
     assert trained[1].notes[0].startswith(f"There are only {trained[1].rods['test']} test rods")
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, tmp_path):
     first = train_curvature(config)

@@ -11,6 +11,8 @@ from stickslip_training.rods.local_global import (
 )
 from stickslip_training.rods.nets import LocalGlobalNet, relative_loss
 
+pytestmark = pytest.mark.physics
+
 SMALL = {"width": 32, "blocks": 2, "local": 4}
 
 
