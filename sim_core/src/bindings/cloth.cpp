@@ -112,7 +112,13 @@ void bind_cloth(nb::module_& m) {
           "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "edge_share"_a, "second_share"_a,
           "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a,
           "constants"_a = std::map<std::string, double>())
-      .def("set_state", &ClothSolver::set_state, "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a)
+      .def(
+          "set_state",
+          [](ClothSolver& self, const Points3& positions, const Points3& velocities, const Points3& slopes,
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies) {
+            self.set_state(positions, velocities, slopes, surfaces, bodies_of(bodies));
+          },
+          "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a, "bodies"_a)
       .def(
           "step",
           [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,

@@ -95,14 +95,14 @@ ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const 
 ClothSolver::~ClothSolver() = default;
 
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes,
-                            const Points3& surfaces) {
+                            const Points3& surfaces, const std::vector<Body>& bodies) {
   impl_->load(positions, slopes, impl_->stepper.x);
   impl_->load_surfaces(surfaces, impl_->stepper.x);
   if (impl_->newton.pairs && impl_->crosses(positions, surfaces)) {
     refuse("positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
-  impl_->stepper.restart();
+  impl_->stepper.restart(bodies);
   impl_->controller.restart();
 }
 

@@ -20,8 +20,9 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings, const Consta
   newton.strained_max = constants_.strained_long;
 }
 
-void Stepper::restart() {
-  started_ = false;
+void Stepper::restart(const std::vector<Body>& bodies) {
+  bodies_before_ = bodies;
+  started_ = !bodies.empty();
   newton.contact.forget();
   if (newton.pairs) newton.pairs->restart();
 }

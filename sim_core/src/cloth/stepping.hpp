@@ -25,8 +25,8 @@ class Stepper {
   Buffer<double> x, v;  // (nodes, 4), m, m/s
   Newton newton;
 
-  // Bodies are where they are in the first step from here.
-  void restart();
+  // `bodies`: where they are; without, they do not move in the next step.
+  void restart(const std::vector<Body>& bodies);
   StepReport step(double dt, const Drive& drive);
 
   // One attempt at a step, as a whole and within the settings' patience, to be accepted or rejected: then nothing has

@@ -9,6 +9,7 @@ from stickslip_sim_core import Keyframes, Sheet, fabric, plane
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes import custom
+from stickslip_sim_core.scenes.holders import Holder
 
 MESH = meshes.grid(0.06, 0.06, 4, 4)
 
@@ -60,12 +61,46 @@ class TestRunScene:
         corner = np.flatnonzero((MESH.rest > 0.029).all(axis=1))
         start = flat(0.1)[corner]
         lifted = Keyframes([0.0, 1.0], np.array([[0, 0, 0], [0, 0, 0.05]]), np.zeros((2, 3)))
-        held = sheet(0.1, held=corner, held_at=lambda time: start + lifted.at(time)[1])
+        held = sheet(0.1, holders=[Holder(corner, lifted.pose)])
         run = custom.scene([held], [[0.5]], duration=4.0, frame_rate=2.0, preset="fast").run()
         assert run.valid, run.reason
         assert run.positions[-1, corner] == pytest.approx(start + np.array([0.0, 0.0, 0.05]))
         weight = fabric("gray-interlock").density * 0.06**2 * GRAVITY
         assert run.holder_force[-1, 0, 2] == pytest.approx(weight, rel=0.2)  # it swings a little
+
+    def test_a_release_lets_go_without_a_kick(self) -> None:
+        """A sheet thrown upward flies on as it was moved: in each frame after it the mean of z falls by g t^2/2."""
+        every = np.arange(len(MESH.rest) - 1)  # one vertex is free
+        thrown = Keyframes([0.0, 0.5], np.array([[0, 0, 0], [0, 0, 1.0]]), np.zeros((2, 3)))
+        run = custom.scene(
+            [sheet(0.1, holders=[Holder(every, thrown.pose, [(0.0, 0.25)])])],
+            [[0.5]],
+            duration=0.5,
+            frame_rate=20.0,
+        ).run()
+        assert run.valid, run.reason
+        z = run.positions[:, every, 2].mean(axis=1)
+        speed = 3.0 / (2.0 * 0.5)  # of the smooth keyframes in their middle [m/s]
+        t = run.times[5:] - 0.25
+        assert z[5] == pytest.approx(0.6, abs=1e-9)
+        assert z[5:] == pytest.approx(0.6 + speed * t - 0.5 * GRAVITY * t**2, abs=5e-3)
+        assert run.holder_force[6:] == pytest.approx(np.zeros((5, 1, 3)))
+
+    def test_a_grasp_takes_vertices_where_they_are(self) -> None:
+        """A sheet falls, is caught at a corner, and hangs there."""
+        corner = np.flatnonzero((MESH.rest > 0.029).all(axis=1))
+        lifted = Keyframes([0.0, 0.1, 1.0], np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0.05]]), np.zeros((3, 3)))
+        run = custom.scene(
+            [sheet(0.5, holders=[Holder(corner, lifted.pose, [(0.1, np.inf)])])],
+            [[0.5]],
+            duration=2.0,
+            frame_rate=20.0,
+            preset="fast",
+        ).run()
+        assert run.valid, run.reason
+        caught = run.positions[2, corner]
+        assert caught[:, 2] == pytest.approx(0.5 - 0.5 * GRAVITY * 0.1**2, abs=3e-3)
+        assert run.positions[-1, corner] == pytest.approx(caught + np.array([0.0, 0.0, 0.05]), abs=1e-9)
 
     def test_the_same_scene_gives_the_same_bits(self) -> None:
         runs = [

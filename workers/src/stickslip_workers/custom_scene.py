@@ -18,6 +18,7 @@ from stickslip_sim_core.cloth.meshes import Mesh, grid, unstructured
 from stickslip_sim_core.protocols import CERTIFICATION, SCENE_PROTOCOLS
 from stickslip_sim_core.scenes import custom
 from stickslip_sim_core.scenes.custom import Sheet
+from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, read_moving_mesh, rotation
 from stickslip_sim_core.scenes.scene import ClothRun
 
@@ -192,7 +193,7 @@ def _sheet(scene: SceneFile, name: str, mesh: Mesh) -> Sheet:
     given = scene.sheets[name]
     numbers = scene.materials.get(given.material)
     start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))]) @ rotation(given.turn).T + np.array(given.origin)
-    parts: list[tuple[npt.NDArray[np.int64], Callable[[float], Array]]] = []
+    holders: list[Holder] = []
     taken = np.zeros(len(start), dtype=bool)
     for holder, held in given.holders.items():
         place = f"sheets.{name}.holders.{holder}"
@@ -202,18 +203,13 @@ def _sheet(scene: SceneFile, name: str, mesh: Mesh) -> Sheet:
         if (inside & taken).any():
             raise SceneError(f"{place}: must not hold what another holder holds")
         taken |= inside
-        parts.append((np.flatnonzero(inside).astype(np.int64), _moving(start[inside], held.motion)))
-    vertices = np.concatenate([np.empty(0, dtype=np.int64), *(part for part, _ in parts)])
-
-    def held_at(time: float) -> Array:
-        return np.concatenate([np.empty((0, 3)), *(at(time) for _, at in parts)])
-
+        keyframes = _keyframes(held.motion or _STILL, start[inside].mean(axis=0))
+        holders.append(Holder(np.flatnonzero(inside), keyframes.pose))
     return Sheet(
         mesh,
         custom_fabric(given.material, **numbers.model_dump()) if numbers else fabric(given.material),
         start,
-        held=vertices,
-        held_at=held_at,
+        holders=holders,
         thickness=given.thickness,
     )
 
@@ -225,18 +221,6 @@ def _keyframes(motion: Motion, middle: Sequence[float] | Array) -> Keyframes:
         [key.turn for key in motion.keys],
         middle if motion.about is None else motion.about,
     )
-
-
-def _moving(start: Array, motion: Motion | None) -> Callable[[float], Array]:
-    """Return where points (n, 3) [m] are at a time [s]."""
-    keyframes = _keyframes(motion or _STILL, start.mean(axis=0))
-
-    def at(time: float) -> Array:
-        turn, move = keyframes.at(time)
-        moved: Array = start @ turn.T + move
-        return moved
-
-    return at
 
 
 def _rigid(body: Plane | Sphere | Cylinder | Box, mu: float) -> Callable[[float], Body]:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,12 +86,12 @@ class Cloth:
         patch_weight = min((fabric.density for fabric in self.fabrics), default=np.nan) * RESIDUAL_PATCH * GRAVITY
         self.force_scale = patch_weight if force_scale is None else force_scale
         """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given."""
-        self._solver = ClothSolver(
+        self._make = partial(
+            ClothSolver,
             mesh.rest,
             mesh.triangles,
             [(fabric.density, fabric.stretching, fabric.rigidity, fabric.damping) for fabric in self.fabrics],
-            self.held.tolist(),
-            edges,
+            clamped=edges,
             tolerance=preset.tolerance * self.force_scale,
             newton_max=preset.newton_max,
             krylov_max=preset.krylov_max,
@@ -114,6 +115,7 @@ class Cloth:
             crease=[surface.crease for surface in self.surfaces],
             constants=dict(preset.constants),
         )
+        self._solver = self._make(held=self.held.tolist())
         self.least_distance = np.inf
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
         self.steps = self.unconverged_steps = 0
@@ -194,9 +196,15 @@ class Cloth:
         return np.split(np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1])
 
     def set_state(
-        self, positions: ArrayLike, velocities: ArrayLike | None = None, slopes: ArrayLike | None = None
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike | None = None,
+        slopes: ArrayLike | None = None,
+        bodies: Sequence[Body] = (),
     ) -> None:
         """Set positions (V, 3) [m], velocities (V, 3) [m/s], and slopes at clamped edges (E, 3).
+
+        Without `bodies`, those of this time, they do not move in the next step.
 
         Raises:
             ValueError: The cloth crosses a surface, or, with self-contact, itself; or an array has another shape.
@@ -205,7 +213,22 @@ class Cloth:
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
         if slopes is not None:
             self.slopes = np.asarray(slopes, float)
-        self._solver.set_state(at, speed, self.slopes, self._surfaces_at(self.time))
+        self._solver.set_state(
+            at, speed, self.slopes, self._surfaces_at(self.time), [body.as_tuple() for body in bodies]
+        )
+
+    def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
+        """Prescribe the positions of these vertices (K,) from now on, in place of those held so far.
+
+        Positions and velocities stay: what is let go flies on as it was moved. `bodies` are those of this time.
+
+        Raises:
+            ValueError: A vertex is not there, or comes twice; or none is left free.
+        """
+        positions, velocities = self.positions, self.velocities
+        self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
+        self._solver = self._make(held=self.held.tolist())
+        self.set_state(positions, velocities, bodies=bodies)
 
     def step(
         self,
@@ -217,8 +240,6 @@ class Cloth:
         damping: float = 0.0,
     ) -> StepReport:
         """Advance by dt [s]. Positions of held vertices (K, 3), slopes, bodies and surfaces are those at its end.
-
-        In the first step after `set_state` bodies do not move.
 
         `damping` is proportional to mass [1/s]; that of the fabric is added.
         A step that does not converge is counted, and its best iterate is kept.

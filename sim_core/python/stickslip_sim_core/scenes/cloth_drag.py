@@ -3,11 +3,11 @@
 `cloth_on_cloth` shares the path of the holders and the cloth that hangs from them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
@@ -15,7 +15,8 @@ from stickslip_sim_core.cloth.bodies import Body, plane
 from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
-from stickslip_sim_core.cloth.solver import GRAVITY, Cloth, Motion
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.kind import Record
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, check_range, cloth_kind
 
@@ -204,7 +205,7 @@ def scene(
         fabrics=[fabric_of(material)],
         preset=preset_named(preset),
         start=hung.positions,
-        held=hung.held,
+        holders=[Holder(hung.held, holder_pose)],
         motion=motion_of(hung, len(square.rest), [plane(mu)]),
         self_contact=None if self_friction is None else SelfContact(self_friction),
         frames=frames,
@@ -233,23 +234,20 @@ def checked_square(mesh: int | meshes.Mesh, frames: int) -> meshes.Mesh:
     return meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
 
 
-def motion_of(hung: Hung, vertices: int, floor: Sequence[Body], fixed: ArrayLike = ()) -> Motion:
+def motion_of(hung: Hung, vertices: int, floor: Sequence[Body]) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
     """Return the motion of the drag scene; gravity is upright one second after the drop.
 
     Args:
         hung: The dragged sheet, which comes first.
         vertices: Number of vertices of all sheets.
         floor: Bodies below.
-        fixed: (F, 3): positions of the held vertices of other sheets, which stay [m].
     """
-    start, stay = hung.positions[hung.held], np.asarray(fixed, float).reshape(-1, 3)
 
-    def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
+    def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
         gravity = np.tile([0.0, 0.0, -GRAVITY], (vertices, 1))
         gravity[: len(hung.positions), 0] = hung.tilt.of_vertices * GRAVITY * (1.0 - upright)
-        x, z = holder_path(time)
-        return gravity, np.concatenate([start + np.array([x, 0.0, z]), stay]), floor
+        return gravity, floor
 
     return motion
 

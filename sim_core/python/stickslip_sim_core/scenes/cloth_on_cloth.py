@@ -22,6 +22,7 @@ from stickslip_sim_core.scenes.cloth_drag import (
     holder_pose,
     motion_of,
 )
+from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.scene import Scene, cloth_kind
 
 BEHIND, LENGTH, WIDTH = 0.15, 0.6, 0.3
@@ -74,8 +75,8 @@ def scene(
         fabrics=[fabric_of(material), fabric_of(substrate_material)],
         preset=preset_named(preset),
         start=np.concatenate([hung.positions, below.positions]),
-        held=np.concatenate([hung.held, count + below.edge]),
-        motion=motion_of(hung, len(everything.rest), floor, below.positions[below.edge]),
+        holders=[Holder(hung.held, holder_pose), Holder(count + below.edge, lambda _time: np.eye(3, 4))],
+        motion=motion_of(hung, len(everything.rest), floor),
         self_contact=SelfContact([[self_friction, mu], [mu, self_friction]], bearing="first"),
         frames=frames,
         frame_rate=FRAME_RATE,

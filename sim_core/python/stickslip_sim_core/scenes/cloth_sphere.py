@@ -94,9 +94,9 @@ def scene(
     down = np.tile([0.0, 0.0, -GRAVITY], (len(square.rest), 1))
     tilted = down + GRAVITY * np.append(bias, 0.0)
 
-    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+    def motion(time: float) -> tuple[Floats, list[Body]]:
         bodies = [floor, ball(mu, turned(time, angular_speed))]
-        return (tilted if time < SETTLING else down), np.empty((0, 3)), bodies
+        return (tilted if time < SETTLING else down), bodies
 
     return Scene(
         mesh=square,

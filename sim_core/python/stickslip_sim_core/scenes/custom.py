@@ -1,7 +1,7 @@
 """Custom scenes: sheets of cloth, bodies that move, and friction between each two."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +15,7 @@ from stickslip_sim_core.cloth.contact import THICKNESS, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.kind import Record
 from stickslip_sim_core.scenes.scene import Scene
 
@@ -31,11 +32,8 @@ class Sheet:
     positions: ArrayLike
     """(V, 3): where it starts, at rest [m]."""
 
-    held: ArrayLike = ()
-    """(K,): vertices whose positions are prescribed."""
-
-    held_at: Callable[[float], ArrayLike] | None = None
-    """Takes a time [s] and returns the positions of the held vertices (K, 3) [m]; None: they stay."""
+    holders: Sequence[Holder] = ()
+    """Of vertices of the sheet."""
 
     thickness: float = THICKNESS
     """[m]"""
@@ -91,16 +89,16 @@ def scene(
         if sheet_count(sheet.mesh.rest, sheet.mesh.triangles) != 1:
             raise ValueError(f"mesh: of sheet {number} must hang together in one piece")
     ends = np.cumsum([0, *map(len, starts)])
-    held = [np.asarray(sheet.held, dtype=np.int64).reshape(-1) for sheet in sheets]
+    holders = [
+        replace(holder, vertices=np.asarray(holder.vertices) + begin)
+        for sheet, begin in zip(sheets, ends, strict=False)
+        for holder in sheet.holders
+    ]
     mesh = meshes.together(*(sheet.mesh for sheet in sheets))
     weight = np.tile(down, (len(mesh.rest), 1))
 
-    def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
-        at = [
-            np.asarray(start[own] if sheet.held_at is None else sheet.held_at(time), float).reshape(-1, 3)
-            for sheet, start, own in zip(sheets, starts, held, strict=True)
-        ]
-        return weight, np.concatenate(at), bodies(time) if callable(bodies) else bodies
+    def motion(time: float) -> tuple[Floats, Sequence[Body]]:
+        return weight, bodies(time) if callable(bodies) else bodies
 
     return Scene(
         mesh=mesh,
@@ -110,7 +108,7 @@ def scene(
         motion=motion,
         frames=frames,
         frame_rate=frame_rate,
-        held=np.concatenate([own + begin for own, begin in zip(held, ends, strict=False)]),
+        holders=holders,
         self_contact=SelfContact(np.asarray(friction, float).reshape(len(sheets), -1), [s.thickness for s in sheets]),
         surfaces=surfaces,
         forces=lambda cloth: _forces(cloth, ends),

@@ -75,6 +75,11 @@ class Keyframes:
         shift: Floats = about + found[:3] - R @ about
         return R, shift
 
+    def pose(self, time: float) -> Floats:
+        """Return the motion at a time [s] as (3, 4)."""
+        R, shift = self.at(time)
+        return np.column_stack([R, shift])
+
 
 def _monotone(times: Floats, values: Floats) -> Floats:
     """Return the slopes of monotone cubics (K, n) at keyframes: 0 at both ends and where a value turns back."""

@@ -9,11 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.bodies import Body
 from stickslip_sim_core.cloth.contact import SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
-from stickslip_sim_core.cloth.solver import Cloth, Motion, kernel_level
+from stickslip_sim_core.cloth.solver import Cloth, kernel_level
+from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import Array, Kind, OnFrame, Outcome, Record
 
 
@@ -89,15 +91,15 @@ class Scene:
     start: Floats
     """(V, 3) [m]: positions of the vertices, at rest."""
 
-    motion: Motion
-    """Gravity, positions of held vertices, and bodies."""
+    motion: Callable[[float], tuple[Floats, Sequence[Body]]]
+    """From a time [s] to gravity (V, 3) [m/s^2] and bodies."""
 
     frames: int
     frame_rate: float
     """[1/s]; the first frame is at 0 s."""
 
-    held: ArrayLike = ()
-    """(K,): vertices whose positions are prescribed."""
+    holders: Sequence[Holder] = ()
+    """What moves vertices as prescribed."""
 
     self_contact: SelfContact | None = None
     surfaces: Sequence[Surface] = ()
@@ -134,11 +136,12 @@ class Scene:
         Raises:
             ValueError: A sheet starts across itself, another or a surface.
         """
+        hands = Hands(self.holders, self.start)
         cloth = Cloth(
             self.mesh,
             self.fabrics,
             self.preset,
-            held=self.held,
+            held=hands.vertices,
             self_contact=self.self_contact,
             surfaces=self.surfaces,
             kernel=self.kernel,
@@ -147,7 +150,7 @@ class Scene:
         paths, forces = [cloth.positions], [self.forces(cloth)]
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
-            cloth.advance(time, self.motion, damping=self.damping(time))
+            self._advance(cloth, hands, time)
             paths.append(cloth.positions)
             forces.append(self.forces(cloth))
             if on_frame is not None:
@@ -179,6 +182,20 @@ class Scene:
             reason=self.reason or cloth.why_invalid(everything),
         )
         return replace(run, labels=self.labels(run))
+
+    def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
+        """Advance to `end` [s], and grasp and release on the way."""
+
+        def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
+            gravity, bodies = self.motion(time)
+            return gravity, hands.at(time), bodies
+
+        damping = self.damping(end)
+        for event in [event for event in hands.events if cloth.time <= event < end]:
+            if cloth.time < event:
+                cloth.advance(event, motion, damping=damping)
+            cloth.hold(hands.take(event, cloth.positions), self.motion(event)[1])
+        cloth.advance(end, motion, damping=damping)
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
         """Run the scene and return the arrays and labels to store."""

@@ -99,8 +99,8 @@ def scene(
     tilted = down + GRAVITY * np.append(bias, 0.0)
     floor = [plane(mu)]
 
-    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
-        return (tilted if time < UPRIGHT else down), np.empty((0, 3)), floor
+    def motion(time: float) -> tuple[Floats, list[Body]]:
+        return (tilted if time < UPRIGHT else down), floor
 
     return Scene(
         mesh=flat,

@@ -1,0 +1,82 @@
+"""Holders: vertices of the cloth that move as rigid bodies while they are grasped."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stickslip_sim_core.arrays import Floats
+
+ALWAYS = (0.0, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Holder:
+    """Vertices that move as one rigid body from each grasp to its release.
+
+    At the time t0 of a grasp the holder takes each vertex where it is: x(t) = M(t) M(t0)^-1 x(t0), M being its pose.
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+
+    vertices: NDArray[np.intp]
+    """(K,)"""
+
+    pose: Callable[[float], Floats]
+    """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]."""
+
+    grasps: Sequence[tuple[float, float]] = (ALWAYS,)
+    """Intervals [s] from a grasp to a release, ascending."""
+
+    def __post_init__(self) -> None:
+        instants = [instant for grasp in self.grasps for instant in grasp]
+        if not all(before < after for before, after in pairwise(instants)) or min(instants, default=0.0) < 0.0:
+            raise ValueError(f"grasps: must ascend from 0 s or later, got {list(self.grasps)}")
+        if not len(self.vertices):
+            raise ValueError("vertices: a holder must hold a vertex, got none")
+
+    def grasps_at(self, time: float) -> bool:
+        """Return whether it holds its vertices from this time [s] on."""
+        return any(begin <= time < end for begin, end in self.grasps)
+
+
+class Hands:
+    """The holders of a scene, with what each of them holds at the current time.
+
+    Args:
+        holders: No two may hold the same vertex at a time.
+        positions: (V, 3) [m]: of all vertices at 0 s.
+    """
+
+    def __init__(self, holders: Sequence[Holder], positions: Floats) -> None:
+        self.holders = tuple(holders)
+        self.events = sorted({t for holder in holders for grasp in holder.grasps for t in grasp if 0.0 < t < np.inf})
+        """Times of all grasps and releases after 0 s [s], ascending."""
+        self._taken: dict[int, Floats] = {}
+        self.take(0.0, positions)
+
+    def take(self, time: float, positions: Floats) -> NDArray[np.int32]:
+        """Grasp and release what this time [s] asks for, and return the held vertices (K,)."""
+        taken: dict[int, Floats] = {}
+        for number, holder in enumerate(self.holders):
+            if not holder.grasps_at(time):
+                continue
+            pose = holder.pose(time)
+            goes_on = number in self._taken and time not in [begin for begin, _ in holder.grasps]
+            taken[number] = self._taken[number] if goes_on else (positions[holder.vertices] - pose[:, 3]) @ pose[:, :3]
+        self._taken = taken
+        return self.vertices
+
+    @property
+    def vertices(self) -> NDArray[np.int32]:
+        """(K,): held vertices, holder by holder."""
+        held = [np.empty(0, np.int32), *(self.holders[number].vertices for number in self._taken)]
+        return np.concatenate(held).astype(np.int32)
+
+    def at(self, time: float) -> Floats:
+        """Return the positions of the held vertices at a time [s]: (K, 3) [m]."""
+        poses = [(points, self.holders[number].pose(time)) for number, points in self._taken.items()]
+        return np.concatenate([np.empty((0, 3)), *(points @ pose[:, :3].T + pose[:, 3] for points, pose in poses)])
