@@ -13,11 +13,10 @@ from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.pictures import MAX_BYTES, UnfitPictureError, read_picture
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth.names import Lighting, Substrate
 from stickslip_schemas.kinds.cloth.spec import ClothRender
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec.appearance import Calibration
+from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.fabrics import Texture
 from stickslip_testing.samples import samples

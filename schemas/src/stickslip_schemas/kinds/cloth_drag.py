@@ -9,7 +9,7 @@ from stickslip_schemas.base.document import Float
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, forces, mesh_arrays, physical_arrays, solver_arrays
 from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, DragSceneSpec, LampAxis, ViewpointAxis
-from stickslip_schemas.kinds.cloth.names import Custom, Substrate, SubstrateAxis, TextureAxis, definitions
+from stickslip_schemas.kinds.cloth.names import Custom, SubstrateAxis, TextureAxis, definitions
 from stickslip_schemas.kinds.cloth.spec import (
     PHYSICAL_AXES,
     SELF_FRICTION,
@@ -18,7 +18,7 @@ from stickslip_schemas.kinds.cloth.spec import (
     ClothSimulation,
     seed_rules,
 )
-from stickslip_schemas.spec.appearance import FloorNumbers
+from stickslip_schemas.spec.appearance import FloorNumbers, Substrate
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.fabrics import CustomName
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS

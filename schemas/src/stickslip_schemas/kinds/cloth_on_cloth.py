@@ -14,7 +14,7 @@ from stickslip_schemas.kinds.cloth.arrays import (
     solver_arrays,
 )
 from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, DragSceneSpec, LampAxis, ViewpointAxis
-from stickslip_schemas.kinds.cloth.names import Custom, MaterialAxis, Substrate, TextureAxis
+from stickslip_schemas.kinds.cloth.names import Custom, MaterialAxis, TextureAxis
 from stickslip_schemas.kinds.cloth.spec import (
     PHYSICAL_AXES,
     SELF_FRICTION,
@@ -24,6 +24,7 @@ from stickslip_schemas.kinds.cloth.spec import (
     MuAxis,
     seed_rules,
 )
+from stickslip_schemas.spec.appearance import Substrate
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS

@@ -1,5 +1,6 @@
-"""Custom lamps, floors and cameras, as numbers in a spec."""
+"""Lamps, floors and cameras: the built-in ones by name, custom ones as numbers in a spec."""
 
+from enum import StrEnum
 from typing import Annotated, Self
 
 import numpy as np
@@ -26,6 +27,35 @@ Roughness = Annotated[Float, Field(ge=0.01, le=1)]
 Tint = Annotated[Float, Field(ge=0.05, le=1)]
 Pixels = Annotated[int, Strict(), Field(ge=16, le=16384), WHOLE]
 Row = tuple[Float, Float, Float]
+
+
+class Lighting(StrEnum):
+    """Named ranges that the lamp of a clip is drawn from.
+
+    Their order gives the codes of the label `lighting`: add new ones at the end.
+    """
+
+    drawn = "drawn"
+    held_out = "held-out"
+
+
+class Substrate(StrEnum):
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
+
+    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
+    the end.
+    """
+
+    matt = "matt"
+    aluminium = "aluminium"
+    aluminium_pet = "aluminium-pet"
+    ceramic = "ceramic"
+    rough_glass = "rough-glass"
+    smooth_glass = "smooth-glass"
+    polyester_mirror = "polyester-mirror"
+    stainless_steel = "stainless-steel"
+    cloth = "cloth"
+    any = "any"
 
 
 class _Ranges(Document):

@@ -5,7 +5,7 @@ import pytest
 from stickslip_blender.cloth.geometry import FLOOR
 from stickslip_blender.cloth.looks import LIGHTS, drawn_light, grained, look_of, looks
 from stickslip_blender.cloth.substrates import HARD, drawn_substrate, floor_factor, substrate_names
-from stickslip_schemas.kinds.cloth.names import Lighting, Substrate
+from stickslip_schemas.spec.appearance import Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.fabrics import Material
 

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from stickslip_schemas.kinds.cloth.names import Lighting, Substrate
 from stickslip_schemas.kinds.cloth.spec import ClothSpec, GroundTruth
-from stickslip_schemas.spec.appearance import CLIP_SIZE
+from stickslip_schemas.spec.appearance import CLIP_SIZE, Lighting, Substrate
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")

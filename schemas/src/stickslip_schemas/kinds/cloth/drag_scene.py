@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, VIEWPOINT, Custom, Lighting, LightingAxis, definitions
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, VIEWPOINT, Custom, LightingAxis, definitions
 from stickslip_schemas.kinds.cloth.spec import ClothSpec
-from stickslip_schemas.spec.appearance import LampNumbers
+from stickslip_schemas.spec.appearance import LampNumbers, Lighting
 from stickslip_schemas.spec.arrays import array
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, name_schema

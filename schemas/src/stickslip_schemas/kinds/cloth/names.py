@@ -9,39 +9,10 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import ArtifactRef, Sha256, referred
-from stickslip_schemas.spec.appearance import Calibration
+from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean, name_schema
 from stickslip_schemas.spec.jobs import JobSpec
-
-
-class Lighting(StrEnum):
-    """Named ranges that the lamp of a clip is drawn from.
-
-    Their order gives the codes of the label `lighting`: add new ones at the end.
-    """
-
-    drawn = "drawn"
-    held_out = "held-out"
-
-
-class Substrate(StrEnum):
-    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
-
-    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
-    the end.
-    """
-
-    matt = "matt"
-    aluminium = "aluminium"
-    aluminium_pet = "aluminium-pet"
-    ceramic = "ceramic"
-    rough_glass = "rough-glass"
-    smooth_glass = "smooth-glass"
-    polyester_mirror = "polyester-mirror"
-    stainless_steel = "stainless-steel"
-    cloth = "cloth"
-    any = "any"
 
 
 class ThreeViewpoint(StrEnum):

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 from stickslip_schemas.base.document import Bool, Document, Float, Int
 from stickslip_schemas.base.keys import ArtifactRef
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.names import Lighting, MaterialAxis, NamingSpec, Substrate
-from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, shown_frames
+from stickslip_schemas.kinds.cloth.names import MaterialAxis, NamingSpec
+from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate, shown_frames
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.spec.fabrics import FabricNumbers

@@ -1,0 +1,1 @@
+"""Scenes as data: what stands where, how it moves, what it looks like, and what may vary."""

@@ -1,0 +1,113 @@
+"""What of a scene is seen, and how: nothing here enters the key of a simulation."""
+
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from stickslip_schemas.base.document import Document, Float
+from stickslip_schemas.scene.motion import BY_NAME, FileName, Vector
+from stickslip_schemas.spec.appearance import (
+    CLIP_SIZE,
+    FARTHEST,
+    LOWEST,
+    FloorNumbers,
+    LampNumbers,
+    Lighting,
+    Share,
+    Substrate,
+)
+from stickslip_schemas.spec.cameras import Camera, rig_names
+from stickslip_schemas.spec.fabrics import CustomName, Texture, did_you_mean
+
+FILM = 36.0
+"""Width of the film that focal lengths refer to [mm]."""
+
+FRAMING = ("front", "side", "high")
+"""The cameras of a scene without cameras of its own: each frames all that moves in a sample."""
+
+
+class View(Document):
+    """A camera, by where it is and where it looks."""
+
+    position: Vector = Field(description="[m]")
+    target: Vector = Field(description="the point in the middle of the picture [m]")
+    focal_length: Float = Field(default=50.0, ge=10, le=400, description="for a film 36 mm wide [mm]")
+
+    @model_validator(mode="after")
+    def _sees(self) -> Self:
+        x, y, z = self.position
+        if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
+            raise ValueError(
+                f"position must be within {FARTHEST:g} m of the middle and {LOWEST:g} m or more above the floor, and "
+                f"it is {list(self.position)} m"
+            )
+        if float(np.linalg.norm(np.cross(self._forward, (0.0, 0.0, 1.0)))) < 1e-6:
+            raise ValueError(f"target must not be straight above or below position, and it is {list(self.target)} m")
+        return self
+
+    @property
+    def _forward(self) -> np.ndarray:
+        return np.subtract(self.target, self.position)
+
+    def camera(self, name: str) -> Camera:
+        """Return the calibrated camera: upright, with the principal point in the middle."""
+        forward = self._forward / np.linalg.norm(self._forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        focal, middle = self.focal_length / FILM * CLIP_SIZE, (CLIP_SIZE - 1) / 2
+        return Camera(
+            name=name,
+            width=CLIP_SIZE,
+            height=CLIP_SIZE,
+            fx=focal,
+            fy=focal,
+            cx=middle,
+            cy=middle,
+            rotation=rotation.tolist(),
+            translation=(-rotation @ np.asarray(self.position)).tolist(),
+        )
+
+
+class SheetLook(Document):
+    """What a sheet looks like where no axis says it."""
+
+    texture: FileName = Field(description="a built-in texture, or a square PNG or JPEG file")
+
+
+class BodyLook(Document):
+    """What a body looks like."""
+
+    color: tuple[Share, Share, Share] = Field(default=(0.5, 0.5, 0.5), description="linear red, green, blue, 0 to 1")
+    roughness: Share = Field(default=0.5, description="0 is a mirror")
+
+
+class Looks(Document):
+    """What is seen: textures, colours, cameras, light and floor."""
+
+    sheets: Annotated[dict[CustomName, SheetLook], BY_NAME] = Field(
+        default_factory=dict,
+        description="textures of their own; the first sheet (by name) without one takes the axis `texture`",
+    )
+    bodies: Annotated[dict[CustomName, BodyLook], BY_NAME] = Field(default_factory=dict)
+    cameras: str | Annotated[dict[CustomName, View], BY_NAME, Field(min_length=1, max_length=64)] | None = Field(
+        default=None, description="a rig by name, or cameras; null: front, side and high frame all that moves"
+    )
+    light: Lighting | LampNumbers = Field(default=Lighting.drawn, description="of the axis `lighting` by default")
+    floor: Substrate | FloorNumbers = Field(default=Substrate.matt, description="of the axis `substrate` by default")
+
+    @field_validator("cameras")
+    @classmethod
+    def _known_rig(cls, cameras: "str | dict[str, View] | None") -> "str | dict[str, View] | None":
+        if isinstance(cameras, str) and cameras not in rig_names():
+            raise ValueError(
+                f"cameras must be one of {', '.join(rig_names())}, or cameras by name"
+                f"{did_you_mean(cameras, rig_names())}"
+            )
+        return cameras
+
+    @property
+    def uses_picture(self) -> dict[str, str]:
+        """Textures that are files, by sheet."""
+        return {name: look.texture for name, look in self.sheets.items() if look.texture not in list(Texture)}

@@ -1,0 +1,170 @@
+"""What of a scene may vary: parameters, and paths into the document that they set."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Never
+
+from pydantic import BaseModel, Field, StringConstraints, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from stickslip_schemas.base.document import Document, Float
+from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
+
+Path = tuple[str | int, ...]
+"""A place in a document: names, and positions in lists."""
+
+ParameterName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
+
+Value = Float | CustomName
+"""What a parameter may be: a number, or the name of a fabric."""
+
+LOOKS_AXES = ("texture", "viewpoint", "lighting", "substrate")
+"""Axes that every scene has: no parameter may have their names."""
+
+_FIXED = ("duration", "end", "frame_rate", "spacing")
+"""Numbers that decide on the shapes of arrays."""
+
+
+class Parameter(Document):
+    """What may vary: one value, which is set at one or several places of the document.
+
+    The document itself has the default at these places.
+    """
+
+    unit: Annotated[str, StringConstraints(max_length=32)] = Field(default="1", description="of the numbers")
+    low: Float | None = Field(default=None, description="least number that it may be")
+    high: Float | None = Field(default=None, description="largest number that it may be")
+    values: tuple[Value, ...] | None = Field(default=None, min_length=1, description="all that it may be")
+    sets: tuple[Annotated[str, Field(min_length=1, max_length=300)], ...] = Field(min_length=1, max_length=64)
+    description: str = Field(default="", max_length=300, description="for people")
+
+    def check(self, scene: Any, name: str, document: Mapping[str, Any], taken: dict[Path, str]) -> None:
+        """Check a parameter of a scene, whose `document` is JSON; `taken` has the places of parameters before it."""
+        here: Path = ("parameters", name)
+        if name in LOOKS_AXES:
+            refuse(scene, here, f"must not have the name of an axis of all scenes: {', '.join(LOOKS_AXES)}", name)
+        defaults = []
+        for number, path in enumerate(self.sets):
+            place_here = (*here, "sets", number)
+            try:
+                place = found(document, path)
+            except LookupError as error:
+                refuse(scene, place_here, str(error.args[0]), path)
+            value = at(document, place)
+            is_number = isinstance(value, float) and not set(place) & {*_FIXED}
+            sized = (
+                place[0] == "sheets" and place[2] == "mesh" and document["sheets"][place[1]]["mesh"]["type"] != "grid"
+            )
+            if not ((is_number and not sized) or place[-1] == "material"):
+                rule = "must lead to a number or a material, and not to what decides on shapes of arrays or on files"
+                refuse(scene, place_here, rule, path)
+            if place in taken:
+                refuse(scene, place_here, f"must not lead where {taken[place]!r} does", path)
+            taken[place] = name
+            defaults.append(value)
+        if len(set(defaults)) > 1:
+            rule = "must find one value, the default, at all places"
+            refuse(scene, (*here, "sets"), f"{rule}; they have {', '.join(map(str, defaults))}", list(self.sets))
+        self._check_range(scene, here, defaults[0])
+
+    def _check_range(self, scene: Any, here: Path, default: Value) -> None:
+        ends = {"low": self.low, "high": self.high}
+        if isinstance(default, str) or self.values is not None:
+            for end, value in ends.items():
+                if value is not None:
+                    refuse(scene, (*here, end), "is for numbers without a list of values", value)
+            for number, value in enumerate(self.values or ()):
+                if type(value) is not type(default):
+                    kind = "name" if isinstance(default, str) else "number"
+                    refuse(scene, (*here, "values", number), f"must be a {kind}, as in the document", value)
+        elif self.low is None or self.high is None or not self.low < self.high:
+            refuse(scene, (*here, "low"), f"low and high [{self.unit}] must be given, low below high", self.low)
+        if not self.allows(default):
+            refuse(scene, (*here, "sets", 0), f"must lead to a default within {self.range}", default)
+
+    @property
+    def extremes(self) -> list[tuple[Path, Value]]:
+        """Values that stand for all others, each with its place in the parameter: rules of numbers are ranges."""
+        listed = [(("values", number), value) for number, value in enumerate(self.values or ())]
+        ends = [((name,), value) for name, value in (("low", self.low), ("high", self.high)) if value is not None]
+        return [*listed, *ends]
+
+    @property
+    def range(self) -> str:
+        """What it may be, in words."""
+        if self.values is not None:
+            return f"{', '.join(map(str, self.values))} [{self.unit}]"
+        return "all fabrics" if self.low is None else f"{self.low:g} to {self.high:g} [{self.unit}]"
+
+    def allows(self, value: Value) -> bool:
+        """Return whether it may have a value."""
+        if self.values is not None:
+            return value in self.values
+        if self.low is None or self.high is None:
+            return isinstance(value, str)
+        return isinstance(value, float | int) and self.low <= value <= self.high
+
+
+def _decides_on_shapes(document: Mapping[str, Any], place: Path) -> bool:
+    of_mesh = len(place) > 2 and (place[0], place[2]) == ("sheets", "mesh")
+    return bool({*_FIXED} & {*place}) or (of_mesh and at(document, place[:3])["type"] != "grid")
+
+
+def found(document: Mapping[str, Any], path: str) -> Path:
+    """Return the place that a dotted path leads to; `friction.A.B` finds the coefficient of two in any order.
+
+    Raises:
+        LookupError: It leads nowhere; the message says from where on.
+    """
+    words = path.split(".")
+    if words[0] == "friction" and len(words) == 3:
+        for number, pair in enumerate(document["friction"]):
+            if sorted(pair["between"]) == sorted(words[1:]):
+                return ("friction", number, "mu")
+        raise LookupError(f"must name two of `friction`, which has no pair of {words[1]} and {words[2]}")
+    here: Any = document
+    place: list[str | int] = []
+    for word in words:
+        step: str | int = int(word) if isinstance(here, list) and word.isdecimal() else word
+        known = range(len(here)) if isinstance(here, list) else list(here) if isinstance(here, dict) else []
+        if step not in known:
+            names = [str(name) for name in known]
+            where = ".".join(map(str, place)) or "the document"
+            raise LookupError(
+                f"must be a path into the document: {where} has no {word!r}{did_you_mean(word, names)}"
+                + (f"; it has {', '.join(names[:32])}" if names else "")
+            )
+        here = here[step]
+        place.append(step)
+    return tuple(place)
+
+
+def at(document: Any, place: Path) -> Any:
+    """Return what is at a place of a document."""
+    for step in place:
+        document = document[step]
+    return document
+
+
+def placed(document: Any, place: Path, value: Any) -> Any:
+    """Return a copy of a document with another value at a place."""
+    if not place:
+        return value
+    step, *rest = place
+    if isinstance(document, list):
+        return [placed(item, tuple(rest), value) if at == step else item for at, item in enumerate(document)]
+    return {**document, step: placed(document[step], tuple(rest), value)}
+
+
+def with_values(document: Any, values: Mapping[Path, Any]) -> Any:
+    """Return a copy of a document with other values at some places."""
+    for place, value in values.items():
+        document = placed(document, place, value)
+    return document
+
+
+def refuse(model: BaseModel, place: Path, rule: str, value: Any) -> Never:
+    """Raise a ValidationError that names a place in a document, the rule that it breaks, and its value."""
+    broken = PydanticCustomError("broken_rule", "{rule}", {"rule": rule})
+    raise ValidationError.from_exception_data(
+        type(model).__name__, [InitErrorDetails(type=broken, loc=place, input=value)]
+    )
