@@ -27,7 +27,7 @@ using namespace nb::literals;
 namespace {
 
 using Table = Eigen::Matrix<double, 6, 4, Eigen::RowMajor>;
-using BodyTuple = std::tuple<int, double, Eigen::Vector3d, Eigen::Vector3d, Eigen::Matrix3d>;
+using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d, Eigen::Matrix3d>;
 
 using FabricTuple = std::tuple<double, Table, Eigen::Matrix3d, double>;
 
@@ -41,7 +41,9 @@ struct DriveNow {
 
 std::vector<Body> bodies_of(const std::vector<BodyTuple>& tuples) {
   std::vector<Body> bodies;
-  for (const auto& [shape, mu, size, origin, rotation] : tuples) bodies.push_back({shape, mu, size, origin, rotation});
+  for (const auto& [shape, mu, core, radius, origin, rotation] : tuples) {
+    bodies.push_back({shape, mu, core, radius, origin, rotation});
+  }
   return bodies;
 }
 

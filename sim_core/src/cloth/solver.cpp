@@ -36,6 +36,9 @@ struct ClothSolver::Impl {
         controller(stepper, control, constants.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {
+    const std::vector<int> sheets = mesh.sheets();
+    stepper.sheets = 1 + *std::max_element(sheets.begin(), sheets.end());
+    for (int i = 0; i < numbering.free_nodes; ++i) newton.contact.sheet[i] = sheets[numbering.vertex[i]];
     if (touch) newton.pairs = contact_set_of(mesh, numbering, *touch, surfaces, constants);
     if (numbering.others > 0) {
       newton.contact.surfaces = smooth_contact_of(mesh, numbering, *touch, surfaces, constants.smooth);

@@ -178,6 +178,10 @@ void Stepper::check(double dt, const Drive& drive) {
   if (!started_) bodies_before_ = drive.bodies;
   started_ = true;
   if (bodies_before_.size() != drive.bodies.size()) refuse("bodies: must keep their number");
+  for (const Body& body : drive.bodies) {
+    if (body.mu.size() == 1 || static_cast<int>(body.mu.size()) == sheets) continue;
+    refuse(text("mu: of a body must be one or of ", sheets, " sheets, got ", body.mu.size()));
+  }
 }
 
 // In parts, each of which is a step halved some times: once more where it does not converge, and once less after one

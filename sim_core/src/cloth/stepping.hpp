@@ -25,6 +25,8 @@ class Stepper {
   Buffer<double> x, v;  // (nodes, 4), m, m/s
   Newton newton;
 
+  int sheets = 1;
+
   // `bodies`: where they are; without, they do not move in the next step.
   void restart(const std::vector<Body>& bodies);
   StepReport step(double dt, const Drive& drive);

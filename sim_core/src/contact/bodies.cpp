@@ -10,26 +10,17 @@ using Eigen::Vector3d;
 Gap gap_of(const Body& body, const Vector3d& x) {
   const Vector3d local = body.rotation.transpose() * (x - body.origin);
   if (body.shape == Body::plane) return {local.z(), body.rotation.col(2)};
-  if (body.shape == Body::sphere) {
-    const double r = local.norm();
-    return {r - body.size[0], r > 0.0 ? Vector3d(body.rotation * (local / r)) : Vector3d(body.rotation.col(2))};
-  }
-  if (body.shape == Body::cylinder) {
-    const Vector3d across(local.x(), local.y(), 0.0);
-    const double r = across.norm();
-    return {r - body.size[0], r > 0.0 ? Vector3d(body.rotation * (across / r)) : Vector3d(body.rotation.col(0))};
-  }
-  const Vector3d beyond = local.cwiseAbs() - body.size, outside = beyond.cwiseMax(0.0);
+  const Vector3d beyond = local.cwiseAbs() - body.core, outside = beyond.cwiseMax(0.0);
   const double r = outside.norm();
   Vector3d normal = Vector3d::Zero();
   if (r > 0.0) {
     for (int c = 0; c < 3; ++c) normal[c] = std::copysign(outside[c] / r, local[c]);
-    return {r, body.rotation * normal};
+    return {r - body.radius, body.rotation * normal};
   }
   int axis = 0;
   beyond.maxCoeff(&axis);
   normal[axis] = std::copysign(1.0, local[axis]);
-  return {beyond[axis], body.rotation * normal};
+  return {beyond[axis] - body.radius, body.rotation * normal};
 }
 
 Vector3d carried(const Body& begin, const Body& end, const Vector3d& x) {

@@ -2,17 +2,22 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <vector>
 
 namespace sim_core {
 
-// At the end of a step. Its own axes: a plane fills z < 0, a sphere has radius size[0], a box reaches from -size to
-// size, and a cylinder has radius size[0] and no ends along z.
+// At the end of a step. In its own axes a plane fills z < 0; a rounded body has all points within `radius` of a core,
+// the box from -core to core: a point of a sphere, a line without ends of a cylinder.
 struct Body {
-  enum Shape : int { plane = 0, sphere = 1, box = 2, cylinder = 3 };
+  enum Shape : int { plane = 0, rounded = 1 };
   int shape;
-  double mu;
-  Eigen::Vector3d size, origin;  // m
+  std::vector<double> mu;  // one, or one of each sheet
+  Eigen::Vector3d core;    // m: 0 ... infinity
+  double radius;           // m
+  Eigen::Vector3d origin;  // m
   Eigen::Matrix3d rotation;
+
+  double mu_of(int sheet) const { return mu.size() == 1 ? mu[0] : mu[sheet]; }
 };
 
 // Signed distance of a point from a body [m], negative inside, and the outward normal there.

@@ -25,6 +25,7 @@ void Norms::count(double force_squared) {
 ContactState::ContactState(int free_nodes, const NodeSettings& settings, double law_stiffness)
     : mode(free_nodes, contact_open),
       touched(free_nodes, -1),
+      sheet(free_nodes, 0),
       stiffness(free_nodes, 0.0),
       normal(4 * free_nodes + 64, 0.0f),
       direction(4 * free_nodes + 64, 0.0f),
@@ -142,7 +143,7 @@ ContactKinematics ContactState::kinematics(int node, int body, const Gap& gap, c
   const bool is_body = body < static_cast<int>(at_end.size());
   Vector3d u = is_body ? Vector3d(p - carried(at_start[body], at_end[body], before)) : surfaces->slip(node, before, p);
   u -= u.dot(gap.normal) * gap.normal;
-  const double mu_here = is_body ? at_end[body].mu : surfaces->mu(node);
+  const double mu_here = is_body ? at_end[body].mu_of(sheet[node]) : surfaces->mu(node);
   return {gap.distance, gap.normal, u, at_node(residual, node), mu_here, stiffness[node]};
 }
 

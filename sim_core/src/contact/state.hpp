@@ -27,6 +27,7 @@ class ContactState {
   explicit ContactState(int free_nodes, const NodeSettings& settings = {}, double law_stiffness = 0.1);
 
   std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
+  std::vector<int> sheet;          // (free nodes): to which they belong
   std::vector<double> stiffness;   // (free nodes): k of the law, N/m
   Buffer<float> normal, direction, mu, turning;
   Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import Body, Cloth, box, fabric, isotropic, plane, preset_named, sphere
+from stickslip_sim_core import Body, Cloth, box, capsule, fabric, isotropic, plane, preset_named, sphere
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.solver import GRAVITY
@@ -84,6 +84,19 @@ class TestFriction:
         assert second.positions @ slope == pytest.approx(first.positions, abs=1e-5)
         assert (first.positions - lying)[:, 0].min() > 0.01
 
+    def test_each_sheet_has_its_own(self) -> None:
+        """Two sheets slide on one floor, each as far as its own friction lets it."""
+        patch = meshes.grid(0.05, 0.05, 4, 4)
+        cloth = Cloth(meshes.together(patch, patch), [MATERIAL, MATERIAL], preset_named("certified"))
+        at = np.column_stack([patch.rest, np.zeros(len(patch.rest))])
+        start = np.concatenate([at, at + np.array([0.0, 0.1, 0.0])])
+        cloth.set_state(start, np.tile([1.0, 0.0, 0.0], (len(start), 1)))
+        for _ in range(500):
+            cloth.step(0.001, bodies=[plane([0.5, 1.0])])
+        way = np.split((cloth.positions - start)[:, 0], 2)
+        assert way[0] == pytest.approx(1.0 / (2.0 * 0.5 * GRAVITY), rel=0.02)
+        assert way[1] == pytest.approx(1.0 / (2.0 * 1.0 * GRAVITY), rel=0.02)
+
     def test_each_body_has_its_own(self) -> None:
         """A box is pulled from under a patch: a rough one takes it along, a smooth one does not, whatever the floor."""
         rough, smooth = laid(meshes.grid(0.05, 0.05, 4, 4)), laid(meshes.grid(0.05, 0.05, 4, 4))
@@ -112,10 +125,8 @@ class TestBodies:
         local = body.rotation.T @ (p - body.origin)
         if body.shape == 0:
             return float(local[2])
-        if body.shape == 1:
-            return float(np.linalg.norm(local) - body.size[0])
-        beyond = np.abs(local) - np.array(body.size)
-        return float(np.linalg.norm(np.maximum(beyond, 0.0)) + min(beyond.max(), 0.0))
+        beyond = np.abs(local) - np.array(body.core)
+        return float(np.linalg.norm(np.maximum(beyond, 0.0)) + min(beyond.max(), 0.0) - body.radius)
 
     def test_sphere_carries(self) -> None:
         cloth = self.fall([plane(0.5), sphere(0.5, 0.05)])
@@ -263,6 +274,17 @@ class TestRefusals:
             box(0.1, (1.0, 0.0, 1.0))
         with pytest.raises(ValueError, match="size: must be three finite lengths > 0"):
             box(0.1, (1.0, 1.0))
+        with pytest.raises(ValueError, match=r"rounding: must be at most half the shortest edge, 0\.01 m, got 0\.02"):
+            box(0.1, (1.0, 1.0, 0.02), rounding=0.02)
+        with pytest.raises(ValueError, match="length: must be finite and > 0, got 0"):
+            capsule(0.1, 0.01, 0.0)
+
+    def test_friction_of_each_sheet(self) -> None:
+        cloth = laid()
+        with pytest.raises(ValueError, match="mu: of a body must be one or of 1 sheets, got 2"):
+            cloth.step(0.02, bodies=[plane([0.1, 0.2])])
+        with pytest.raises(ValueError, match="one or one a sheet"):
+            plane([[0.1]])
 
     @pytest.mark.parametrize(
         ("rest", "triangles", "message"),

@@ -1,4 +1,4 @@
-"""Rigid bodies that cloth touches: planes, spheres, cylinders and boxes."""
+"""Rigid bodies that cloth touches: planes, spheres, cylinders, capsules and boxes with rounded edges."""
 
 from dataclasses import dataclass, field
 
@@ -11,26 +11,35 @@ MU_MAX = 10.0
 """Largest coefficient of friction."""
 
 
-BodyTuple = tuple[int, float, Floats, Floats, Floats]
+ROUNDING = 5e-3
+"""Default radius of the edges of a box [m]; of a box thinner than two of these, half its shortest edge. Cells of up to
+twice the radius slide over such an edge."""
+
+
+BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats]
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body. In its own axes a plane fills z < 0; the others are centred on their origin, and z is the axis of a
-    cylinder.
+    """A rigid body: a half-space, or all points within a radius of a core.
+
+    The core is a box about the origin: a point of a sphere, a segment of a capsule, an endless line of a cylinder.
 
     Raises:
         ValueError: `mu` is out of range.
     """
 
-    mu: float
-    """Coefficient of friction, 0 ... 10."""
+    mu: float | ArrayLike
+    """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,)."""
 
     shape: int = 0
-    """0 plane, 1 sphere, 2 box, 3 cylinder: `contact::Shape` of the core."""
+    """0 plane, which fills z < 0 in its own axes; 1 rounded: `Body::Shape` of the core."""
 
-    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Radius of a sphere or cylinder, or half edges of a box [m]."""
+    core: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Half edges of the core along the body's own axes [m], 0 or more; inf along the axis of an endless cylinder."""
+
+    radius: float = 0.0
+    """Distance of the body's face from its core [m]."""
 
     origin: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) [m]"""
@@ -39,8 +48,9 @@ class Body:
     """(3, 3): columns are the axes of the body in the world."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.mu <= MU_MAX:
-            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {self.mu}")
+        mu = np.asarray(self.mu, float)
+        if mu.ndim > 1 or not mu.size or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
+            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
 
     @property
     def pose(self) -> Floats:
@@ -51,14 +61,15 @@ class Body:
         """Return the arguments of the C++ core."""
         return (
             self.shape,
-            self.mu,
-            np.array(self.size),
+            np.atleast_1d(np.asarray(self.mu, float)).tolist(),
+            np.array(self.core),
+            self.radius,
             np.asarray(self.origin, float),
             np.asarray(self.rotation, float),
         )
 
 
-def plane(mu: float, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
+def plane(mu: float | ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
     """Return the half-space below a plane."""
     n = np.asarray(normal, float)
     n = n / np.linalg.norm(n)
@@ -68,34 +79,72 @@ def plane(mu: float, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike =
     return Body(mu, 0, origin=np.asarray(origin, float), rotation=np.stack([t, np.cross(n, t), n], axis=1))
 
 
-def sphere(mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:
+def sphere(
+    mu: float | ArrayLike, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
+) -> Body:
     """Return a ball. Cloth that sticks to it turns with it as its rotation (3, 3) changes from step to step."""
-    return _placed(mu, 1, _radius(radius), origin, rotation)
+    return _rounded(mu, (0.0, 0.0, 0.0), _length("radius", radius), origin, rotation)
 
 
 def cylinder(
-    mu: float, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
+    mu: float | ArrayLike, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
 ) -> Body:
     """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
-    return _placed(mu, 3, _radius(radius), origin, rotation)
+    return _rounded(mu, (0.0, 0.0, np.inf), _length("radius", radius), origin, rotation)
 
 
-def box(mu: float, size: ArrayLike, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None) -> Body:
-    """Return a box with edges of `size` (3,) [m]."""
-    half = 0.5 * np.asarray(size, float)
-    if half.shape != (3,) or not (np.isfinite(half).all() and (half > 0.0).all()):
+def capsule(
+    mu: float | ArrayLike,
+    radius: float,
+    length: float,
+    *,
+    origin: ArrayLike = (0.0, 0.0, 0.0),
+    rotation: ArrayLike | None = None,
+) -> Body:
+    """Return a cylinder with half balls as ends, along the last column of its rotation (3, 3).
+
+    Args:
+        mu: Coefficient of friction, or one for each sheet.
+        radius: Of the cylinder and its ends [m].
+        length: Of the cylinder between the two half balls [m].
+        origin: Its middle (3,) [m].
+        rotation: Its axes in the world (3, 3).
+    """
+    return _rounded(mu, (0.0, 0.0, 0.5 * _length("length", length)), _length("radius", radius), origin, rotation)
+
+
+def box(
+    mu: float | ArrayLike,
+    size: ArrayLike,
+    *,
+    rounding: float | None = None,
+    origin: ArrayLike = (0.0, 0.0, 0.0),
+    rotation: ArrayLike | None = None,
+) -> Body:
+    """Return a box with edges of `size` (3,) [m], rounded with a radius [m]; None: 5 mm, or less for a thin box."""
+    whole = np.asarray(size, float)
+    if whole.shape != (3,) or not (np.isfinite(whole).all() and (whole > 0.0).all()):
         raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
-    return _placed(mu, 2, (half[0], half[1], half[2]), origin, rotation)
+    half = 0.5 * float(whole.min())
+    radius = min(ROUNDING, half) if rounding is None else _length("rounding", rounding)
+    if radius > half:
+        raise ValueError(f"rounding: must be at most half the shortest edge, {half:g} m, got {radius:g}")
+    a, b, c = (0.5 * whole - radius).tolist()
+    return _rounded(mu, (a, b, c), radius, origin, rotation)
 
 
-def _radius(radius: float) -> tuple[float, float, float]:
-    if not (np.isfinite(radius) and radius > 0.0):
-        raise ValueError(f"radius: must be finite and > 0, got {radius}")
-    return radius, 0.0, 0.0
+def _length(name: str, value: float) -> float:
+    if not (np.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name}: must be finite and > 0, got {value}")
+    return value
 
 
-def _placed(
-    mu: float, shape: int, size: tuple[float, float, float], origin: ArrayLike, rotation: ArrayLike | None
+def _rounded(
+    mu: float | ArrayLike,
+    core: tuple[float, float, float],
+    radius: float,
+    origin: ArrayLike,
+    rotation: ArrayLike | None,
 ) -> Body:
     turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return Body(mu, shape, size, np.asarray(origin, float), turn)
+    return Body(mu, 1, core, radius, np.asarray(origin, float), turn)
