@@ -28,6 +28,7 @@ def test_exported_names() -> None:
         "SolverSettings",
         "Surface",
         "box",
+        "capsule",
         "build_info",
         "cylinder",
         "fabric",
