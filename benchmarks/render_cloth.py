@@ -82,7 +82,9 @@ class Bench:
             self.track = file["track"].astype(np.float64)
             self.renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
         self.look = look_of(MATERIAL)
-        self.pictures = {texture: grained(texture_image(texture), self.look) for texture in TEXTURES}
+        self.pictures = {
+            texture: grained(texture_image(texture), self.look, self.renderer.geometry.surface) for texture in TEXTURES
+        }
         self.textures = Textures(list(self.pictures.values()))
         self.geometry, self.scene = self.renderer.geometry, self.renderer.scene
         self.geometry.surface.dress(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)

@@ -84,6 +84,11 @@ class Camera(Document):
         v = self.fy * x[..., 1] * inverse + self.cy
         return np.stack([u, v], axis=-1), depth
 
+    @property
+    def numbers(self) -> list[float]:
+        """The numbers of the label: fx, fy, cx, cy, R by rows, t."""
+        return [self.fx, self.fy, self.cx, self.cy, *(v for row in self.rotation for v in row), *self.translation]
+
     def overflow(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> float:
         """Measure by how much balls of a radius [scene units] about points (..., 3) leave the frame [px].
 
@@ -100,6 +105,49 @@ class Camera(Document):
     def in_frame(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> bool:
         """Say whether balls of a radius [scene units] about points (..., 3) lie wholly in the frame."""
         return self.overflow(points, radius, margin) <= 0.0
+
+
+FRAMING = {"front": (-90.0, 15.0), "side": (-20.0, 25.0), "high": (-60.0, 50.0)}
+"""Azimuth, seen from what it frames, from +x towards +y, and elevation of each camera that frames [degree]."""
+
+_FRAMED_FOCAL = 560.0  # [px] at 224 pixels: a lens of 90 mm, as the rigs have
+_FRAMED_MARGIN = 10.0  # [px] at 224 pixels
+
+
+def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) -> Camera:
+    """Return the upright camera nearest to points (n, 3) [scene units] that has all of them in its square frame.
+
+    A point (X, Y, Z) in the camera's directions is in the frame where |X + t_x| <= k (Z + t_z), and the same of Y, so
+    t_z is the larger of (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of Y, and t_x centres the points.
+
+    Args:
+        name: One of `FRAMING`.
+        points: What is to be seen, all of the time.
+        size: Width and height of the frame [px].
+        turn: By which it goes around the points, from +x towards +y [degree].
+    """
+    a, e = np.radians(FRAMING[name]) + np.array([np.radians(turn), 0.0])
+    forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    R = np.stack([right, np.cross(forward, right), forward])
+    x, y, z = R @ np.asarray(points, dtype=np.float64).reshape(-1, 3).T
+    scale = size / 224.0
+    focal = _FRAMED_FOCAL * scale
+    k = (size / 2.0 - 0.5 - _FRAMED_MARGIN * scale) / focal
+    (left, right_), (top, bottom) = (((-w - k * z).max(), (w - k * z).max()) for w in (x, y))
+    t = ((left - right_) / 2.0, (top - bottom) / 2.0, max(left + right_, top + bottom) / (2.0 * k))
+    middle = (size - 1) / 2.0
+    return Camera(
+        name=name,
+        width=size,
+        height=size,
+        fx=focal,
+        fy=focal,
+        cx=middle,
+        cy=middle,
+        rotation=R.tolist(),
+        translation=t,
+    )
 
 
 class _Rig(Document):

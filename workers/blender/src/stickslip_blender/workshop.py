@@ -99,18 +99,17 @@ class Workshop:
     def _shading_path(self, key: str) -> Path | None:
         return None if self.store.cache is None else self.store.cache / "shadings" / key
 
-    def record(self, record: RecordRef, *names: str) -> list[Array]:
-        """Return one row of arrays of an artifact."""
+    def record(self, record: RecordRef) -> dict[str, Array]:
+        """Return one row of all arrays of an artifact, by name."""
         digest, arrays = self._records
-        arrays = arrays if digest == record.digest else {}
-        if missing := [name for name in names if name not in arrays]:
+        if digest != record.digest:
             with np.load(io.BytesIO(self.store.read(record.digest)), allow_pickle=False) as file:
-                arrays = arrays | {name: file[name] for name in missing}
+                arrays = dict(file)
             self._records = record.digest, arrays
-        rows = len(arrays[names[0]])
+        rows = len(next(iter(arrays.values())))
         if record.row >= rows:
             raise ValueError(f"record.row must be below {rows}, the rows of {record.digest}; got {record.row}")
-        return [arrays[name][record.row] for name in names]
+        return {name: values[record.row] for name, values in arrays.items()}
 
     def renderer(self, scene: object, build: Callable[[], R]) -> R:
         """Return the renderer of a scene: the last one if it fits, or a new one in its place."""
@@ -151,11 +150,12 @@ def check_rig(render: Render) -> None:
 def why_unfit(what: str, points: Array, radius: float, cameras: tuple[Camera, ...]) -> TaskResult | None:
     """Return the rejection of points (..., 3) that are not finite or leave the frame of a camera, or None."""
     if not np.isfinite(points).all():
-        return _rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
+        return rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
     overflow = {camera.name: camera.overflow(points, radius, FRAME_MARGIN) for camera in cameras}
     outside = [f"the {what} leaves view {name} by {excess:.1f} px" for name, excess in overflow.items() if excess > 0.0]
-    return _rejected(Reason.out_of_frame, "; ".join(outside)) if outside else None
+    return rejected(Reason.out_of_frame, "; ".join(outside)) if outside else None
 
 
-def _rejected(reason: Reason, message: str) -> TaskResult:
+def rejected(reason: Reason, message: str) -> TaskResult:
+    """Return the rejection of a sample."""
     return TaskResult(outcome="rejected", reason=reason, message=message)

@@ -5,15 +5,15 @@ from typing import Any
 
 import numpy as np
 from stickslip_blender.cloth import ground_truth as module
-from stickslip_blender.cloth.geometry import FLOOR, Geometry, Holders
-from stickslip_blender.cloth.ground_truth import CLOTH, GROUND, PROP, ground_truth
+from stickslip_blender.cloth.geometry import BACKGROUND, CLOTH, FLOOR, GROUND, PROP, Geometry, Holders
+from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_schemas.kinds.cloth.arrays import SEGMENTS
 from stickslip_schemas.kinds.cloth.spec import GroundTruth
 from stickslip_schemas.spec.cameras import load_rig
 
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:
-    codes = (module.BACKGROUND, module.GROUND, module.CLOTH, module.PROP)
+    codes = (BACKGROUND, GROUND, CLOTH, PROP)
     assert dict(zip(SEGMENTS, codes, strict=True)) == {"background": 0, "floor": 1, "cloth": 2, "prop": 3}
     assert set(module.GroundTruth.__annotations__) == set(GroundTruth)
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from stickslip_blender.cloth.geometry import Geometry, Holders
-from stickslip_blender.cloth.ground_truth import CLOTH, GROUND, PROP, ground_truth
+from stickslip_blender.cloth.geometry import CLOTH, GROUND, PROP, Geometry, Holders
+from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.shading import Composer
 from stickslip_blender.scenes.cloth_sphere import Ball
 from stickslip_blender.scenes.shawl import SUNK, Figure

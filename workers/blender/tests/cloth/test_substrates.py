@@ -1,10 +1,13 @@
 """Floors and lamps keep within their ranges, and a seed says which."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from stickslip_blender.cloth.geometry import FLOOR
 from stickslip_blender.cloth.looks import LIGHTS, drawn_light, grained, look_of, looks
 from stickslip_blender.cloth.substrates import HARD, drawn_substrate, floor_factor, substrate_names
+from stickslip_blender.cloth.surface import Surface
 from stickslip_schemas.spec.appearance import Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.fabrics import Material
@@ -48,9 +51,10 @@ def test_marks_lie_still_on_the_floor() -> None:
     assert np.corrcoef(seen)[0, 1] > 0.7  # a pixel apart at most
 
 
-def test_fabrics_differ_in_their_grain() -> None:
+def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
+    surface = Surface(sheet.triangles, sheet.rest)
     white = np.full((256, 256, 3), 200, dtype=np.uint8)
-    prints = {material: grained(white, look_of(material)) for material in looks()}
+    prints = {material: grained(white, look_of(material), surface) for material in looks()}
     assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
     assert prints["11oz-black-denim"].std() > 4 * prints["camel-ponte-roma"][20:-20, 20:-20].std()
     for picture in prints.values():

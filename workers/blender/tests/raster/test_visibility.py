@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.raster import GRID, Textures, Window, _raster, projected, see, see_albedo, window_about
 from stickslip_blender.raster.visibility import barycentric
+from stickslip_schemas.spec.cameras import load_rig
 from stickslip_testing.cameras import looking_at
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
@@ -135,10 +136,17 @@ def test_values_at_centers_are_interpolated_in_perspective() -> None:
     np.testing.assert_allclose(depth, found[:, 3], atol=1e-9)
 
 
+def test_a_triangle_that_reaches_behind_the_camera_is_not_seen() -> None:
+    points, triangles, _ = _soup(2)
+    window = Window(0, 0, 64, 64)
+    behind = see(np.where(np.arange(6)[:, None] == 4, -1.0, points), triangles, window).triangle
+    alone = see(points[:3], triangles[:1], window).triangle
+    np.testing.assert_array_equal(behind, alone)
+    assert window_about(np.full((3, 3), np.nan), load_rig("drag")[0]).is_empty
+
+
 def test_what_cannot_be_drawn_is_refused() -> None:
     points, triangles, _ = _soup(2)
-    with pytest.raises(ValueError, match="depth must be above 0, and is not at point 4"):
-        see(np.where(np.arange(6)[:, None] == 4, -1.0, points), triangles, Window(0, 0, 4, 4))
     with pytest.raises(ValueError, match="indices must be from 0 to 5"):
         see(points, triangles + 1, Window(0, 0, 4, 4))
     with pytest.raises(ValueError, match="must be pictures of one shape"):

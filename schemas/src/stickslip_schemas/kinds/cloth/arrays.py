@@ -1,6 +1,6 @@
 """Arrays that the datasets of the kinds of cloth have in common."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,11 @@ KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
 
 SEGMENTS = ("background", "floor", "cloth", "prop")
 """Names of the codes of the array `segmentation`: add new ones at the end."""
+
+
+def scene_segments(sheets: Iterable[str], bodies: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the codes of the array `segmentation` of a scene."""
+    return ("background", *sheets, *bodies, "holders")
 
 
 def codes(name: str, names: tuple[str, ...]) -> ArrayLayout:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import content_key, referred
+from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, encode_chunk
 from stickslip_schemas.format.pictures import moving
@@ -21,7 +22,7 @@ from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.spec.fabrics import Texture
 
 from stickslip_blender.build import build_digest
-from stickslip_blender.cloth.geometry import FLOOR, Geometry, Surroundings
+from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
 from stickslip_blender.cloth.scene import ClothScene, Shot
@@ -30,7 +31,7 @@ from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
 from stickslip_blender.raster import Textures
-from stickslip_blender.workshop import Workshop, why_unfit
+from stickslip_blender.workshop import Workshop, rejected, why_unfit
 
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask
@@ -94,7 +95,12 @@ class ClothRenderer:
         substrate = drawn_substrate(look.substrate, look.light_seed, look.finish)
         self.scene.set_up(camera, light, substrate, fabric)
         shots = [self.scene.shot(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
-        floor = floor_factor(substrate, camera, FLOOR)
+        height = self.geometry.surroundings.floor
+        floor = (
+            np.ones((camera.height, camera.width, 3), dtype=np.float32)
+            if height is None
+            else floor_factor(substrate, camera, height)
+        )
         chosen = CLOTH_SAMPLING[look.quality] if sampling is None else sampling
         labels = {
             "light_seed": look.light_seed,
@@ -127,7 +133,7 @@ class ClipRenderer:
         return Shading(light, self._gate(self.shots[middle], light[middle]))
 
     def _gate(self, shot: Shot, light: npt.NDArray[np.float16]) -> float:
-        picture = grained(texture_image(GATE_TEXTURE), self.fabric)
+        picture = grained(texture_image(GATE_TEXTURE), self.fabric, self.scene.geometry.surface)
         window = self.scene.window(shot)
         whole = np.zeros(light.shape, dtype=np.float16)
         whole[window.slices] = self.scene.direct(
@@ -143,7 +149,7 @@ class ClipRenderer:
 
         Textures: pictures as `texture_image` returns them; clips: shape (textures, frames, height, width, 3).
         """
-        pictures = [grained(texture, self.fabric) for texture in textures]
+        pictures = [grained(texture, self.fabric, self.scene.geometry.surface) for texture in textures]
         packed = Textures(pictures)
         camera = self.camera
         videos = np.empty((len(pictures), len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
@@ -200,25 +206,35 @@ def render_clips(
     workshop: Workshop,
     make: Callable[[Any], Surroundings],
     *,
-    surroundings_key: object = None,
+    sheet: str = "",
+    frame: Callable[[Geometry], Camera] | None = None,
 ) -> TaskResult:
     """Render the clips of a task on the scene that `make` makes of a rest shape.
 
-    `surroundings_key` says what else the scene depends on.
+    `sheet` is before the names of the cloth's arrays. `frame` makes the camera of a scene that has no other, and the
+    camera is then a label.
     """
-    camera = look.camera or next(camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
-    track, rest, triangles = workshop.record(task.record, "positions", "rest", "triangles")
-    if rejected := why_unfit("cloth", track, 0.0, (camera,)):
-        return rejected
+    record = workshop.record(task.record)
+    track, rest, triangles = (record[f"{sheet}{name}"] for name in ("positions", "rest", "triangles"))
+    if not np.isfinite(track).all():
+        return rejected(Reason.invalid_sample, "the cloth has positions that are not finite")
     renderer = workshop.renderer(
-        (look.kind, surroundings_key, triangles.tobytes(), rest.tobytes()),
+        (look.kind, None if make is Holders else task.record, triangles.tobytes(), rest.tobytes()),
         lambda: ClothRenderer(triangles, rest, make, workshop.scratch),
     )
+    camera = look.camera or (
+        frame(renderer.geometry)
+        if frame
+        else next(camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
+    )
+    if unfit := why_unfit("cloth", track, 0.0, (camera,)):
+        return unfit
     clip = renderer.clip(look, camera, track[list(look.instants)])
     shading = _shading(clip, look, task, workshop)
     known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}
     wanted = task.textures or (look.variant,)
-    videos, labels = clip.clips(shading, [_picture(name, workshop) for name in wanted])
+    videos, labels = clip.clips(shading, [picture(name, workshop) for name in wanted])
+    labels |= {"camera": camera.numbers} if frame else {}
     if not task.textures:
         preview = workshop.store.publish(moving(videos[0], side=_PREVIEW_SIDE)) if task.preview else None
         chunks = {"video": workshop.clip(videos[0]), **known}
@@ -237,7 +253,7 @@ def render_clips(
     return TaskResult(outcome="succeeded", output=output)
 
 
-def _picture(texture: str, workshop: Workshop) -> Clip:
+def picture(texture: str, workshop: Workshop) -> Clip:
     """Return the picture of a texture that is built in, or that a user has put into the store."""
     digest = referred(texture)
     return texture_image(Texture(texture)) if digest is None else custom_texture(workshop.store.read(digest))

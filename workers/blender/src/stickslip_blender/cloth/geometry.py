@@ -1,26 +1,43 @@
-"""The triangles of a scene of cloth: the refined cloth, and props.
+"""The triangles of a scene of cloth: the refined cloth, and props, which may be further sheets of cloth.
 
-The scene in Blender and the rasteriser are built from the same triangles.
+The scene in Blender and the rasteriser are built from the same triangles. Cycles sees all props grey, so that the light
+of the cloth stays a function of its albedo alone; the composer lays their colours on top, as it does with the floor's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_blender.cloth.surface import Surface
-from stickslip_blender.raster import fans
+from stickslip_blender.cloth.looks import Look
+from stickslip_blender.cloth.shapes import Faces, box
+from stickslip_blender.cloth.surface import surface
+from stickslip_blender.raster import Textures, decoded, fans
+
+BACKGROUND, GROUND, CLOTH, PROP = range(4)
+"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.arrays.SEGMENTS`."""
 
 FLOOR = -0.0005
 """Height at which the floor is seen [m]: half a thickness below the middle surface of a cloth that lies on it."""
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
-Faces = list[tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Print:
+    """What makes a prop a sheet of cloth."""
+
+    uv: Array
+    """Texture coordinates in [0, 1] of its vertices, shape (n, 2)."""
+    picture: npt.NDArray[np.uint8]
+    """With the grain of the fabric, 8-bit sRGB, shape (size, size, 3)."""
+    look: Look
 
 
 @dataclass(frozen=True)
@@ -32,23 +49,58 @@ class Prop:
     """In its own axes, shape (n, 3) [m]."""
     faces: Faces
     """Convex polygons."""
-    color: tuple[float, float, float]
-    """Linear."""
+    colors: Array
+    """Linear, of each face (n, 3) or of all (1, 3); a sheet's is that of its picture."""
     roughness: float
     is_smooth: bool = False
-    """Whether its faces are shaded as one smooth skin."""
+    """Whether its faces are shaded as one smooth skin, but for edges sharper than `cycles.objects.SHARP`."""
+    segment: int = PROP
+    """Its code in the segmentation."""
+    sheet: Print | None = None
+
+    @cached_property
+    def grey(self) -> float:
+        """The albedo that Cycles sees: the mean of its colours."""
+        given = self.colors if self.sheet is None else decoded(self.sheet.picture)
+        return max(float(given.mean()), 0.01)
+
+    @property
+    def tints(self) -> npt.NDArray[np.float32]:
+        """Colours over `grey` of each triangle (T, 3); 0 of a sheet, whose colour is in its picture."""
+        corners = [len(face) - 2 for face in self.faces]
+        if self.sheet is not None:
+            return np.zeros((sum(corners), 3), dtype=np.float32)
+        each = np.broadcast_to(self.colors / self.grey, (len(corners), 3))
+        return np.repeat(each, corners, axis=0).astype(np.float32)
 
 
 class Surroundings(Protocol):
     """The props of a scene, and where they are."""
 
     props: tuple[Prop, ...]
+    """Sheets of cloth first."""
+    floor: float | None
+    """Height at which the floor is seen [m]; None: there is none."""
+    ground: int
+    """Code of the floor in the segmentation."""
+    segment: int
+    """Code of the cloth in the segmentation."""
 
     def placed(self, instant: int, vertices: Array) -> list[Array]:
         """Return the vertices of each prop (n, 3) [m] at an instant, with the cloth at vertices (V, 3) [m]."""
 
     def aim(self, instant: int, vertices: Array) -> Array:
         """Return the point that the lamp follows (3,) [m]."""
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A sheet of cloth among the props, as the rasteriser looks its colour up."""
+
+    triangles: slice
+    """Among those of all props."""
+    textures: Textures
+    grey: float
 
 
 class Geometry:
@@ -59,20 +111,42 @@ class Geometry:
     cloth_triangles: int
     """How many of them are the cloth's."""
     uv: Array
-    """Texture coordinates of all vertices; those of the props are 0."""
+    """Texture coordinates of all vertices; 0 of what is no sheet."""
+    segments: npt.NDArray[np.uint8]
+    """Code of each triangle in the segmentation, shape (T,)."""
+    has_uv: npt.NDArray[np.bool_]
+    """Whether each triangle is cloth, shape (T,)."""
+    is_flat: npt.NDArray[np.bool_]
+    """Whether each triangle is shaded flat, shape (T,)."""
+    tints: npt.NDArray[np.float32]
+    """Of each triangle of the props, and a row of zeros at the end, shape (T' + 1, 3)."""
+    printed: tuple[Printed, ...]
+    """The sheets among the props."""
 
     def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike, surroundings: Surroundings) -> None:
         """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]."""
         self.vertices = len(np.asarray(rest))
         self.surroundings = surroundings
-        self.surface = Surface(triangles, rest)
+        self.surface = surface(triangles, rest)
         self.cloth_vertices, self.cloth_triangles = len(self.surface.uv), len(self.surface.triangles)
-        count, parts = self.cloth_vertices, [self.surface.triangles]
-        for prop in surroundings.props:
-            parts.append(fans(prop.faces) + count)
-            count += len(prop.vertices)
+        props = surroundings.props
+        sizes = np.cumsum([self.cloth_vertices, *(len(prop.vertices) for prop in props)])
+        parts = [self.surface.triangles, *(fans(p.faces) + first for p, first in zip(props, sizes[:-1], strict=True))]
         self.triangles = np.ascontiguousarray(np.concatenate(parts), dtype=np.int32)
-        self.uv = np.concatenate([self.surface.uv, np.zeros((count - self.cloth_vertices, 2))])
+        counts = [len(part) for part in parts]
+        self.uv = np.concatenate(
+            [self.surface.uv, *(np.zeros((len(p.vertices), 2)) if p.sheet is None else p.sheet.uv for p in props)]
+        )
+        self.segments = np.repeat([surroundings.segment, *(p.segment for p in props)], counts).astype(np.uint8)
+        self.has_uv = np.repeat([True, *(p.sheet is not None for p in props)], counts)
+        self.is_flat = np.repeat([False, *(not p.is_smooth for p in props)], counts)
+        self.tints = np.concatenate([*(p.tints for p in props), np.zeros((1, 3), dtype=np.float32)])
+        ends = np.cumsum([0, *counts[1:]])
+        self.printed = tuple(
+            Printed(slice(begin, end), Textures([prop.sheet.picture]), prop.grey)
+            for prop, (begin, end) in zip(props, pairwise(ends.tolist()), strict=True)
+            if prop.sheet is not None
+        )
 
     def points(self, positions: npt.ArrayLike, instant: int) -> Array:
         """Return all vertices, shape (V, 3) [m], of the solver's positions (V', 3) [m] at an instant."""
@@ -94,29 +168,26 @@ class Geometry:
         return track
 
 
-def mirrored(points: Array) -> Array:
-    """Return points as the floor mirrors them."""
+def mirrored(points: Array, floor: float) -> Array:
+    """Return points as a floor at a height mirrors them [m]."""
     image = points.copy()
-    image[:, 2] = 2.0 * FLOOR - image[:, 2]
+    image[:, 2] = 2.0 * floor - image[:, 2]
     return image
-
-
-def box(size: tuple[float, float, float], center: tuple[float, float, float]) -> tuple[Array, Faces]:
-    """Return the corners and faces of a box."""
-    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    faces: Faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return np.asarray(center) + 0.5 * np.asarray(size) * signs, faces
 
 
 HOLDER = (0.004, 0.01, 0.01)
 """Size of the clip at a corner [m]: across the cloth, and in its plane as in the simulation."""
 ROD = (0.003, 0.003, 0.5)
 """Size of the rod that the clip hangs on [m]."""
+HOLDER_COLOR, HOLDER_ROUGHNESS = np.array([[0.05, 0.05, 0.05]]), 0.45
 _AIM = 0.05  # [m], the height that the lamp points to, under the holders
 
 
 class Holders:
     """The two holders of a dragged cloth, at its upper corners [thesis, 4.2.3]; the lamp follows them."""
+
+    floor: float | None = FLOOR
+    ground, segment = GROUND, CLOTH
 
     def __init__(self, rest: npt.ArrayLike) -> None:
         """Find the corners of a cloth whose held edge is the last one of its rest shape (V, 2) [m]."""
@@ -127,7 +198,7 @@ class Holders:
         inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
         self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
         vertices, faces = _holder()
-        self.props = tuple(Prop(f"holder-{n}", vertices, faces, (0.05, 0.05, 0.052), 0.45) for n in (1, 2))
+        self.props = tuple(Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2))
 
     def placed(self, _instant: int, vertices: Array) -> list[Array]:
         """Move the holders with the corners that they hold."""

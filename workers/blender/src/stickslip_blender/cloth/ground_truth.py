@@ -11,11 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.cloth.geometry import FLOOR, Geometry
+from stickslip_blender.cloth.geometry import BACKGROUND, Geometry
 from stickslip_blender.raster import Window, _raster, projected, see
-
-BACKGROUND, GROUND, CLOTH, PROP = range(4)
-"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.arrays.SEGMENTS`."""
 
 Floats = npt.NDArray[np.float32]
 Halves = npt.NDArray[np.float16]
@@ -44,34 +41,39 @@ def ground_truth(
     """Return the ground truth of an instant: all vertices (V, 3) [m] then, and at the next frame."""
     here = projected(camera, points)
     seen = see(here, geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
-    moved = projected(camera, following)
-    normals = _raster.normals(points, geometry.triangles) @ np.asarray(camera.rotation).T
-    values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, (moved - here)[:, :2], normals], axis=1))
+    smooth = _raster.normals(points, geometry.triangles)
+    values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following, smooth], axis=1))
     thing = seen.triangle >= 0
-    cloth = thing & (seen.triangle < geometry.cloth_triangles)
+    cloth = thing & geometry.has_uv[seen.triangle]
 
-    rays, floor = _floor_depth(camera)
-    depth = np.where(thing, values[..., 0], floor)
-    segmentation = np.select([cloth, thing, np.isfinite(floor)], [CLOTH, PROP, GROUND], BACKGROUND).astype(np.uint8)
-    normal = np.where(thing[..., None], values[..., 5:8], np.asarray(camera.rotation)[:, 2])
+    rays, floor = _floor_depth(camera, geometry.surroundings.floor)
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    moved, _ = camera.project(values[..., 3:6])
+    segmentation = np.where(np.isfinite(floor), geometry.surroundings.ground, BACKGROUND)
+    segmentation[thing] = geometry.segments[seen.triangle[thing]]
+    normal = np.where(thing[..., None], values[..., 6:9], (0.0, 0.0, 1.0))
+    flat = thing & geometry.is_flat[seen.triangle]
+    a, b, c = (points[geometry.triangles[seen.triangle[flat], k]] for k in range(3))
+    normal[flat] = np.cross(b - a, c - a)
+    normal = normal @ np.asarray(camera.rotation).T
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = normal / np.maximum(length, 1e-12)
     normal = np.where((normal * rays).sum(axis=-1, keepdims=True) > 0.0, -normal, normal)
     normal[segmentation == BACKGROUND] = 0.0
     return GroundTruth(
-        depth=depth.astype(np.float32),
-        segmentation=segmentation,
+        depth=np.where(thing, values[..., 0], floor).astype(np.float32),
+        segmentation=segmentation.astype(np.uint8),
         normals=normal.astype(np.float16),
         uv=np.where(cloth[..., None], values[..., 1:3], np.nan).astype(np.float16),
-        flow=np.where(thing[..., None], values[..., 3:5], 0.0).astype(np.float16),
+        flow=np.where(thing[..., None], moved - pixels, 0.0).astype(np.float16),
     )
 
 
-def _floor_depth(camera: Camera) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _floor_depth(camera: Camera, height: float | None) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return the rays (height, width, 3), of depth 1, in camera axes, and the depth at which they meet the floor."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     down = (rays @ np.asarray(camera.rotation))[..., 2]
     with np.errstate(divide="ignore"):
-        depth = (FLOOR - camera.position[2]) / down
-    return rays, np.where(down < 0.0, depth, np.inf)
+        depth = ((np.inf if height is None else height) - camera.position[2]) / down
+    return rays, np.where((down < 0.0) & (height is not None), depth, np.inf)

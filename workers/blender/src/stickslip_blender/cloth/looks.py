@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
+from stickslip_blender.cloth.surface import Surface
+
 if TYPE_CHECKING:
     from stickslip_schemas.spec.appearance import LampNumbers
 
 Field = npt.NDArray[np.float64]
 Grain = Literal["plain", "twill", "melange", "rib", "sparkle", "ribbon", "mesh", "pin-dots"]
-
-SIDE = 0.2
-"""Side of the square of cloth, which a grain is drawn on [m]."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +57,23 @@ def look_of(material: str) -> Look:
     return looks().get(material, PLAIN)
 
 
-def grained(picture: npt.NDArray[np.uint8], look: Look) -> npt.NDArray[np.uint8]:
-    """Return a texture (size, size, 3), 8-bit sRGB, printed on a fabric: with its grain and its stitches."""
-    size = len(picture)
-    across = (np.arange(size) + 0.5) / size * SIDE * 1e3
+def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt.NDArray[np.uint8]:
+    """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet, with the grain of its fabric and a hem.
+
+    Row 0 is the lower edge of the sheet; the picture covers the longer side.
+    """
+    wide, high = (1e3 * side for side in surface.size)
+    across = (np.arange(len(picture)) + 0.5) / len(picture) * max(wide, high)
     u, v = np.meshgrid(across, across)
     shade = 1.0 + look.contrast * _GRAINS[look.grain](u, v)
-    stitched = shade * (1.0 - 0.3 * _stitches(u, v))
-    return np.rint(np.clip(picture * stitched[..., None], 0.0, 255.0)).astype(np.uint8)
+    if surface.is_rectangle:
+        shade *= 1.0 - 0.3 * _stitches(u, v, wide, high)
+    return np.rint(np.clip(picture * shade[..., None], 0.0, 255.0)).astype(np.uint8)
 
 
-def _stitches(u: Field, v: Field) -> Field:
+def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
     """Return 1 on the stitches of the hem, 4.5 mm from the edge and 3 mm long, at (u, v) [mm]; 0 elsewhere."""
-    wide = 1e3 * SIDE
-    from_side, from_end = np.minimum(u, wide - u), np.minimum(v, wide - v)
+    from_side, from_end = np.minimum(u, wide - u), np.minimum(v, high - v)
     seam = np.abs(np.minimum(from_side, from_end) - 4.5) < 0.45
     along = np.where(from_side < from_end, v, u)
     return (seam & (np.mod(along, 4.0) < 3.0)).astype(np.float64)

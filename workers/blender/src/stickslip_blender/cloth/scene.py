@@ -6,14 +6,14 @@ kind in `stickslip_blender.scenes` adds the props.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.cloth.geometry import FLOOR, Geometry, mirrored
+from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.looks import Light, Look
 from stickslip_blender.cloth.shading import ALBEDOS, Composer
 from stickslip_blender.cloth.substrates import Substrate
@@ -60,7 +60,9 @@ class ClothScene:
         self._scene = new_scene(max_bounces=3, diffuse_bounces=2, light_tree=False)  # one lamp: nothing to choose
         set_curtains(self._scene, _AMBIENT)
         self._lamp = Lamp(self._scene, _LAMP_SIZE)
-        self._floor = add_material(add_mesh(self._scene, "floor", *_floor()), "floor")
+        self._floor = None
+        if geometry.surroundings.floor is not None:
+            self._floor = add_material(add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor")
         faces, uv = geometry.surface.triangles, geometry.surface.uv
         flat = np.column_stack([uv, np.zeros(len(uv))])
         cloth = add_mesh(self._scene, "cloth", flat, faces.tolist(), is_smooth=True)
@@ -68,7 +70,12 @@ class ClothScene:
         self._meshes = [cloth]
         for prop in geometry.surroundings.props:
             mesh = add_mesh(self._scene, prop.name, prop.vertices, prop.faces, is_smooth=prop.is_smooth)
-            add_material(mesh, prop.name, Base_Color=(*prop.color, 1.0), Roughness=prop.roughness)
+            if prop.sheet is None:
+                add_material(mesh, prop.name, Base_Color=(*(prop.grey,) * 3, 1.0), Roughness=prop.roughness)
+            else:
+                fabric = Fabric(mesh, prop.sheet.uv, np.concatenate(prop.faces).astype(np.int32))
+                fabric.set_look(**_shader(prop.sheet.look))
+                fabric.set_color((prop.grey,) * 3)
             self._meshes.append(mesh)
         add_view(self._scene)
         self._reader = FrameReader(self._scene, scratch)
@@ -81,16 +88,16 @@ class ClothScene:
         """Set the camera, the lamp, the floor and the fabric of the next clips."""
         set_view(self._scene, camera)
         self._camera, self._light, self.substrate = camera, light, substrate
-        shader = asdict(look)
-        self._fabric.set_look(**{name: shader[name] for name in ("roughness", "specular", "sheen", "translucency")})
+        self._fabric.set_look(**_shader(look))
         self._lamp.set_power(_LAMP_POWER * light.power)
-        set_inputs(
-            self._floor,
-            Base_Color=(*(substrate.albedo,) * 3, 1.0),
-            Roughness=substrate.roughness,
-            Metallic=substrate.metallic,
-            Specular_IOR_Level=substrate.specular,
-        )
+        if self._floor is not None:
+            set_inputs(
+                self._floor,
+                Base_Color=(*(substrate.albedo,) * 3, 1.0),
+                Roughness=substrate.roughness,
+                Metallic=substrate.metallic,
+                Specular_IOR_Level=substrate.specular,
+            )
 
     def shading(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
         """Render one instant for all textures: linear light at ALBEDOS, shape (height, width, 3).
@@ -117,9 +124,9 @@ class ClothScene:
 
     def window(self, shot: Shot) -> Window:
         """Return the part of the frame that shows the cloth, and its image in a floor that mirrors it."""
-        cloth = shot.points[: self.geometry.cloth_vertices]
-        if self.substrate.roughness < _MIRRORING:
-            cloth = np.concatenate([cloth, mirrored(cloth)])
+        cloth, floor = shot.points[: self.geometry.cloth_vertices], self.geometry.surroundings.floor
+        if self.substrate.roughness < _MIRRORING and floor is not None:
+            cloth = np.concatenate([cloth, mirrored(cloth, floor)])
         return window_about(projected(self._camera, cloth), self._camera, _WINDOW_MARGIN)
 
     def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
@@ -135,12 +142,17 @@ class ClothScene:
         self._lamp.aim(shot.aim, outward, _LAMP_DISTANCE)
 
 
-def _floor() -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:
-    """Return the vertices and faces of a round plate with a low rim."""
+def _shader(look: Look) -> dict[str, float]:
+    """Return what of a look the shader of a fabric takes."""
+    return {name: getattr(look, name) for name in ("roughness", "specular", "sheen", "translucency")}
+
+
+def _floor(height: float) -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:
+    """Return the vertices and faces of a round plate at a height [m], with a low rim."""
     around = 64
     angle = 2.0 * np.pi * np.arange(around) / around
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=1) * _FLOOR_RADIUS
-    circle[:, 2] = FLOOR
+    circle[:, 2] = height
     rim = circle + np.array([0.0, 0.0, _FLOOR_RIM])
     sides = [(k, (k + 1) % around, (k + 1) % around + around, k + around) for k in range(around)]
     return np.concatenate([circle, rim]), [tuple(range(around)), *sides]

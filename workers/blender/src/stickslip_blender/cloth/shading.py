@@ -10,7 +10,8 @@ A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture i
     L(p) = S + (D + I m) A(p)     m: mean albedo of the cloth in sight, for light comes from elsewhere on the cloth
 
 in linear light, for each of the texture's colours. Off the cloth D is light that the cloth threw there: A is m, or what
-a floor that mirrors shows of the cloth, blurred as much as its roughness does.
+a floor that mirrors shows of the cloth, blurred as much as its roughness does. Marks of the floor and colours of props
+lie on top, as factors of their light: whatever is not the cloth is grey in Cycles.
 
 Pictures of clips are not rounded to the nearest levels. Each level is within TOLERANCE of the exact value, and chosen
 so that neighbours are equal where they may be: pixels in a row, and the colours of grey. Clips are a sixth smaller for
@@ -19,13 +20,13 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.cloth.geometry import FLOOR, Geometry, mirrored
+from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.substrates import Substrate
 from stickslip_blender.raster import Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
 
@@ -88,7 +89,7 @@ class Composer:
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
         reflected, around = np.empty((0, 0, colors), dtype=np.float32), Window(0, 0, 0, 0)
-        if substrate.mirrors:
+        if substrate.mirrors and self._geometry.surroundings.floor is not None:
             reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
         _raster.compose(
             np.ascontiguousarray(shading).view(np.uint16),
@@ -99,7 +100,7 @@ class Composer:
             seen.window.place,
             reflected,
             around.place,
-            self._uncovered(floor, points, camera),
+            self._tinted(floor, points, camera),
             _reflectance(substrate),
             pictures,
         )
@@ -115,12 +116,12 @@ class Composer:
         seen = see(projected(camera, points), self._geometry.triangles, window)
         cover = np.zeros(light.shape[:2], dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        marks = self._uncovered(floor, points, camera) - 1.0
+        marks = self._tinted(floor, points, camera) - 1.0
         factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
         return light * factor
 
-    def _uncovered(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
-        """Return the factor of the floor where no prop hides it, and 1 where one does."""
+    def _tinted(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
+        """Return the factor (height, width, 3) of all that is not the cloth: the floor's, or of the prop before it."""
         geometry = self._geometry
         if not geometry.surroundings.props:
             return floor
@@ -129,9 +130,17 @@ class Composer:
         if window.is_empty:
             return floor
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
-        hidden = see(projections, props, window, _PROP_GRID).share_below(len(props))
+        seen = see(projections, props, window, _PROP_GRID)
+        samples = [seen.triangle[r::_PROP_GRID, c::_PROP_GRID] for r in range(_PROP_GRID) for c in range(_PROP_GRID)]
+        shown = sum((geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)) / len(samples)
+        for sheet in geometry.printed:  # see_albedo looks at the first triangles
+            count, first = sheet.triangles.stop - sheet.triangles.start, sheet.triangles.start
+            turned = np.where(seen.triangle < 0, -1, (seen.triangle - first) % len(props)).astype(np.int32)
+            rolled = replace(seen, triangles=np.roll(props, -first, axis=0), triangle=turned)
+            sight = see_albedo(rolled, geometry.uv, sheet.textures, count)
+            shown = shown + sight.coverage[..., None] * sight.mean[:, :, 0] / np.float32(sheet.grey)
         factor = floor.copy()
-        factor[window.slices] += hidden[..., None] * (np.float32(1.0) - factor[window.slices])
+        factor[window.slices] = shown + (1.0 - seen.share_below(len(props))[..., None]) * factor[window.slices]
         return factor
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
@@ -146,8 +155,9 @@ class Composer:
         textures: Textures,
     ) -> tuple[Floats, Window]:
         """Return the albedo that the floor shows of the cloth where it mirrors it, (height, width, 3 textures)."""
-        cloth = self._geometry.cloth_triangles
-        below = projected(camera, mirrored(points))
+        cloth, floor = self._geometry.cloth_triangles, self._geometry.surroundings.floor
+        assert floor is not None
+        below = projected(camera, mirrored(points, floor))
         window = window_about(below[: self._geometry.cloth_vertices], camera, margin=12)
         nothing = np.empty((0, 0, 3 * textures.count), dtype=np.float32), Window(0, 0, 0, 0)
         if window.is_empty:
@@ -156,7 +166,7 @@ class Composer:
         sight = see_albedo(seen, self._geometry.uv, textures, cloth)
         if not sight.coverage.any():
             return nothing
-        beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera)
+        beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera, floor)
         shown = sight.coverage[..., None]
         wide = np.full(beyond.shape, _PATH_BLUR, dtype=np.float32)
         around = _raster.blurred(np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide)
@@ -178,13 +188,13 @@ def _reflectance(substrate: Substrate) -> float:
     return substrate.albedo if substrate.metallic > 0.5 else _DIELECTRIC
 
 
-def _beyond_floor(seen: Seen, camera: Camera) -> Floats:
+def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
     """Return how far behind the floor a mirrored thing appears, over its depth, (height, width); 0 where none is."""
     depth = seen.at_centers(seen.points[:, 2:])[..., 0]
     window = seen.window
     rows, columns = np.mgrid[window.top : window.bottom, window.left : window.right]
     ray = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], axis=-1)
     down = (ray @ np.asarray(camera.rotation))[..., 2]
-    floor = (FLOOR - camera.position[2]) / np.where(down < -1e-6, down, -1e-6)
+    floor = (height - camera.position[2]) / np.where(down < -1e-6, down, -1e-6)
     share = np.where(depth > 0.0, 1.0 - floor / np.maximum(depth, 1e-6), 0.0)
     return np.clip(share, 0.0, 1.0).astype(np.float32)

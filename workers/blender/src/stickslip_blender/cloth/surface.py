@@ -6,6 +6,8 @@ how strong they are, for wrinkles are what friction is seen by. The hem is a sec
 
 from __future__ import annotations
 
+from copy import copy
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,18 +33,33 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
 
 
+def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> Surface:
+    """Return the surface of a mesh, see `Surface`: the last ones are kept, for making one takes a second."""
+    faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
+    return copy(_made(faces.tobytes(), flat.tobytes()))
+
+
 class Surface:
     """A refined mesh: from positions of the solver's vertices to those of the visible ones."""
 
     triangles: Indices
     """Shape (T, 3)."""
     uv: Array
-    """Texture coordinates in [0, 1], shape (V, 2)."""
+    """Texture coordinates, shape (V, 2): from 0 to 1 along the longer side."""
+    size: tuple[float, float]
+    """Of the flat sheet, along warp and weft [m]."""
+    is_rectangle: bool
+    """Whether the flat sheet is a rectangle."""
 
     def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike) -> None:
         """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]."""
         faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
         low, high = flat.min(axis=0), flat.max(axis=0)
+        width, height = (high - low).tolist()
+        self.size = width, height
+        ab, ac = (flat[faces[:, k]] - flat[faces[:, 0]] for k in (1, 2))
+        area = 0.5 * np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum()
+        self.is_rectangle = bool(area > 0.999 * width * height)
         self._levels: list[Subdivision] = []
         while len(flat) < FINE_VERTICES:
             self._levels.append(subdivide(faces, flat))
@@ -54,7 +71,7 @@ class Surface:
         inside = np.concatenate([flat[rim] + offset * _inward(flat[rim]) for offset in _PROFILE[:, 0]])
         self._corners, self._weights = _located(inside, flat, faces)
         self.triangles = np.ascontiguousarray(np.concatenate([faces, _ring_faces(len(rim), self._count)]))
-        uv = (np.concatenate([flat, inside]) - low) / (high - low)
+        uv = (np.concatenate([flat, inside]) - low) / max(self.size)
         self.uv = np.ascontiguousarray(np.clip(uv, 0.0, 1.0))
         self.dress(hem=0.0)
 
@@ -76,6 +93,11 @@ class Surface:
         middle = np.einsum("hk,hkx->hx", self._weights, sheet[self._corners])
         upward = np.einsum("hk,hkx->hx", self._weights, normals[self._corners])
         return np.concatenate([sheet, middle + self._hem * upward])
+
+
+@lru_cache(maxsize=16)
+def _made(triangles: bytes, rest: bytes) -> Surface:
+    return Surface(np.frombuffer(triangles, dtype=np.int32).reshape(-1, 3), np.frombuffer(rest).reshape(-1, 2))
 
 
 def _creases(uv: Array, seed: int) -> Array:

@@ -13,6 +13,8 @@ from stickslip_blender.cycles.blender import import_bpy
 
 SENSOR_WIDTH = 36.0  # [mm]; only the ratio of focal length to sensor width matters
 _CLIP = (1e-3, 1e3)  # [scene units]
+SHARP = np.radians(40.0)
+"""Angle between faces above which the edge of a smooth mesh stays an edge."""
 
 Array = npt.NDArray[np.float64]
 
@@ -27,6 +29,7 @@ def add_mesh(
     scene.collection.objects.link(bpy.data.objects.new(name, mesh))
     if is_smooth:
         mesh.shade_smooth()
+        mesh.set_sharp_from_angle(angle=SHARP)
     return mesh
 
 

@@ -10,6 +10,7 @@ from stickslip_blender.raster.visibility import (
     Seen,
     Textures,
     Window,
+    decoded,
     fans,
     projected,
     see,
@@ -17,4 +18,16 @@ from stickslip_blender.raster.visibility import (
     window_about,
 )
 
-__all__ = ["GRID", "Albedo", "Seen", "Textures", "Window", "fans", "projected", "see", "see_albedo", "window_about"]
+__all__ = [
+    "GRID",
+    "Albedo",
+    "Seen",
+    "Textures",
+    "Window",
+    "decoded",
+    "fans",
+    "projected",
+    "see",
+    "see_albedo",
+    "window_about",
+]

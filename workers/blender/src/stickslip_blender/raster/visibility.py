@@ -18,6 +18,8 @@ GRID = 12
 
 _LANES = 8  # channels are filled up to a multiple
 
+_LINEAR = np.array([_raster.decoded(level / 255.0) for level in range(256)], dtype=np.float32)
+
 Points = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
 
@@ -109,10 +111,18 @@ def projected(camera: Camera, points: npt.ArrayLike) -> Points:
 
 def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
     """Return the part of the frame that projected points are in, with so many pixels around it."""
-    low, high = np.floor(points[:, :2].min(axis=0)) - margin, np.ceil(points[:, :2].max(axis=0)) + margin + 1
+    places = points[np.isfinite(points[:, 0]), :2]  # the others are behind the camera
+    if not len(places):
+        return Window(0, 0, 0, 0)
+    low, high = np.floor(places.min(axis=0)) - margin, np.ceil(places.max(axis=0)) + margin + 1
     left, top = np.maximum(low, 0).astype(int)
     right, bottom = np.minimum(high, (camera.width, camera.height)).astype(int)
     return Window(int(left), int(top), int(right), int(bottom))
+
+
+def decoded(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Return a picture, 8-bit sRGB, as linear light [IEC 61966-2-1]."""
+    return _LINEAR[picture]
 
 
 def fans(faces: Sequence[Sequence[int]]) -> Indices:
@@ -121,7 +131,14 @@ def fans(faces: Sequence[Sequence[int]]) -> Indices:
 
 
 def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
-    """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window."""
+    """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window.
+
+    A triangle that reaches behind the camera is not seen.
+    """
+    behind = ~(points[:, 2] > 0.0)
+    if behind.any():
+        points = np.where(behind[:, None], (0.0, 0.0, 1.0), points)
+        triangles = np.where(behind[triangles].any(axis=1, keepdims=True), triangles[:1, :1], triangles)
     return Seen(points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid))
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_blender.cloth.clips import render_clips
-from stickslip_blender.cloth.geometry import Faces, Prop
+from stickslip_blender.cloth.geometry import Holders, Prop
+from stickslip_blender.cloth.shapes import Faces
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -29,11 +30,11 @@ Array = npt.NDArray[np.float64]
 
 def render(look: ClothSphereRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a cloth on a turning sphere."""
-    (poses,) = workshop.record(task.record, "sphere_pose")
-    return render_clips(look, task, workshop, partial(Ball, poses=poses), surroundings_key=poses.tobytes())
+    poses = workshop.record(task.record)["sphere_pose"]
+    return render_clips(look, task, workshop, partial(Ball, poses=poses))
 
 
-class Ball:
+class Ball(Holders):
     """A ball of gores in two colours; the lamp points at its centre."""
 
     def __init__(self, _rest: npt.ArrayLike, *, poses: npt.ArrayLike) -> None:
@@ -41,7 +42,7 @@ class Ball:
         self._poses = np.asarray(poses, dtype=np.float64)
         radius = float(self._poses[0, 2, 3])
         parts = zip(_gores(radius - SUNK), _COLORS, strict=True)
-        self.props = tuple(Prop(f"ball-{n}", *part, color, 0.5) for n, (part, color) in enumerate(parts, 1))
+        self.props = tuple(Prop(f"ball-{n}", *part, np.array([color]), 0.5) for n, (part, color) in enumerate(parts, 1))
 
     def placed(self, instant: int, _vertices: Array) -> list[Array]:
         """Turn the ball to its pose at an instant."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the views of one rod."""
     cameras = load_rig(look.rig)
-    (line,) = workshop.record(task.record, "centerline")
+    line = workshop.record(task.record)["centerline"]
     if rejected := why_unfit("rod", line, look.radius, cameras):
         return rejected
     color = silicone_color(look.color_seed)

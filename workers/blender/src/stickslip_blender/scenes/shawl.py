@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_blender.cloth.clips import render_clips
-from stickslip_blender.cloth.geometry import Prop
+from stickslip_blender.cloth.geometry import Holders, Prop
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -26,16 +26,14 @@ Array = npt.NDArray[np.float64]
 
 def render(look: ShawlRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a shawl."""
-    skin, weights, bones = (
-        np.asarray(values, dtype=np.float64)
-        for values in workshop.record(task.record, "skin_rest", "skin_weights", "bones")
-    )
-    (triangles,) = workshop.record(task.record, "skin_triangles")
+    record = workshop.record(task.record)
+    skin, weights, bones = (record[name].astype(np.float64) for name in ("skin_rest", "skin_weights", "bones"))
+    triangles = record["skin_triangles"]
     make = partial(Figure, skin=skin, triangles=triangles, weights=weights, bones=bones)
-    return render_clips(look, task, workshop, make, surroundings_key=(skin.tobytes(), bones.tobytes()))
+    return render_clips(look, task, workshop, make)
 
 
-class Figure:
+class Figure(Holders):
     """A figure of one neutral colour; the lamp points at its chest."""
 
     def __init__(
@@ -45,7 +43,7 @@ class Figure:
         self._weights, self._bones = weights, bones
         inner = skin - SUNK * _normals(skin, triangles)
         faces = [tuple(face) for face in triangles.tolist()]
-        self.props: tuple[Prop, ...] = (Prop("figure", inner, faces, _COLOR, 0.6, is_smooth=True),)
+        self.props: tuple[Prop, ...] = (Prop("figure", inner, faces, np.array([_COLOR]), 0.6, is_smooth=True),)
 
     def placed(self, instant: int, _vertices: Array) -> list[Array]:
         """Move the skin with the bones."""

@@ -1,0 +1,284 @@
+"""LeRobotDataset v3 [huggingface/lerobot, codebase version v3.0]: what holders do to cloth, for learning robots.
+
+An episode is a simulation with one texture and one look of light and floor, seen by all viewpoints of the dataset.
+`action` has of each holder its position, the first two columns of its rotation [Zhou et al. 2019], and whether it
+holds, at the next frame; `observation.state` has the same of this frame, the poses of all bodies, and the places of
+five vertices of each sheet: four corners and the middle. Labels are columns of the episodes.
+
+Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stickslip_schemas.spec.arrays import SPLITS
+
+from stickslip_training.arrays import Array
+from stickslip_training.export.content import Content, OnBytes
+
+FILES = 1000
+"""Files of a folder."""
+EPISODES_IN_FILE = 1000
+"""Episodes whose numbers go into one file."""
+KEY_FRAMES = 10
+"""Frames from one that is whole to the next: a frame is found by decoding so many at most."""
+
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+NEEDED = ("video", "holder_pose", "grasped")
+_POSE = ("x", "y", "z", "xx", "yx", "zx", "xy", "yy", "zy")
+_COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What becomes one episode."""
+
+    split: str
+    slots: dict[str, int]
+    """Sample by viewpoint."""
+
+
+def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
+    """Write the files into an empty directory; raise ValueError where there are no holders or no whole episode."""
+    import pandas
+    import pyarrow
+    from pyarrow import parquet
+
+    arrays = {array.name: array for array in content.arrays}
+    if missing := [name for name in NEEDED if name not in arrays]:
+        raise ValueError(
+            f"LeRobot needs the arrays {', '.join(NEEDED)} of a scene with holders, and {', '.join(missing)} are not "
+            f"in this part of {content.name}"
+        )
+    episodes = list(_episodes(content))
+    views = list(episodes[0].slots)
+    instants = np.array(arrays["video"].attributes["instants"])
+    length, span = len(instants), int(np.ptp(instants))
+    per_second = Fraction(arrays["holder_pose"].attributes["instants_per_second"]).limit_denominator(1000)
+    rate = per_second * (length - 1) / span if span else Fraction(1)  # a video has its frames evenly
+    totals: dict[str, Any] = {}
+    rows: list[dict[str, Any]] = []
+    tables: list[Any] = []
+    for number, episode in enumerate(episodes):
+        chunk, file = divmod(number, FILES)
+        frames, names = _numbers(content, episode.slots[views[0]], instants)
+        stats = {name: _statistics(values) for name, values in frames.items()}
+        where: dict[str, Any] = {}
+        for view, slot in episode.slots.items():
+            key, video = f"observation.images.{view}", content.read("video", np.array([slot]))[0]
+            _encode(video, directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file), rate)
+            stats[key] = _statistics(video.reshape(-1, 3) / 255.0, (3, 1, 1))
+            where |= {
+                f"videos/{key}/chunk_index": chunk,
+                f"videos/{key}/file_index": file,
+                f"videos/{key}/from_timestamp": 0.0,
+                f"videos/{key}/to_timestamp": float(length / rate),
+            }
+            on_bytes(content.sample_bytes)
+        totals = {name: _merged(totals[name], own) if name in totals else own for name, own in stats.items()}
+        tables.append(_table(frames, number, rate))
+        data_chunk, data_file = divmod(number // EPISODES_IN_FILE, FILES)
+        if len(tables) == EPISODES_IN_FILE or number == len(episodes) - 1:
+            path = directory / DATA.format(chunk_index=data_chunk, file_index=data_file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            parquet.write_table(pyarrow.concat_tables(tables), path)
+            tables = []
+        rows.append(
+            {
+                **_labels(content, episode),
+                "episode_index": number,
+                "tasks": [content.title],
+                "length": length,
+                "dataset_from_index": number * length,
+                "dataset_to_index": (number + 1) * length,
+                "data/chunk_index": data_chunk,
+                "data/file_index": data_file,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                **where,
+                **{f"stats/{name}/{key}": value for name, own in stats.items() for key, value in own.items()},
+            }
+        )
+    path = directory / EPISODES.format(chunk_index=0, file_index=0)
+    path.parent.mkdir(parents=True)
+    parquet.write_table(pyarrow.Table.from_pylist(rows), path)
+    pandas.DataFrame({"task_index": [0]}, index=[content.title]).to_parquet(directory / "meta" / "tasks.parquet")
+    (directory / "meta" / "stats.json").write_text(json.dumps(totals))
+    info = _info(episodes, names, views, float(rate), arrays["video"].shape)
+    (directory / "meta" / "info.json").write_text(json.dumps(info, indent=2))
+
+
+def _episodes(content: Content) -> Iterator[Episode]:
+    """Yield the episodes that all viewpoints of the dataset see, split by split."""
+    reader = content.reader
+    labels = [name for name in reader.spec.named_axes if name in reader.arrays and name != "viewpoint"]
+    seen: dict[tuple[Any, ...], dict[str, int]] = {}
+    views = reader.categories("viewpoint")
+    for slot in content.slots.tolist():
+        key = (int(reader.label("split")[slot]), *(reader.label(name)[slot].item() for name in labels))
+        seen.setdefault(key, {})[views[reader.label("viewpoint")[slot]]] = slot
+    every = {view for slots in seen.values() for view in slots}
+    whole = [(key[0], slots) for key, slots in seen.items() if slots.keys() == every]
+    if not whole:
+        raise ValueError(
+            f"an episode needs a clip of each of {', '.join(sorted(every))}, and no simulation of this part of "
+            f"{content.name} has them all"
+        )
+    for split, slots in sorted(whole, key=lambda found: found[0]):
+        yield Episode(SPLITS[split], dict(sorted(slots.items())))
+
+
+def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Array], dict[str, list[str]]]:
+    """Return `action` and `observation.state` of the frames of a sample, float32, and the names of their numbers."""
+    alone = np.array([slot])
+    arrays = {array.name: array for array in content.arrays}
+
+    def over_time(name: str) -> Array:
+        values: Array = content.read(name, alone)[0][instants]
+        return values
+
+    poses, grasped = _flat_poses(over_time("holder_pose")), over_time("grasped").astype(np.float32)
+    holders = np.concatenate([poses, grasped[..., None]], axis=2)
+    things = arrays["holder_pose"].attributes["names"]
+    own = [f"{holder}.{what}" for holder in things for what in (*_POSE, "grasp")]
+    held = holders.reshape(len(holders), -1)
+    parts, names = [held], list(own)
+    if "body_pose" in arrays:
+        parts.append(_flat_poses(over_time("body_pose")).reshape(len(holders), -1))
+        names += [f"{body}.{what}" for body in arrays["body_pose"].attributes["names"] for what in _POSE]
+    for name in (name for name in arrays if name.endswith(".positions")):
+        sheet = name.removesuffix(".positions")
+        tracked = _tracked(content.read(f"{sheet}.rest", alone)[0])
+        parts.append(over_time(name)[:, tracked].reshape(len(holders), -1))
+        names += [f"{sheet}.{vertex}.{axis}" for vertex in tracked for axis in "xyz"]
+    following = np.concatenate([held[1:], held[-1:]])
+    state = np.concatenate(parts, axis=1)
+    return (
+        {"action": following.astype(np.float32), "observation.state": state.astype(np.float32)},
+        {"action": own, "observation.state": names},
+    )
+
+
+def _flat_poses(poses: Array) -> Array:
+    """Return poses (n, things, 3, 4) as places and first two columns of rotations, (n, things, 9)."""
+    columns = np.concatenate([poses[..., 3], poses[..., 0], poses[..., 1]], axis=-1)
+    return np.asarray(columns)
+
+
+def _tracked(rest: Array) -> list[int]:
+    """Return the vertices of a flat sheet (V, 2) that are nearest to its corners and its middle."""
+    low, high = rest.min(axis=0), rest.max(axis=0)
+    places = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
+    return [int(np.abs(rest - place).sum(axis=1).argmin()) for place in places]
+
+
+def _encode(video: Array, path: Path, rate: Fraction) -> None:
+    """Write a clip (frames, height, width, 3), 8-bit sRGB, as a video without loss."""
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as file:
+        options = {"qp": "0", "bf": "0", "g": str(KEY_FRAMES)}
+        stream = file.add_stream("libx264rgb", rate=rate, options=options)
+        stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "rgb24"
+        stream.thread_count = 1  # the same clip has the same bytes
+        for picture in video:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+        file.mux(stream.encode())
+
+
+def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
+    """Return the frames of an episode, one a row."""
+    import pyarrow
+
+    length = len(frames["action"])
+    index = np.arange(length, dtype=np.int64)
+    columns = {name: pyarrow.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1]) for name, v in frames.items()}
+    counters = {"timestamp": (index / float(rate)).astype(np.float32), "frame_index": index}
+    counters |= {"episode_index": np.full_like(index, number), "index": index + number * length}
+    return pyarrow.table(columns | counters | {"task_index": np.zeros_like(index)})
+
+
+def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
+    """Return what LeRobot normalises with, of values (n, k), as lists of a shape, (k,) by default."""
+    exact = values.astype(np.float64)
+    found = {"min": exact.min(axis=0), "max": exact.max(axis=0), "mean": exact.mean(axis=0), "std": exact.std(axis=0)}
+    return {name: value.reshape(shape or -1).tolist() for name, value in found.items()} | {"count": [len(values)]}
+
+
+def _merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Return the statistics of two sets of values together [Chan et al. 1979]."""
+    a, b = ({name: np.array(value) for name, value in each.items()} for each in (one, other))
+    count = a["count"] + b["count"]
+    share = b["count"][0] / count[0]
+    apart = b["mean"] - a["mean"]
+    variance = (1.0 - share) * a["std"] ** 2 + share * b["std"] ** 2 + share * (1.0 - share) * apart**2
+    found = {"min": np.minimum(a["min"], b["min"]), "max": np.maximum(a["max"], b["max"])}
+    found |= {"mean": a["mean"] + share * apart, "std": np.sqrt(variance), "count": count}
+    return {name: value.tolist() for name, value in found.items()}
+
+
+def _labels(content: Content, episode: Episode) -> dict[str, Any]:
+    """Return the labels of an episode: those that are one number of a sample, and names instead of codes."""
+    slot = next(iter(episode.slots.values()))
+    found: dict[str, Any] = {}
+    for array in content.labels:
+        if not array.shape and array.name != "viewpoint":
+            value = content.read(array.name, np.array([slot]))[0].item()
+            found[array.name] = str(array.categories[value]) if array.categories else value
+    return found
+
+
+def _info(
+    episodes: list[Episode], names: dict[str, list[str]], views: list[str], rate: float, shape: tuple[int, ...]
+) -> dict[str, Any]:
+    """Return `info.json`; `shape` is that of a clip."""
+    length, height, width, _ = shape
+    features: dict[str, Any] = {
+        name: {"dtype": "float32", "shape": [len(numbers)], "names": numbers} for name, numbers in names.items()
+    }
+    features |= {
+        f"observation.images.{view}": {
+            "dtype": "video",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.height": height,
+                "video.width": width,
+                "video.codec": "h264",
+                "video.pix_fmt": "gbrp",
+                "video.is_depth_map": False,
+                "video.fps": rate,
+                "video.channels": 3,
+                "has_audio": False,
+            },
+        }
+        for view in views
+    }
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
+    ends = np.cumsum([0, *(sum(episode.split == split for episode in episodes) for split in SPLITS)]).tolist()
+    return {
+        "codebase_version": "v3.0",
+        "robot_type": "holders",
+        "total_episodes": len(episodes),
+        "total_frames": length * len(episodes),
+        "total_tasks": 1,
+        "chunks_size": FILES,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": int(rate) if rate == int(rate) else rate,
+        "splits": {split: f"{a}:{b}" for split, a, b in zip(SPLITS, ends, ends[1:], strict=False) if b > a},
+        "data_path": DATA,
+        "video_path": VIDEO,
+        "features": features,
+    }

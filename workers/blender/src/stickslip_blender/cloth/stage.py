@@ -1,0 +1,196 @@
+"""What a scene shows besides its first sheet: further sheets, bodies and holders, from its document and a record.
+
+Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of its names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.kinds.cloth.arrays import scene_segments
+from stickslip_schemas.spec.cameras import Camera, framed
+
+from stickslip_blender.cloth.geometry import (
+    BACKGROUND,
+    FLOOR,
+    HOLDER_COLOR,
+    HOLDER_ROUGHNESS,
+    Geometry,
+    Print,
+    Prop,
+)
+from stickslip_blender.cloth.looks import grained, look_of
+from stickslip_blender.cloth.shapes import Faces, box, gores, rounded, tiles
+from stickslip_blender.cloth.surface import surface
+from stickslip_blender.raster import Window, _raster, projected, see
+
+SUNK = -FLOOR
+"""Distance of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it."""
+
+ENDLESS, TILE = 1.0, 0.1
+"""Half of what is seen of an endless cylinder, or of a plane that is no floor; side of the plane's tiles [m]."""
+
+JAWS = 0.004
+"""By how much a holder is larger than what it holds, along each axis [m]."""
+
+MOVING = 0.005
+"""A vertex that goes farther than this moves [m]: cameras frame all that do."""
+
+PLAIN = (168, 164, 156)
+"""Colour of a sheet that neither a scene nor an axis gives a texture, sRGB."""
+
+_STILL_COLOR, _STILL_ROUGHNESS = (0.5, 0.5, 0.5), 0.5
+_TURNS = (0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0, 120.0, -120.0, 150.0, -150.0, 180.0)  # [degree]
+_ENOUGH = 0.6  # of the most that any turn shows of the cloth: the smallest turn that shows as much is taken
+_LOOKS, _THUMB = 5, 56  # instants that are looked at, and the side of their pictures [px]
+
+Array = npt.NDArray[Any]
+
+
+def first_sheet(scene: Mapping[str, Any]) -> str:
+    """Return the name of the sheet that takes the axis `texture`: the first without one of its own, or the first."""
+    own = scene["looks"]["sheets"]
+    return next((name for name in scene["sheets"] if name not in own), next(iter(scene["sheets"])))
+
+
+class Stage:
+    """The surroundings of the first sheet of a scene."""
+
+    def __init__(
+        self,
+        scene: Mapping[str, Any],
+        record: Mapping[str, Array],
+        picture: Callable[[str], npt.NDArray[np.uint8]],
+    ) -> None:
+        """Make the props of a scene, as JSON, from the arrays of a sample; `picture` returns a texture by name."""
+        codes = {name: code for code, name in enumerate(scene_segments(scene["sheets"], scene["bodies"]))}
+        self._record = record
+        self._sheet = first_sheet(scene)
+        self.segment = codes[self._sheet]
+        self.floor: float | None = None
+        self.ground = BACKGROUND
+        self._placers: list[Callable[[int], Array]] = []
+        props: list[Prop] = []
+        for name, sheet in scene["sheets"].items():
+            if name != self._sheet:
+                props.append(self._printed(name, sheet, scene["looks"]["sheets"].get(name), picture, codes[name]))
+        for number, (name, body) in enumerate(scene["bodies"].items()):
+            if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
+                self.floor, self.ground = body["origin"][2] + FLOOR, codes[name]
+                continue
+            look = scene["looks"]["bodies"].get(name) or {"color": _STILL_COLOR, "roughness": _STILL_ROUGHNESS}
+            props.append(self._body(name, number, body, look, codes[name]))
+        for number, sides in enumerate(record["holder_box"].tolist() if "holder_box" in record else ()):
+            if not np.isnan(sides).any():
+                vertices, faces = box(tuple(side + JAWS for side in sides), (0.0, 0.0, 0.0))
+                self._placers.append(self._posed("holder_pose", number, vertices))
+                look = HOLDER_COLOR, HOLDER_ROUGHNESS
+                props.append(Prop(f"holder-{number}", vertices, faces, *look, segment=codes["holders"]))
+        self.props = tuple(props)
+
+    def placed(self, instant: int, _vertices: Array) -> list[Array]:
+        """Move everything to its place at an instant."""
+        return [place(instant) for place in self._placers]
+
+    def aim(self, _instant: int, vertices: Array) -> Array:
+        """Return the middle of the box about the first sheet."""
+        middle: Array = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        return middle
+
+    def moving(self, geometry: Geometry) -> Array:
+        """Return the places (n, 3) [m], over time, of all that moves, and of all of the first sheet."""
+        track = self._record[f"{self._sheet}.positions"]
+        instants = np.unique(np.linspace(0, len(track) - 1, 60).astype(int))
+        parts = [track[instants].reshape(-1, 3)]
+        for place in self._placers:
+            places = np.stack([place(instant) for instant in instants])
+            moves = (np.ptp(places, axis=0) > MOVING).any(axis=1)
+            parts.append(places[:, moves].reshape(-1, 3))
+        return np.concatenate(parts)
+
+    def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
+        """Return the camera that frames all that moves, turned about it until enough of the first sheet is in sight."""
+        points, track = self.moving(geometry), self._record[f"{self._sheet}.positions"]
+        instants = np.linspace(0, len(track) - 1, _LOOKS).astype(int)
+        scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
+        shown = [_shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes) for turn in _TURNS]
+        turn = next(turn for turn, seen in zip(_TURNS, shown, strict=True) if seen >= _ENOUGH * max(shown))
+        return framed(name, points, size=size, turn=turn)
+
+    def _printed(
+        self, name: str, sheet: Mapping[str, Any], own: Mapping[str, Any] | None, picture: Any, segment: int
+    ) -> Prop:
+        positions = self._record[f"{name}.positions"]
+        skin, look = (
+            surface(self._record[f"{name}.triangles"], self._record[f"{name}.rest"]),
+            look_of(sheet["material"]),
+        )
+        skin.dress(hem=1e-3 * look.hem)
+        texture = np.full((64, 64, 3), PLAIN, dtype=np.uint8) if own is None else picture(own["texture"])
+        self._placers.append(lambda instant: skin(positions[instant]))
+        return Prop(
+            name,
+            skin(positions[0]),
+            list(map(tuple, skin.triangles.tolist())),
+            np.zeros((1, 3)),
+            look.roughness,
+            is_smooth=True,
+            segment=segment,
+            sheet=Print(skin.uv, grained(texture, look, skin), look),
+        )
+
+    def _body(self, name: str, number: int, body: Mapping[str, Any], look: Mapping[str, Any], segment: int) -> Prop:
+        color = np.asarray(look["color"], dtype=np.float64).reshape(1, 3)
+        if body["type"] == "mesh":
+            triangles, moved = self._record[f"{name}.triangles"], self._record.get(f"{name}.vertices")
+            vertices, faces = _sunk(self._record[f"{name}.rest"], triangles), list(map(tuple, triangles.tolist()))
+            posed = self._posed("body_pose", number, vertices)
+            self._placers.append(posed if moved is None else lambda instant: _sunk(moved[instant], triangles))
+            return Prop(name, vertices, faces, color, look["roughness"], is_smooth=True, segment=segment)
+        vertices, faces, is_smooth = _shape(body)
+        if body["type"] in ("sphere", "cylinder", "capsule"):
+            color = gores(color, len(faces))
+        self._placers.append(self._posed("body_pose", number, vertices))
+        return Prop(name, vertices, faces, color, look["roughness"], is_smooth=is_smooth, segment=segment)
+
+    def _posed(self, array: str, number: int, vertices: Array) -> Callable[[int], Array]:
+        poses = np.asarray(self._record[array][:, number], dtype=np.float64)
+
+        def place(instant: int) -> Array:
+            at: Array = vertices @ poses[instant, :, :3].T + poses[instant, :, 3]
+            return at
+
+        return place
+
+
+def _sunk(points: Array, triangles: Array) -> Array:
+    """Return the vertices (n, 3) of a mesh, moved inwards by `SUNK`."""
+    given = np.asarray(points, dtype=np.float64)
+    inner: Array = given - SUNK * _raster.normals(given, np.ascontiguousarray(triangles, dtype=np.int32))
+    return inner
+
+
+def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces, bool]:
+    """Return the vertices of a body that is no mesh, in its own axes [m], its faces, and whether it is smooth."""
+    kind = body["type"]
+    if kind == "plane":
+        vertices, faces = tiles(body["normal"], 2.0 * ENDLESS, round(2.0 * ENDLESS / TILE))
+        return vertices - SUNK * np.asarray(body["normal"]) / np.linalg.norm(body["normal"]), faces, False
+    if kind == "box":
+        rounding = max(body["rounding"], 2.0 * SUNK)
+        return *rounded(0.5 * np.asarray(body["size"]) - rounding, rounding - SUNK), True
+    half = {"sphere": 0.0, "capsule": 0.5 * body.get("length", 0.0), "cylinder": ENDLESS}[kind]
+    return *rounded((0.0, 0.0, half), body["radius"] - SUNK), True
+
+
+def _shown(camera: Camera, geometry: Geometry, scenes: list[Array]) -> int:
+    """Return how many pixels show the first sheet, over several instants."""
+    window = Window(0, 0, camera.width, camera.height)
+    count = 0
+    for points in scenes:
+        seen = see(projected(camera, points), geometry.triangles, window, grid=1).triangle
+        count += int(((seen >= 0) & (seen < geometry.cloth_triangles)).sum())
+    return count

@@ -1,0 +1,178 @@
+"""The stage of a scene: bodies as they are simulated, sheets with pictures, cameras that frame what moves."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from stickslip_blender.cloth.geometry import FLOOR, Geometry
+from stickslip_blender.cloth.ground_truth import ground_truth
+from stickslip_blender.cloth.shading import Composer
+from stickslip_blender.cloth.shapes import gores, rounded
+from stickslip_blender.cloth.stage import SUNK, Stage, first_sheet
+from stickslip_blender.cloth.textures import texture_image
+from stickslip_schemas.kinds.cloth.arrays import scene_segments
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.spec.cameras import FRAMING, framed
+from stickslip_schemas.spec.fabrics import Texture
+
+INSTANTS = 3
+
+
+def flat(width: float, height: float, cells: int) -> tuple[Any, Any]:
+    """Return the vertices (V, 2) and triangles of a rectangle."""
+    x, y = (np.linspace(-side / 2, side / 2, cells + 1) for side in (width, height))
+    rest = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    number = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = (number[i : cells + i, j : cells + j].ravel() for i in (0, 1) for j in (0, 1))
+    return rest, np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)]).astype(np.int32)
+
+
+def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a scene and its record: a sheet that rises over a cloth on the floor, bodies of all kinds, a holder.
+
+    `screen` is the y of a wall before the sheet [m].
+    """
+    bodies: dict[str, Any] = {
+        "ball": {"type": "sphere", "radius": 0.04, "origin": [0.3, 0.0, 0.04]},
+        "block": {"type": "box", "size": [0.1, 0.08, 0.06], "rounding": 0.01, "origin": [-0.3, 0.0, 0.03]},
+        "floor": {"type": "plane"},
+        "peg": {"type": "capsule", "radius": 0.02, "length": 0.1, "origin": [0.0, 0.3, 0.07]},
+        "tetrahedron": {"type": "mesh", "file": "tetrahedron.obj"},
+    }
+    if screen is not None:
+        bodies["wall"] = {"type": "box", "size": [1.0, 0.02, 1.0], "origin": [0.0, screen, 0.5]}
+    scene = Scene.model_validate(
+        {
+            "format": "stickslip-scene/1",
+            "duration": 1.0,
+            "frame_rate": INSTANTS - 1,
+            "default_friction": 0.4,
+            "sheets": {
+                "rug": {"material": "11oz-black-denim", "mesh": {"type": "grid", "size": [0.6, 0.4], "cells": [6, 6]}},
+                "towel": {"material": "gray-interlock", "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [6, 6]}},
+            },
+            "bodies": bodies,
+            "looks": {
+                "sheets": {"rug": {"texture": "stripes"}},
+                "bodies": {"block": {"color": [0.6, 0.1, 0.05], "roughness": 0.3}},
+            },
+        }
+    ).model_dump(mode="json")
+    record: dict[str, Any] = {}
+    for name, (rest, triangles), rise in (("rug", flat(0.6, 0.4, 6), 0.0), ("towel", flat(0.2, 0.1, 6), 0.1)):
+        heights = 0.05 * (rise > 0.0) + rise * np.arange(INSTANTS)
+        track = np.stack([np.column_stack([rest, np.full(len(rest), height)]) for height in heights])
+        record |= {f"{name}.positions": track, f"{name}.rest": rest, f"{name}.triangles": triangles}
+    poses = np.zeros((INSTANTS, len(bodies), 3, 4))
+    poses[..., :3] = np.eye(3)
+    for number, body in enumerate(scene["bodies"].values()):
+        poses[:, number, :, 3] = body.get("origin", [0.0, 0.0, 0.0])
+    poses[-1, 0, :, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # the ball turns
+    corners = np.array([(0, -0.3, 0), (0.1, -0.3, 0), (0, -0.2, 0), (0, -0.3, 0.1)])
+    faces = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)], dtype=np.int32)
+    hand = np.zeros((INSTANTS, 1, 3, 4))
+    hand[..., :3], hand[:, 0, 2, 3] = np.eye(3), 0.05 + 0.1 * np.arange(INSTANTS)
+    more = {"tetrahedron.rest": corners, "tetrahedron.triangles": faces, "body_pose": poses}
+    return scene, record | more | {"holder_pose": hand, "holder_box": np.array([[0.0, 0.1, 0.0]])}
+
+
+def staged(**options: Any) -> tuple[Stage, Geometry, Any]:
+    scene, record = made(**options)
+    stage = Stage(scene, record, lambda name: texture_image(Texture(name)))
+    sheet = first_sheet(scene)
+    return stage, Geometry(record[f"{sheet}.triangles"], record[f"{sheet}.rest"], stage), record[f"{sheet}.positions"]
+
+
+@pytest.fixture(scope="module")
+def usual() -> tuple[Stage, Geometry, Any]:
+    return staged()
+
+
+@pytest.mark.parametrize(("core", "radius"), [((0, 0, 0), 0.05), ((0, 0, 0.1), 0.02), ((0.04, 0.03, 0.02), 0.01)])
+def test_round_bodies_are_their_cores_grown_by_the_radius(core: tuple[float, float, float], radius: float) -> None:
+    vertices, faces = rounded(core, radius)
+    inside = np.clip(vertices, np.negative(core), core)
+    np.testing.assert_allclose(np.linalg.norm(vertices - inside, axis=1), radius)
+    np.testing.assert_allclose(vertices.max(axis=0), np.add(core, radius))
+    volume = sum(np.linalg.det(vertices[[face[0], b, c]]) / 6.0 for face in faces for b, c in pairwise(face[1:]))
+    a, b, c = 2.0 * np.array(core)
+    exact = (
+        a * b * c + 2 * radius * (a * b + b * c + c * a) + np.pi * radius**2 * (a + b + c) + 4 / 3 * np.pi * radius**3
+    )
+    assert volume == pytest.approx(exact, rel=0.03)  # outward, closed, and a polyhedron
+    colors = gores(np.ones((1, 3)), len(faces))
+    assert 0.4 < (colors[:, 0] < 0.5).mean() < 0.6
+
+
+def test_the_first_sheet_without_a_texture_takes_the_axis() -> None:
+    scene, _ = made()
+    assert first_sheet(scene) == "towel"
+    scene["looks"]["sheets"]["towel"] = {"texture": "dots"}
+    assert first_sheet(scene) == "rug"
+
+
+def test_bodies_are_where_the_record_has_them_and_a_little_inside(usual: Any) -> None:
+    stage, _, track = usual
+    assert stage.floor == FLOOR
+    last = {prop.name: at for prop, at in zip(stage.props, stage.placed(INSTANTS - 1, track[-1]), strict=True)}
+    assert [*last] == ["rug", "ball", "block", "peg", "tetrahedron", "holder-0"]
+    np.testing.assert_allclose(np.linalg.norm(last["ball"] - [0.3, 0.0, 0.04], axis=1), 0.04 - SUNK)
+    turned = stage.placed(0, track[0])[1] - [0.3, 0.0, 0.04]
+    now = last["ball"] - [0.3, 0.0, 0.04]
+    np.testing.assert_allclose(now, np.column_stack([-turned[:, 1], turned[:, 0], turned[:, 2]]), atol=1e-12)
+    np.testing.assert_allclose(np.ptp(last["block"], axis=0), np.subtract([0.1, 0.08, 0.06], 2 * SUNK))
+    assert last["peg"][:, 2].max() == pytest.approx(0.07 + 0.05 + 0.02 - SUNK)
+    assert last["holder-0"][:, 2].mean() == pytest.approx(0.25)
+    assert (np.abs(last["rug"][:, 2]) < 0.002).all()
+
+
+def test_everything_has_a_code_and_its_colour(usual: Any) -> None:
+    stage, geometry, track = usual
+    names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
+    camera = framed("high", np.concatenate([track[-1], *stage.placed(2, track[-1])]), size=224)
+    points = geometry.points(track[-1], 2)
+    truth = ground_truth(geometry, points, points, camera)
+    seen = {names[code] for code in np.unique(truth.segmentation)}
+    assert seen == {*names} - {"background"}
+    cloth = np.isin(truth.segmentation, [names.index("rug"), names.index("towel")])
+    assert np.isfinite(truth.uv[cloth]).all()
+    assert np.isnan(truth.uv[~cloth]).all()
+    assert np.nanmax(truth.uv[..., 1]) < 0.68  # a picture covers the longer side
+    light = np.ones((224, 224, 3), dtype=np.float16)
+    factor = Composer(geometry).on_floor(light, points, camera, np.full(light.shape, 3.0, dtype=np.float32))
+    red = factor[truth.segmentation == names.index("block")]
+    np.testing.assert_allclose(np.median(red, axis=0), np.array([0.6, 0.1, 0.05]) / 0.25, rtol=1e-3)
+    rug = factor[truth.segmentation == names.index("rug")]
+    assert rug.mean() == pytest.approx(1.0, abs=0.15)
+    assert rug[:, 1].std() > 0.5  # red and white stripes
+    np.testing.assert_allclose(factor[truth.segmentation == names.index("towel")][:, 0].mean(), 1.0, atol=0.2)
+
+
+@pytest.mark.parametrize("name", FRAMING)
+def test_cameras_frame_what_moves_and_nothing_else(usual: Any, name: str) -> None:
+    stage, geometry, track = usual
+    camera = stage.camera(name, geometry, 224)
+    assert camera.position[1] < -0.2  # front: nothing hides the cloth there
+    assert camera.overflow(track) == pytest.approx(camera.overflow(stage.moving(geometry)))
+    assert -14.0 < camera.overflow(stage.moving(geometry)) < -6.0
+    assert camera.position[2] > 0.1
+    assert not camera.in_frame(stage.placed(0, track[0])[0])  # the rug lies still
+
+
+def test_a_camera_goes_around_what_hides_the_cloth() -> None:
+    stage, geometry, _ = staged(screen=-0.15)
+    assert stage.camera("front", geometry, 224).position[1] > -0.05
+
+
+def test_a_scene_without_a_plane_has_no_floor() -> None:
+    scene, record = made()
+    record["body_pose"] = np.delete(record["body_pose"], [*scene["bodies"]].index("floor"), axis=1)
+    del scene["bodies"]["floor"]
+    stage = Stage(scene, record, lambda name: texture_image(Texture(name)))
+    geometry = Geometry(record["towel.triangles"], record["towel.rest"], stage)
+    points = geometry.points(record["towel.positions"][0], 0)
+    truth = ground_truth(geometry, points, points, framed("front", record["towel.positions"], size=224))
+    assert stage.floor is None
+    assert np.isinf(truth.depth[truth.segmentation == 0]).all()
+    assert (truth.segmentation == 0).any()
