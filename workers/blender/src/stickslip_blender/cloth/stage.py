@@ -52,8 +52,8 @@ Array = npt.NDArray[Any]
 
 def first_sheet(scene: Mapping[str, Any]) -> str:
     """Return the name of the sheet that takes the axis `texture`: the first without one of its own, or the first."""
-    own = scene["looks"]["sheets"]
-    return next((name for name in scene["sheets"] if name not in own), next(iter(scene["sheets"])))
+    names, own = list[str](scene["sheets"]), scene["looks"]["sheets"]
+    return next((name for name in names if name not in own), names[0])
 
 
 class Stage:
