@@ -1,6 +1,7 @@
 """The REST interface: what it accepts, what it refuses and how, pages, idempotency."""
 
 import json
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -139,6 +140,30 @@ def test_a_report_with_nan_in_its_labels_is_refused(client: httpx.Client) -> Non
     report = {"task_id": "simulate-0", "token": 1, "result": {"outcome": "succeeded", "output": output}}
     body = json.dumps({"worker_id": "worker-0", "reports": [report]}).encode()
     problem(client.post("/v1/worker/report", content=body, headers=JSON), 400, "malformed_body")
+
+
+@pytest.mark.parametrize(
+    ("body", "rule"),
+    [
+        (json.dumps({"kind": "rod_hang"} | {f"key-{n}": 1 for n in range(150_000)}), "there is no such field"),
+        ("{" + ",".join(f'"key-{n}": 1' for n in range(150_000)) + ', "key-149999": 2}', "'key-149999' is there twice"),
+        ('{"axes":' * 100_000 + "1" + "}" * 100_000, "nested too deeply"),
+    ],
+    ids=["unknown", "doubled", "nested"],
+)
+def test_a_body_of_many_keys_is_refused_at_once(client: httpx.Client, body: str, rule: str) -> None:
+    headers = {"Content-Type": "application/json"}
+    before = time.process_time()
+    answer = client.post("/v1/jobs", content=body, headers=headers)
+    assert time.process_time() - before < 10.0  # it takes 0.5 s; the quadratic rule took minutes
+    assert answer.status_code in (400, 422)
+    assert rule in answer.text
+    assert len(answer.content) < 50_000
+
+
+def test_browsers_do_not_guess_types(client: httpx.Client) -> None:
+    for path in ("/v1/jobs", "/", "/openapi.json", "/nowhere"):
+        assert client.get(path).headers["X-Content-Type-Options"] == "nosniff"
 
 
 def test_another_content_type_is_refused(client: httpx.Client) -> None:

@@ -49,6 +49,17 @@ def test_a_place_that_is_no_store_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_nobody_else_reads_the_database(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir(mode=0o755)
+    (data / "coordinator.sqlite3").touch(mode=0o644)
+    context = Context.open(Settings(data=data, durable=False))
+    start(context)
+    (database,) = data.glob("coordinator.sqlite3")
+    context.close()
+    assert [place.stat().st_mode & 0o777 for place in (data, database)] == [0o700, 0o600]
+
+
 def test_the_environment_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STICKSLIP_STORE", "s3:/lab/store")
     with pytest.raises(SettingsError, match=REFUSAL):

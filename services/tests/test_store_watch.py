@@ -128,6 +128,20 @@ def test_a_store_that_is_a_file_pauses_the_job(context: Context, worker: Pretend
     assert show_job(context, job).message == ""
 
 
+def test_a_job_from_before_the_first_worker_is_planned_once_the_store_is_free(context: Context) -> None:
+    root = Path(context.settings.store_place)
+    if root.exists():
+        root.rmdir()
+    root.write_text("in the way")
+    job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
+    sweep(context)
+    PretendWorker(DirectApi(context), context.store).register()
+    root.unlink()
+    sweep(context)
+    assert show_job(context, job).state is JobState.queued
+    assert show_job(context, job).message == ""
+
+
 def test_a_store_that_only_a_worker_cannot_use_costs_no_try(
     context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:

@@ -1,8 +1,11 @@
 """Webhooks: every event is delivered, in order and signed, whatever receivers and coordinators do."""
 
 import json
+import socket
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -11,6 +14,7 @@ from typing import Any
 import httpx
 import pytest
 from standardwebhooks import Webhook as Verifier
+from stickslip_services.access import webhooks
 from stickslip_services.access.webhooks import (
     CLAIM_SECONDS,
     GIVE_UP_SECONDS,
@@ -195,6 +199,41 @@ def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
     with context.database.read() as connection:
         (shown,) = list_webhooks(connection, clock())
     assert "ConnectError" in shown.fault
+
+
+def test_a_receiver_that_trickles_holds_up_no_other(
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    messenger: WebhookDelivery,
+    receiver: Receiver,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(webhooks, "ANSWER_SECONDS", 1.5)
+    monkeypatch.setattr(webhooks, "WAIT_SECONDS", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as slow:
+        threading.Thread(target=trickle, args=(slow,), daemon=True).start()
+        slow_hook, _ = made(context, f"http://127.0.0.1:{slow.getsockname()[1]}/")
+        made(context, receiver.url)
+        run_job(context, worker, 1.0)
+        began = time.monotonic()
+        messenger.run()
+        wait_until(lambda: [one for one in receiver.told if one[1] != "queued"] == ONE_JOB, seconds=1)
+        assert time.monotonic() - began < 1.4
+
+        def fault() -> str:
+            with context.database.read() as connection:
+                return next(one.fault for one in list_webhooks(connection, clock()) if one.id == slow_hook)
+
+        wait_until(lambda: "did not answer within 1.5 s" in fault(), seconds=5)
+
+
+def trickle(server: socket.socket) -> None:
+    """Answer with one byte every 0.2 s."""
+    with suppress(OSError), server.accept()[0] as line:
+        for byte in b"HTTP/1.1 204 No Content\r\n" * 100:
+            line.sendall(bytes([byte]))
+            time.sleep(0.2)
 
 
 @pytest.mark.parametrize("url", ["http://example.org/hook", "ftp://127.0.0.1/", "https://", "hook", "http://[", ""])

@@ -44,6 +44,18 @@ def store(proxy: Proxy, request: pytest.FixtureRequest) -> BucketStore:
     return BucketStore("bucket", request.node.name)
 
 
+def test_a_bucket_without_a_request_for_many_deletes_one_by_one(proxy: Proxy, store: BucketStore) -> None:
+    kept, gone = store.publish(SMALL), store.publish(LARGE)
+    store.show(gone, "dataset", 1, "a")
+    store.show(gone, "dataset", 1, "b")
+    proxy.fault = lambda method, path: "501" if method == "POST" and "delete" in path else ""
+    store.delete(gone)
+    store.hide("dataset", 1)
+    assert proxy.counts["501"] > 0
+    assert not store.is_shown("dataset", 1)
+    assert [found.name for found in store.stored()] == [kept]
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_request_may_fail_once(proxy: Proxy, store: BucketStore, fault: str) -> None:
     for data in (SMALL, LARGE):

@@ -64,7 +64,7 @@ def _handler(proxy: Proxy) -> type[BaseHTTPRequestHandler]:
             body = self.rfile.read(size)
             if fault == "late":
                 time.sleep(0.3)
-            if fault in ("503", "409", "500"):
+            if fault in ("503", "409", "500", "501"):
                 return self._answer(int(fault), {"Content-Type": "application/xml"}, f"<Error>{fault}</Error>".encode())
             # S3 looks and writes at once; moto does one after the other, and lets two writers of one object win.
             conditional = self.command == "PUT" and "If-None-Match" in self.headers

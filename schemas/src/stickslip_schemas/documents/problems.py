@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
+from itertools import islice
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
@@ -61,14 +62,14 @@ class Problem(BaseModel):
     errors: list[FieldError] = Field(default_factory=list)
 
 
-def field_errors(error: ValidationError, document: Any, of: Any) -> list[FieldError]:
+def field_errors(error: ValidationError, document: Any, of: Any, *, at_most: int | None = None) -> list[FieldError]:
     """Return one FieldError for each of pydantic's, with pointers into `document` as the user wrote it.
 
     `of` is the type that the document was to be, a model or a union of models: misspelt words are compared with its
-    fields and values.
+    fields and values. This takes time for each error: `at_most` bounds it for a document of many.
     """
-    items = [item for item in error.errors(include_url=False) if not _is_echo(item)]
-    return [_field_error(item, document, of) for item in items]
+    items = (item for item in error.errors(include_url=False) if not _is_echo(item))
+    return [_field_error(item, document, of) for item in islice(items, at_most)]
 
 
 def _is_echo(item: ErrorDetails) -> bool:

@@ -5,10 +5,12 @@ sequence of events, so events arrive in order, and none is lost when a process i
 with the same `webhook-id`.
 """
 
+import asyncio
 import json
 import logging
 import secrets
 import threading
+import time
 from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +32,13 @@ from stickslip_services.errors import NotFoundError, SettingsError
 logger = logging.getLogger(__name__)
 
 ANSWER_SECONDS = 15.0
-"""Timeout of the receiver's answer [s]."""
+"""Time that a receiver has for its answer, from the first attempt to connect to the status [s]."""
+
+MOST_AT_ONCE = 32
+"""Webhooks that are delivered to at the same time."""
+
+WAIT_SECONDS = 1.0
+"""Time that one round waits for its deliveries [s]; slower ones go on beside the next round."""
 
 CLAIM_SECONDS = 60.0
 """Duration of a coordinator's claim on a webhook [s]."""
@@ -117,14 +125,26 @@ class WebhookDelivery:
         self._stopping.set()
 
     def run(self) -> None:
-        """Deliver all events that webhooks have not received, unless they wait for a retry."""
+        """Deliver all events that webhooks have not received, unless they wait for a retry.
+
+        Each webhook has a thread of its own, so a slow receiver holds up no other. The threads of slow ones go on when
+        this returns.
+        """
         with self._database.read() as connection:
             due = connection.scalars(select(webhooks.c.seq).where(_is_due(self._clock()))).all()
             behind = [seq for seq in due if _next_message(connection, seq) is not None]
-        for seq in behind:
-            with self._claimed(seq) as is_ours:
-                while is_ours and not self._stopping.is_set() and self._deliver_one(seq):
-                    pass
+        threads = [threading.Thread(target=self._deliver, args=(seq,), daemon=True) for seq in behind[:MOST_AT_ONCE]]
+        for thread in threads:
+            thread.start()
+        end = time.monotonic() + WAIT_SECONDS
+        for thread in threads:
+            thread.join(max(0.0, end - time.monotonic()))
+
+    def _deliver(self, seq: int) -> None:
+        """Deliver the messages of a webhook, unless another coordinator or thread does so."""
+        with self._claimed(seq) as is_ours:
+            while is_ours and not self._stopping.is_set() and self._deliver_one(seq):
+                pass
 
     @contextmanager
     def _claimed(self, seq: int) -> Iterator[bool]:
@@ -203,10 +223,19 @@ def _send(url: str, secret: str, message_id: str, body: str, now: float) -> str:
         "webhook-signature": Signer(secret).sign(message_id, as_datetime(int(now)), body),
     }
     try:
-        response = httpx.post(url, content=body, headers=headers, timeout=ANSWER_SECONDS, trust_env=False)
+        status = asyncio.run(asyncio.wait_for(_status(url, body, headers), ANSWER_SECONDS))
+    except TimeoutError:
+        return f"the receiver did not answer within {ANSWER_SECONDS:g} s"
     except httpx.HTTPError as error:
         return f"{type(error).__name__}: {error}"[:500]
-    return "" if response.is_success else f"the receiver answered {response.status_code}, and 2xx was expected"
+    return "" if 200 <= status < 300 else f"the receiver answered {status}, and 2xx was expected"
+
+
+async def _status(url: str, body: str, headers: dict[str, str]) -> int:
+    """Post a message; return the status of the answer, whose body is not read."""
+    client = httpx.AsyncClient(timeout=None, trust_env=False)
+    async with client, client.stream("POST", url, content=body, headers=headers) as response:
+        return response.status_code
 
 
 def _find(connection: Connection, webhook_id: str) -> None:

@@ -1,6 +1,7 @@
 """Request bodies: strictly parsed JSON documents, refused with pointers to the wrong fields."""
 
 import json
+from collections import Counter
 from typing import Any, Generic, TypeVar
 
 from fastapi import Request
@@ -50,14 +51,15 @@ class JsonBody(Generic[T]):
             json.dumps(document, allow_nan=False)  # models refuse NaN with its place; this covers free-form parts
             return valid
         except ValidationError as error:
-            fields = field_errors(error, document, self._of)
+            fields = field_errors(error, document, self._of, at_most=SHOWN_ERRORS)
+            count = error.error_count()
         except RecursionError as error:
             raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
         except ValueError as error:
             raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}") from error
         detail = "; ".join(f"{field.pointer or 'the document'}: {field.rule}" for field in fields[:3])
-        more = f" (and {len(fields) - 3} more)" if len(fields) > 3 else ""
-        raise ProblemError(422, ProblemCode.validation_failed, detail + more, fields=fields[:SHOWN_ERRORS])
+        more = f" (and {count - 3} more)" if count > 3 else ""
+        raise ProblemError(422, ProblemCode.validation_failed, detail + more, fields=fields)
 
 
 def parse_json(body: bytes) -> Any:
@@ -77,9 +79,8 @@ def parse_json(body: bytes) -> Any:
 def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     document = dict(pairs)
     if len(document) != len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"the key {twice!r} is there twice")
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key {twice[:100]!r} is there twice")
     return document
 
 

@@ -15,7 +15,9 @@ _REQUEST_ID = re.compile(r"[A-Za-z0-9_.:-]{1,128}")
 
 
 class RequestIdMiddleware:
-    """Gives every request an id, the client's where it sent a sensible `X-Request-Id`, and returns it."""
+    """Gives every request an id, the client's where it sent a sensible `X-Request-Id`, and returns it.
+
+    Every answer also forbids browsers to guess its type."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -31,7 +33,9 @@ class RequestIdMiddleware:
 
         async def send_with_id(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message)["X-Request-Id"] = request_id
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-Id"] = request_id
+                headers["X-Content-Type-Options"] = "nosniff"
             await send(message)
 
         await self._app(scope, receive, send_with_id)

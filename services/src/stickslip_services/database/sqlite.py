@@ -1,5 +1,6 @@
 """SQLite: a file in the data directory, for one coordinator."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ class SqliteDatabase(Database):
     """Transactions on one file. A write takes SQLite's write lock with its first statement (`BEGIN IMMEDIATE`)."""
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _close_to_others(path)
         # FULL: accepted jobs and dataset versions survive a power cut. A commit costs an fsync; leases and reports
         # come in batches, so there are only a few a second.
         self._pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
@@ -44,6 +45,19 @@ class SqliteDatabase(Database):
         connection.isolation_level = None  # transactions are begun by _begin, not by the driver
         for pragma in self._pragmas:
             connection.execute(f"PRAGMA {pragma}")
+
+
+def _close_to_others(path: Path) -> None:
+    """Let nobody but the owner read the data directory and the database, which holds secrets of webhooks.
+
+    SQLite gives its log the permissions of the database.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for place, mode in ((path.parent, 0o700), (path, 0o600)):
+        if place == path:
+            place.touch(mode=mode)
+        if place.stat().st_uid == os.geteuid():
+            place.chmod(mode)
 
 
 def _begin(connection: Connection) -> None:

@@ -28,8 +28,9 @@ def start(context: Context) -> None:
 
 
 def sweep(context: Context) -> None:
-    """Watch the store, take back expired leases, retry tasks, and update the messages of jobs that wait."""
+    """Watch the store, plan jobs that wait, take back expired leases, retry tasks, and update messages."""
     _watch_store(context)
+    plan_waiting_jobs(context)
     take_back(context)
     note_stranded(context)
     _watch_etas(context)

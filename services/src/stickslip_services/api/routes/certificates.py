@@ -19,7 +19,6 @@ _PAGE: dict[str, Any] = {"text/html": {"schema": {"type": "string"}}}
 _INERT = {
     # The page is whatever was uploaded: it may show itself, and do nothing else.
     "Content-Security-Policy": "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox",
-    "X-Content-Type-Options": "nosniff",
 }
 
 
