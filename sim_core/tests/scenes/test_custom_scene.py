@@ -73,7 +73,7 @@ class TestRunScene:
         every = np.arange(len(MESH.rest) - 1)  # one vertex is free
         thrown = Keyframes([0.0, 0.5], np.array([[0, 0, 0], [0, 0, 1.0]]), np.zeros((2, 3)))
         run = custom.scene(
-            [sheet(0.1, holders=[Holder(every, thrown.pose, [(0.0, 0.25)])])],
+            [sheet(0.1, holders=[Holder(every, thrown.pose, (0.0, 0.25))])],
             [[0.5]],
             duration=0.5,
             frame_rate=20.0,
@@ -91,7 +91,7 @@ class TestRunScene:
         corner = np.flatnonzero((MESH.rest > 0.029).all(axis=1))
         lifted = Keyframes([0.0, 0.1, 1.0], np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0.05]]), np.zeros((3, 3)))
         run = custom.scene(
-            [sheet(0.5, holders=[Holder(corner, lifted.pose, [(0.1, np.inf)])])],
+            [sheet(0.5, holders=[Holder(corner, lifted.pose, (0.1, np.inf))])],
             [[0.5]],
             duration=2.0,
             frame_rate=20.0,

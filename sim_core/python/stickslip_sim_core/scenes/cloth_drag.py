@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.scenes.hanging import Hung, hung
 from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.kind import Record
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, check_range, cloth_kind
@@ -69,37 +69,8 @@ def holder_path(time: float) -> Floats:
 DURATION = duration_of(DROP) + LEGS * duration_of(DRAG)
 """Of drop-and-drag [s]."""
 
-HANGING = SolverSettings("hanging", 0.05, tolerance=1e-5, step_error=None)
-"""Solver settings of the hung shape, so that all presets start from the same."""
-
-HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
-"""Factors of the bias, in turn: with a large bias the cloth has one shape, which is followed as the bias falls."""
-
-SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
-"""Steps with each factor, and their damping [1/s]."""
-
-FIRST_STEP, GROWTH = 0.002, 1.3
-"""First step [s], and growth of the next ones up to 50 ms: the flat cloth buckles when it is released."""
-
-LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
-"""Steps then grow to this length [s] until no vertex moves further than this in one [m]; at most so many steps."""
-
-SHORTENED = 0.1
-"""Share of each displacement that is taken once one is longer than half of the one before. A step has the stiffness of
-its start, so a fabric that stiffens fast would swing about its shape at rest forever."""
-
 FRAMES = 300
 """Frames of a whole drop-and-drag."""
-
-
-@dataclass(frozen=True, eq=False)
-class Tilt:
-    """Gravity along x, over that along -z, which breaks the symmetry of the drop."""
-
-    side: int
-    bias: float
-    of_vertices: Floats
-    """(V,)"""
 
 
 def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
@@ -108,64 +79,12 @@ def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
     return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
 
 
-@dataclass(frozen=True, eq=False)
-class Hung:
-    """The shape of a cloth at rest under its holders."""
-
-    positions: Floats
-    """(V, 3) [m]"""
-
-    held: NDArray[np.intp]
-    """Vertices under the holders."""
-
-    tilt: Tilt
-    softest: float
-    """Smallest eigenvalue of stiffness over mass [1/s^2]; positive if it is stable."""
-
-    reason: str
-    """Reason why it is no stable equilibrium, or empty."""
-
-
 def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = None) -> Hung:
-    """Return the shape in which the cloth hangs at rest under its holders, over the floor.
-
-    A cloth held at two corners has many shapes at rest. This one is reached as the tilt of gravity falls from 30 times
-    the bias to the bias. It is settled until nothing moves, and its stability is checked.
-    """
-    held = held_by_holders(mesh)
-    cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
+    """Return the shape in which the cloth hangs at rest under its holders, over the floor."""
     flat = np.zeros((len(mesh.rest), 3))
     flat[:, 1] = mesh.rest[:, 0]
     flat[:, 2] = mesh.rest[:, 1] + SIDE / 2 + CLEARANCE
-    rng = np.random.default_rng(seed)
-    side = 1 if rng.random() < 0.5 else -1
-    bias = float(rng.uniform(1e-3, 3e-3))
-    twist = float(rng.uniform(-0.3, 0.3))
-    tilt = Tilt(side, bias, side * bias * (1.0 + twist * mesh.rest[:, 0] / (SIDE / 2)))
-    cloth.set_state(flat)
-    dt = FIRST_STEP
-    for times in HANGING_TILTS:
-        cloth.gravity[:, 0] = times * tilt.of_vertices * GRAVITY
-        for _ in range(SETTLING_STEPS):
-            cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
-            dt = min(GROWTH * dt, HANGING.time_step)
-    moved, steps, share = np.inf, 0, 1.0
-    while (dt < LONGEST or moved > AT_REST) and steps < HANGING_STEPS_MAX:
-        before, moved_before = cloth.positions, moved
-        dt = min(1.5 * dt, LONGEST)
-        cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
-        moved, steps = float(np.abs(cloth.positions - before).max()), steps + 1
-        if dt == LONGEST and moved > 0.5 * moved_before:
-            share = SHORTENED
-        if share < 1.0 and moved > AT_REST:
-            cloth.set_state(before + share * (cloth.positions - before))
-    softest = cloth.softest()
-    reason = ""
-    if not moved <= AT_REST:
-        reason = f"the hung cloth did not come to rest: it moved by {moved:.1e} m in {dt:g} s"
-    elif not softest > 0.0:
-        reason = f"the hung cloth is not stable: its softest eigenvalue is {softest:.2g} 1/s^2"
-    return Hung(cloth.positions, held, tilt, softest, reason)
+    return hung(mesh, fabric, flat, held_by_holders(mesh), normal=(1.0, 0.0, 0.0), seed=seed, kernel=kernel)
 
 
 def scene(
@@ -199,22 +118,22 @@ def scene(
         ValueError: An argument breaks its rule.
     """
     square = checked_square(mesh, frames)
-    hung = hang(square, fabric_of(material), seed=seed, kernel=kernel)
+    cloth = hang(square, fabric_of(material), seed=seed, kernel=kernel)
     return Scene(
         mesh=square,
         fabrics=[fabric_of(material)],
         preset=preset_named(preset),
-        start=hung.positions,
-        holders=[Holder(hung.held, holder_pose)],
-        motion=motion_of(hung, len(square.rest), [plane(mu)]),
+        start=cloth.positions,
+        holders=[Holder(cloth.held, holder_pose)],
+        motion=motion_of(cloth, len(square.rest), [plane(mu)]),
         self_contact=None if self_friction is None else SelfContact(self_friction),
         frames=frames,
         frame_rate=FRAME_RATE,
-        forces=lambda cloth: dragged_forces(cloth, hung, cloth.contact_force()),
+        forces=lambda solver: dragged_forces(solver, cloth, solver.contact_force()),
         tracks={"holder_pose": holder_pose},
-        labels=lambda run: drop_labels(run, hung),
+        labels=lambda run: drop_labels(run, cloth),
         kernel=kernel,
-        reason=hung.reason,
+        reason=cloth.reason,
     )
 
 
@@ -246,7 +165,7 @@ def motion_of(hung: Hung, vertices: int, floor: Sequence[Body]) -> Callable[[flo
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
         gravity = np.tile([0.0, 0.0, -GRAVITY], (vertices, 1))
-        gravity[: len(hung.positions), 0] = hung.tilt.of_vertices * GRAVITY * (1.0 - upright)
+        gravity[: len(hung.positions)] += hung.tilt * GRAVITY * (1.0 - upright)
         return gravity, floor
 
     return motion
@@ -279,4 +198,4 @@ def drop_labels(run: ClothRun, hung: Hung) -> dict[str, float]:
     if frame < len(run.positions):
         x = run.positions[frame, :, 0]
         landed = int(np.sign(x.mean() - x[hung.held].mean()))
-    return {"bias_side": hung.tilt.side, "bias": hung.tilt.bias, "landed_side": landed}
+    return {"bias_side": hung.side, "bias": hung.bias, "landed_side": landed}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,9 @@ ALWAYS = (0.0, np.inf)
 
 @dataclass(frozen=True, eq=False)
 class Holder:
-    """Vertices that move as one rigid body from each grasp to its release.
+    """Vertices that move as one rigid body from a grasp to a release.
 
-    At the time t0 of a grasp the holder takes each vertex where it is: x(t) = M(t) M(t0)^-1 x(t0), M being its pose.
+    At the time t0 of the grasp the holder takes each vertex where it is: x(t) = M(t) M(t0)^-1 x(t0), M being its pose.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -28,19 +27,18 @@ class Holder:
     pose: Callable[[float], Floats]
     """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]."""
 
-    grasps: Sequence[tuple[float, float]] = (ALWAYS,)
-    """Intervals [s] from a grasp to a release, ascending."""
+    grasp: tuple[float, float] = ALWAYS
+    """When it takes hold, and when it lets go [s]."""
 
     def __post_init__(self) -> None:
-        instants = [instant for grasp in self.grasps for instant in grasp]
-        if not all(before < after for before, after in pairwise(instants)) or min(instants, default=0.0) < 0.0:
-            raise ValueError(f"grasps: must ascend from 0 s or later, got {list(self.grasps)}")
+        if not 0.0 <= self.grasp[0] < self.grasp[1]:
+            raise ValueError(f"grasp: must ascend from 0 s or later, got {list(self.grasp)}")
         if not len(self.vertices):
             raise ValueError("vertices: a holder must hold a vertex, got none")
 
-    def grasps_at(self, time: float) -> bool:
+    def holds(self, time: float) -> bool:
         """Return whether it holds its vertices from this time [s] on."""
-        return any(begin <= time < end for begin, end in self.grasps)
+        return self.grasp[0] <= time < self.grasp[1]
 
 
 class Hands:
@@ -53,7 +51,7 @@ class Hands:
 
     def __init__(self, holders: Sequence[Holder], positions: Floats) -> None:
         self.holders = tuple(holders)
-        self.events = sorted({t for holder in holders for grasp in holder.grasps for t in grasp if 0.0 < t < np.inf})
+        self.events = sorted({t for holder in holders for t in holder.grasp if 0.0 < t < np.inf})
         """Times of all grasps and releases after 0 s [s], ascending."""
         self._taken: dict[int, Floats] = {}
         self.take(0.0, positions)
@@ -62,19 +60,18 @@ class Hands:
         """Grasp and release what this time [s] asks for, and return the held vertices (K,)."""
         taken: dict[int, Floats] = {}
         for number, holder in enumerate(self.holders):
-            if not holder.grasps_at(time):
-                continue
-            pose = holder.pose(time)
-            goes_on = number in self._taken and time not in [begin for begin, _ in holder.grasps]
-            taken[number] = self._taken[number] if goes_on else (positions[holder.vertices] - pose[:, 3]) @ pose[:, :3]
+            if holder.holds(time):
+                pose = holder.pose(time)
+                place = (positions[holder.vertices] - pose[:, 3]) @ pose[:, :3]
+                taken[number] = self._taken.get(number, place)
         self._taken = taken
         return self.vertices
 
     @property
     def vertices(self) -> NDArray[np.int32]:
         """(K,): held vertices, holder by holder."""
-        held = [np.empty(0, np.int32), *(self.holders[number].vertices for number in self._taken)]
-        return np.concatenate(held).astype(np.int32)
+        held = [self.holders[number].vertices for number in self._taken]
+        return np.concatenate([np.empty(0, np.int32), *held], dtype=np.int32)
 
     def at(self, time: float) -> Floats:
         """Return the positions of the held vertices at a time [s]: (K, 3) [m]."""

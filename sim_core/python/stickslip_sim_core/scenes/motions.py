@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.meshes import Mesh
 
 
 def _times(times: ArrayLike) -> Floats:
@@ -34,9 +36,10 @@ def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[float],
 
 @dataclass(frozen=True, eq=False)
 class Keyframes:
-    """A rigid motion through keyframes, without overshoot: monotone cubics [Fritsch & Carlson 1980].
+    """A rigid motion through keyframes. Nothing moves before the first and after the last one.
 
-    Nothing moves before the first and after the last keyframe.
+    It is smooth by default, without overshoot: monotone cubics [Fritsch & Carlson 1980]. A linear motion has an even
+    speed between keyframes; from each on, its speed changes evenly for `ramp` seconds, which ends later by as much.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -54,6 +57,11 @@ class Keyframes:
     about: ArrayLike = (0.0, 0.0, 0.0)
     """(3,): the point at the start that rotations are about [m]."""
 
+    linear: bool = False
+
+    ramp: float = 0.0
+    """Of a linear motion [s], 0 or more."""
+
     _path: Callable[[float], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -66,7 +74,14 @@ class Keyframes:
             object.__setattr__(self, name, value)
         values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
         times = np.asarray(self.times)
-        object.__setattr__(self, "_path", _through(times, values, _monotone(times, values)))
+        path = _evenly(times, values, self.ramp) if self.linear else _through(times, values, _monotone(times, values))
+        object.__setattr__(self, "_path", path)
+
+    @property
+    def last(self) -> float:
+        """When the motion ends [s]; 0 if nothing moves."""
+        values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
+        return 0.0 if (values == values[0]).all() else float(np.asarray(self.times)[-1]) + self.ramp
 
     def at(self, time: float) -> tuple[Floats, Floats]:
         """Return the motion at a time [s]: x -> R x + b, as R (3, 3) and b (3,) [m]."""
@@ -77,8 +92,61 @@ class Keyframes:
 
     def pose(self, time: float) -> Floats:
         """Return the motion at a time [s] as (3, 4)."""
-        R, shift = self.at(time)
-        return np.column_stack([R, shift])
+        return np.column_stack(self.at(time))
+
+
+@dataclass(frozen=True, eq=False)
+class Spin:
+    """A rotation that begins at a time, gains its speed evenly, and keeps it."""
+
+    axis: ArrayLike
+    """(3,), of any length above 0."""
+
+    speed: float
+    """[rad/s]"""
+
+    begin: float
+    """[s]"""
+
+    ramp: float
+    """Time in which it gains its speed [s]."""
+
+    about: ArrayLike
+    """(3,): a point of the axis [m]."""
+
+    @property
+    def last(self) -> float:
+        """When the motion ends [s]: never, unless nothing moves."""
+        return float("inf") if self.speed else 0.0
+
+    def pose(self, time: float) -> Floats:
+        """Return the motion at a time [s]: x -> A x + b, as (3, 4)."""
+        t = max(time - self.begin, 0.0)
+        angle = self.speed * (0.5 * t * t / self.ramp if t < self.ramp else t - 0.5 * self.ramp)
+        axis, about = np.asarray(self.axis, float), np.asarray(self.about, float)
+        R = rotation(angle * axis / np.linalg.norm(axis))
+        return np.column_stack([R, about - R @ about])
+
+
+RigidMotion = Keyframes | Spin
+
+
+def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[float], Floats]:
+    """Return v0 + sum over k of (s_k - s_(k-1)) r(t - t_k), s_k being the slope after t_k.
+
+    r(u) = u^2/(2 ramp) up to the ramp, and u - ramp/2 from there on; 0 before 0.
+    """
+    slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
+    still = np.zeros((1, values.shape[1]))
+    changes = np.diff(np.concatenate([still, slopes, still]), axis=0)
+
+    def at(time: float) -> Floats:
+        u = np.clip(time - times, 0.0, None)
+        reached = np.where(u < ramp, 0.5 * u * u / (ramp or 1.0), u - 0.5 * ramp)
+        found: Floats = values[0] + reached @ changes
+        return found
+
+    return at
 
 
 def _monotone(times: Floats, values: Floats) -> Floats:
@@ -100,7 +168,9 @@ def rotation(turn: ArrayLike) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class MovingMesh:
-    """Triangles whose vertices pass through given frames, with the slopes of parabolas through three of them.
+    """Triangles that move smoothly through given frames, with the slopes of parabolas through three of them.
+
+    Before the first and after the last frame nothing moves.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -110,43 +180,83 @@ class MovingMesh:
     """(T, 3)"""
 
     times: ArrayLike
-    """(F,) [s], ascending, from 0 on. Before the first and after the last frame nothing moves."""
+    """(F,) [s], ascending, from 0 on."""
 
-    positions: ArrayLike
-    """(F, N, 3) [m]"""
+    frames: ArrayLike
+    """(F, N, 3): vertices [m]; of a skin, (F, B, 3, 4): motions of bones, x -> A x + b."""
+
+    rest: ArrayLike | None = None
+    """Of a skin (N, 3): vertices where bones do not move [m]."""
+
+    weights: ArrayLike | None = None
+    """Of a skin (N, B): how much each vertex follows each bone."""
+
+    strength: float = 1.0
+    """Factor of all displacements since the first frame."""
 
     _path: Callable[[float], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times))
-        path = np.asarray(self.positions, float)
-        if path.ndim != 3 or path.shape[2] != 3 or not np.isfinite(path).all():
-            raise ValueError(f"positions: must be finite, of shape (frames, vertices, 3), got {path.shape}")
-        times = np.asarray(self.times)
+        path, times = np.asarray(self.frames, float), np.asarray(self.times)
+        shape: tuple[Any, ...] = ("vertices", 3)
+        if self.rest is not None:
+            rest, weights = np.asarray(self.rest, float), np.asarray(self.weights, float)
+            if rest.ndim != 2 or rest.shape[1] != 3 or weights.ndim != 2 or len(weights) != len(rest):
+                raise ValueError(f"rest, weights: must be (N, 3) and (N, bones), got {rest.shape} and {weights.shape}")
+            if not (np.isfinite(rest).all() and np.isfinite(weights).all()):
+                raise ValueError("rest, weights: must be finite")
+            shape = (weights.shape[1], 3, 4)
+        if path.ndim != len(shape) + 1 or path.shape[2:] != shape[1:] or not np.isfinite(path).all():
+            raise ValueError(f"frames: must be finite, of shape {('frames', *shape)}, got {path.shape}")
+        if shape[0] not in ("vertices", path.shape[1]):
+            raise ValueError(f"frames: must be of {shape[0]} bones, as weights are, got {path.shape[1]}")
         if len(path) != len(times):
-            raise ValueError(f"positions: must have {len(times)} frames, one for each instant, got {len(path)}")
-        object.__setattr__(self, "positions", path)
+            raise ValueError(f"frames: must be {len(times)}, one for each instant, got {len(path)}")
         object.__setattr__(self, "triangles", np.asarray(self.triangles, dtype=np.int32))
         slopes = np.zeros_like(path)
-        h = np.diff(times)[:, None, None]
+        h = np.diff(times).reshape(-1, *[1] * (path.ndim - 1))
         rate = np.diff(path, axis=0) / h
         slopes[1:-1] = (h[1:] * rate[:-1] + h[:-1] * rate[1:]) / (h[1:] + h[:-1])
         object.__setattr__(self, "_path", _through(times, path, slopes))
 
+    @property
+    def last(self) -> float:
+        """When the motion ends [s]; 0 if nothing moves."""
+        return float(np.asarray(self.times)[-1]) if len(np.asarray(self.times)) > 1 else 0.0
+
     def at(self, time: float) -> Floats:
         """Return the vertices at a time [s]: (N, 3) [m]."""
-        return self._path(time)
+        now = self._placed(time)
+        if self.strength == 1.0:
+            return now
+        start = self._placed(0.0)
+        found: Floats = start + self.strength * (now - start)
+        return found
+
+    def _placed(self, time: float) -> Floats:
+        """Return the vertices of the frames: of a skin, sum over bones of w (A x + b) [linear blend skinning]."""
+        path = self._path(time)
+        if self.rest is None:
+            return path
+        x, y, z = np.asarray(self.rest, float).T[..., None]
+        found = np.zeros((len(x), 3))
+        for weight, bone in zip(np.asarray(self.weights, float).T, path, strict=True):
+            found += weight[:, None] * (x * bone[:, 0] + y * bone[:, 1] + z * bone[:, 2] + bone[:, 3])
+        return found
 
 
-def read_moving_mesh(path: str | Path, *, frame_rate: float | None = None) -> MovingMesh:
+def read_moving_mesh(path: str | Path, *, frame_rate: float | None = None, strength: float = 1.0) -> MovingMesh:
     """Read triangles that may move: an OBJ file, a folder of them, one a frame, or an NPZ file.
 
-    Polygons are cut into triangles. An NPZ file has `positions` (F, N, 3) [m], `triangles` (T, 3) and `times` (F,) [s];
-    `python -m stickslip_blender.import_mesh` writes one from Alembic, USD and what else Blender reads.
+    Polygons are cut into triangles. An NPZ file has `triangles` (T, 3), `times` (F,) [s], and `positions` (F, N, 3)
+    [m] or, of a skin, `rest` (N, 3) [m], `weights` (N, B) and `bones` (F, B, 3, 4): see `MovingMesh`.
+    `python -m stickslip_blender.import_mesh` writes positions from Alembic, USD and what else Blender reads.
 
     Args:
         path: What to read; frames of a folder are in the order of their names.
         frame_rate: Of a folder [1/s]; its first frame is at 0 s.
+        strength: Factor of all displacements since the first frame.
 
     Raises:
         ValueError: It holds no such mesh.
@@ -163,19 +273,79 @@ def read_moving_mesh(path: str | Path, *, frame_rate: float | None = None) -> Mo
         for file, (vertices, triangles) in zip(files, frames, strict=True):
             if vertices.shape != frames[0][0].shape or not np.array_equal(triangles, frames[0][1]):
                 raise ValueError(f"{file}: must have the vertices and faces of {files[0].name}, in the same order")
-        return MovingMesh(frames[0][1], np.arange(len(files)) / frame_rate, np.stack([frame[0] for frame in frames]))
+        path_of_frames = np.stack([frame[0] for frame in frames])
+        return MovingMesh(frames[0][1], np.arange(len(files)) / frame_rate, path_of_frames, strength=strength)
     if place.suffix.lower() == ".obj":
         vertices, triangles = read_obj(place)
         return MovingMesh(triangles, [0.0], vertices[None])
     if place.suffix.lower() == ".npz":
         with np.load(place, allow_pickle=False) as file:
-            missing = [name for name in ("positions", "triangles", "times") if name not in file]
+            own = ("rest", "weights", "bones") if "bones" in file else ("positions",)
+            missing = [name for name in (*own, "triangles", "times") if name not in file]
             if missing:
                 raise ValueError(
-                    f"{place}: must have positions, triangles and times, and {', '.join(missing)} is not there"
+                    f"{place}: must have {', '.join(own)}, triangles and times, and {', '.join(missing)} is not there"
                 )
-            return MovingMesh(file["triangles"], file["times"], file["positions"])
+            skin = {name: file[name] for name in own if name in ("rest", "weights")}
+            return MovingMesh(file["triangles"], file["times"], file[own[-1]], **skin, strength=strength)
     raise ValueError(f"{place}: must be an OBJ file, a folder of OBJ files, or an NPZ file")
+
+
+PATH_COLUMNS = ("time", "x", "y", "z", "rx", "ry", "rz")
+"""Of a CSV file of a motion: [s], [m] and [rad], since the start."""
+
+
+def read_path(path: Path) -> tuple[Floats, Floats, Floats]:
+    """Return times (K,) [s], displacements (K, 3) [m] and rotation vectors (K, 3) [rad] of a CSV or an NPZ file.
+
+    A CSV file has the columns `PATH_COLUMNS`; an NPZ file has `time`, `move` and `turn`.
+
+    Raises:
+        ValueError: It holds no such motion.
+        OSError: It cannot be read.
+    """
+    if path.suffix.lower() == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            missing = [name for name in ("time", "move", "turn") if name not in file]
+            if missing:
+                raise ValueError(f"{path}: must have time, move and turn, and {', '.join(missing)} is not there")
+            return np.asarray(file["time"], float), np.asarray(file["move"], float), np.asarray(file["turn"], float)
+    head, *lines = path.read_text(encoding="utf-8").splitlines()
+    if tuple(head.replace(" ", "").split(",")) != PATH_COLUMNS:
+        raise ValueError(f"{path}: must have the columns {','.join(PATH_COLUMNS)}, got {head!r}")
+    table = np.array([[float(word) for word in line.split(",")] for line in lines if line.strip()], float)
+    if table.ndim != 2 or table.shape[1] != len(PATH_COLUMNS):
+        raise ValueError(f"{path}: must have lines of {len(PATH_COLUMNS)} numbers, got shape {table.shape}")
+    return table[:, 0], table[:, 1:4], table[:, 4:]
+
+
+def read_pattern(path: Path) -> tuple[Mesh, Floats]:
+    """Return the flat pattern of a sheet, and its positions (V, 3) [m], from an OBJ file.
+
+    Its texture coordinates are the pattern [m]: each vertex has one.
+
+    Raises:
+        ValueError: A vertex has none, or several: cloth cannot have seams.
+        OSError: It cannot be read.
+    """
+    vertices, triangles = read_obj(path)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    words = [line.split() for line in lines]
+    pattern = np.array([[float(word[1]), float(word[2])] for word in words if word and word[0] == "vt"], float)
+    rest = np.full((len(vertices), 2), np.nan)
+    for corner in (corner for word in words if word and word[0] == "f" for corner in word[1:]):
+        numbers = corner.split("/")
+        if len(numbers) < 2 or not numbers[1]:
+            raise ValueError(f"{path}: must have texture coordinates, the flat pattern, at each corner, got {corner!r}")
+        vertex = int(numbers[0]) - 1 if int(numbers[0]) > 0 else int(numbers[0])
+        own = pattern[int(numbers[1]) - 1 if int(numbers[1]) > 0 else int(numbers[1])]
+        if not np.isnan(rest[vertex]).any() and (rest[vertex] != own).any():
+            raise ValueError(f"{path}: must have one texture coordinate a vertex, and vertex {vertex + 1} has several")
+        rest[vertex] = own
+    unused = np.flatnonzero(np.isnan(rest).any(axis=1))
+    if len(unused):
+        raise ValueError(f"{path}: must have each vertex in a face, and vertex {unused[0] + 1} is in none")
+    return Mesh(rest, triangles), vertices
 
 
 def read_obj(path: Path) -> tuple[Floats, NDArray[np.int32]]:

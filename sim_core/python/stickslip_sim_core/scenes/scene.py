@@ -18,6 +18,12 @@ from stickslip_sim_core.cloth.solver import Cloth, kernel_level
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import Array, Kind, OnFrame, Outcome, Record
 
+REST_SPEED = 1e-3
+"""Largest mean speed of a vertex between two frames at which cloth is at rest [m/s]."""
+
+REST_TIME = 0.25
+"""How long it is [s], so that a swing that turns back is not at rest."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClothRun:
@@ -57,6 +63,9 @@ class ClothRun:
     unconverged_steps: int
     worst_residual: float
     """Largest residual force of a node in any step, in weights of 25 mm^2 of the lightest fabric."""
+
+    rest_time: float
+    """When all came to rest, if the scene ends then [s]; NaN if it did not."""
 
     reason: str
     """Reason why the run is not valid, or empty."""
@@ -121,6 +130,16 @@ class Scene:
 
     labels: Callable[[ClothRun], Mapping[str, Any]] = lambda _run: {}
 
+    arrays: Callable[[ClothRun], Record] = lambda run: {
+        "positions": run.positions,
+        "rest": run.rest,
+        "triangles": run.triangles,
+    }
+    """Arrays of the run to store besides its record."""
+
+    still_from: float | None = None
+    """From this time on [s] the scene ends once all is at rest, and further frames repeat the last; None: never."""
+
     kernel: str | None = None
     """Level of the kernels, see `Cloth`."""
 
@@ -148,6 +167,7 @@ class Scene:
         )
         cloth.set_state(self.start)
         paths, forces = [cloth.positions], [self.forces(cloth)]
+        calm, rest_time = 0, np.nan
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
             self._advance(cloth, hands, time)
@@ -157,6 +177,12 @@ class Scene:
                 on_frame(frame + 1, self.frames)
             if not np.isfinite(paths[-1]).all():
                 break
+            calm = calm + 1 if self._is_still(time, paths[-2], paths[-1]) else 0
+            if calm >= REST_TIME * self.frame_rate:
+                rest_time = time
+                break
+        missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
+        paths, forces = paths + missing * paths[-1:], forces + missing * forces[-1:]
         everything, sheet = np.stack(paths), self.sheet or self.mesh
         path, others = np.split(everything, [len(sheet.rest)], axis=1)
         times = np.arange(len(path)) / self.frame_rate
@@ -179,9 +205,16 @@ class Scene:
             steps=cloth.steps,
             unconverged_steps=cloth.unconverged_steps,
             worst_residual=cloth.worst_residual,
+            rest_time=rest_time,
             reason=self.reason or cloth.why_invalid(everything),
         )
         return replace(run, labels=self.labels(run))
+
+    def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
+        """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move of itself."""
+        if self.still_from is None or time <= self.still_from:
+            return False
+        return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
 
     def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
         """Advance to `end` [s], and grasp and release on the way."""
@@ -203,7 +236,7 @@ class Scene:
         if not run.valid:
             return Outcome(reason=run.reason)
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
-        arrays: Record = {"positions": run.positions, "rest": run.rest, "triangles": run.triangles, **run.record}
+        arrays: Record = {**self.arrays(run), **run.record}
         made = self.fabrics[0]
         labels = {
             "areal_density": made.density,

@@ -1,0 +1,230 @@
+"""Scenes of data: sheets, holders, bodies and their friction, as a document says."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stickslip_sim_core._sim_core import sheet_count
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body
+from stickslip_sim_core.cloth.contact import SelfContact
+from stickslip_sim_core.cloth.presets import preset_named
+from stickslip_sim_core.cloth.solver import Cloth, kernel_level
+from stickslip_sim_core.scenes.kind import Kind, OnFrame, Outcome, Record
+from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
+from stickslip_sim_core.scenes.scene import ClothRun, Scene
+
+UPRIGHT = 1.0
+"""Time in which gravity is set upright over a hung sheet once its bias ends [s]."""
+
+
+def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
+    """Return the scene of a document: `Physics` of stickslip_schemas.scene, as JSON, with paths of files here.
+
+    Its run records, besides what all scenes record, sheets, holders and bodies being in the order of their names:
+
+    - `SHEET.positions`, `SHEET.rest`, `SHEET.triangles`, and `SHEET.contact` (frame, vertex): 0 open, 1 stick, 2 slip
+    - `contact_force` (frame, sheet, other, 3) [N]: on each sheet, of each body and then of each sheet
+    - `holder_force` (frame, holder, 3) [N], `holder_pose` (frame, holder, 3, 4), `grasped` (frame, holder), and
+      `holder_box` (holder, 3) [m], where there are holders
+    - `body_pose` (frame, body, 3, 4), where there are bodies: x -> A x + b from its own axes
+    - `BODY.rest`, `BODY.triangles`, and `BODY.vertices` (frame, vertex, 3) [m] if it deforms, of bodies of triangles
+
+    Args:
+        document: What the scene is.
+        seed: Of what breaks its symmetry.
+        kernel: Level of the kernels, see `Cloth`.
+
+    Raises:
+        ValueError: A value breaks its rule; the message begins with its place.
+        OSError: A file cannot be read.
+    """
+    names = sorted(document["sheets"])
+    mu = _friction(document)
+    sheets = [sheet(name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel) for name in names]
+    for one in sheets:
+        if sheet_count(one.mesh.rest, one.mesh.triangles) != 1:
+            raise ValueError(f"sheets.{one.name}.mesh: must hang together in one piece")
+    things = [
+        thing(name, given, [mu[one, name] for one in names]) for name, given in sorted(document["bodies"].items())
+    ]
+    ends = np.cumsum([0, *(len(one.start) for one in sheets)])
+    holders = [
+        replace(holder, vertices=holder.vertices + begin)
+        for one, begin in zip(sheets, ends, strict=False)
+        for holder in one.holders.values()
+    ]
+    gravity = _Gravity(document, sheets, seed)
+    rigid = [one.rigid for one in things if one.rigid is not None]
+
+    def motion(time: float) -> tuple[Floats, Sequence[Body]]:
+        return gravity.at(time), [at(time) for at in rigid]
+
+    length, end, calm = document["duration"], document["end"], document["calm"]
+    last = max([0.0, gravity.last, *(one.last for one in sheets), *(one.last for one in things)])
+    tracks = {f"{one.name}.vertices": one.surface.at for one in things if one.surface is not None and one.deforms}
+    if things:
+        tracks["body_pose"] = lambda time: np.stack([one.pose(time) for one in things])
+    if holders:
+        poses = [track for one in sheets for track in one.tracks.values()]
+        tracks["holder_pose"] = lambda time: np.stack([pose(time) for pose in poses])
+        tracks["grasped"] = lambda time: np.array([holder.holds(time) for holder in holders], np.uint8)
+    boxes = [box for one in sheets for box in one.boxes.values()]
+    return Scene(
+        mesh=meshes.together(*(one.mesh for one in sheets)),
+        fabrics=[one.fabric for one in sheets],
+        preset=preset_named(document["preset"]),
+        start=np.concatenate([one.start for one in sheets]),
+        motion=motion,
+        holders=holders,
+        self_contact=_touch(document, sheets, mu),
+        surfaces=[one.surface for one in things if one.surface is not None],
+        damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
+        frames=int((length if end is None else end["at_most"]) * document["frame_rate"] * (1.0 + 1e-12)) + 1,
+        frame_rate=document["frame_rate"],
+        still_from=None if end is None else last,
+        forces=_Forces(sheets, things, holders),
+        tracks=tracks,
+        record={"holder_box": np.stack(boxes)} if boxes else {},
+        arrays=lambda run: _arrays(run, sheets, things, ends),
+        labels=lambda run: _labels(run, document, sheets, gravity.bias),
+        kernel=kernel,
+        reason=next((one.hung.reason for one in sheets if one.hung is not None and one.hung.reason), ""),
+    )
+
+
+def _friction(document: Document) -> dict[tuple[str, str], float]:
+    """Return the coefficient of friction of each sheet with each sheet and body."""
+    given = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
+    others = [*document["sheets"], *document["bodies"]]
+    return {
+        (one, other): given.get(frozenset((one, other)), document["default_friction"])
+        for one in document["sheets"]
+        for other in others
+    }
+
+
+def _touch(document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]) -> SelfContact | None:
+    """Return the contact of cloth with cloth."""
+    through = [one.name for one in sheets if not document["sheets"][one.name]["self_contact"]]
+    if through and len(sheets) > 1:
+        raise ValueError(f"sheets.{through[0]}.self_contact: must be true in a scene of several sheets, got false")
+    if through:
+        return None
+    friction = [[mu[one.name, other.name] for other in sheets] for one in sheets]
+    return SelfContact(friction, [one.thickness for one in sheets], document["bearing"])
+
+
+class _Gravity:
+    """Gravity with what leans it, over time: the bias of the scene, and those of hung sheets."""
+
+    def __init__(self, document: Document, sheets: Sequence[Sheet], seed: int) -> None:
+        self._down = np.tile(np.array(document["gravity"], float), (sum(len(one.start) for one in sheets), 1))
+        self._size = float(np.linalg.norm(document["gravity"]))
+        self._tilted, self._until = self._down, -np.inf
+        self.bias = np.zeros(2)
+        if document["bias"] is not None:
+            size, self._until = document["bias"]["size"], document["bias"]["until"]
+            self.bias = np.random.default_rng(seed).uniform(-size, size, 2)
+            self._tilted = self._down + self._size * np.append(self.bias, 0.0)
+        self._hung = [
+            (slice(begin - len(one.start), begin), one.hung.tilt, document["sheets"][one.name]["start"]["bias_until"])
+            for one, begin in zip(sheets, np.cumsum([len(one.start) for one in sheets]), strict=True)
+            if one.hung is not None
+        ]
+        self.last = max([0.0, self._until, *(until + UPRIGHT for _, _, until in self._hung)])
+        """When it stops to change [s]."""
+
+    def at(self, time: float) -> Floats:
+        """Return the acceleration of each vertex at a time [s]: (V, 3) [m/s^2]."""
+        found = self._tilted if time < self._until else self._down
+        if self._hung:
+            found = found.copy()
+        for own, tilt, until in self._hung:
+            upright = min(max(time - until, 0.0) / UPRIGHT, 1.0)
+            found[own] += tilt * self._size * (1.0 - upright)
+        return found
+
+
+class _Forces:
+    """Forces and contacts at a frame, by sheets, bodies and holders."""
+
+    def __init__(self, sheets: Sequence[Sheet], things: Sequence[Thing], holders: Sequence[Any]) -> None:
+        self._names = [one.name for one in sheets]
+        self._sheets, self._things, self._holders = len(sheets), len(things), holders
+        rigid = [number for number, one in enumerate(things) if one.rigid is not None]
+        surfaces = [number for number, one in enumerate(things) if one.surface is not None]
+        self._others = np.array([*rigid, *surfaces], dtype=np.intp)  # in the solver's order
+        sizes = [len(one.surface.at(0.0)) for one in things if one.surface is not None]
+        owners = [self._things + np.repeat(np.arange(self._sheets), [len(one.start) for one in sheets])]
+        self._owner = np.concatenate([*owners, np.repeat(np.array(surfaces, dtype=np.intp), sizes)])
+        self._ends = np.cumsum([len(one.start) for one in sheets])
+
+    def __call__(self, cloth: Cloth) -> Record:
+        """Return `contact_force`, `SHEET.contact` and `holder_force`; nothing touches before the first step."""
+        vertices = len(cloth.masses)
+        force = np.zeros((self._things + self._sheets,) * 2 + (3,))
+        state = np.zeros(vertices, np.uint8)
+        pulls = np.zeros((len(self._holders), 3))
+        if cloth.steps:
+            reactions, contacts, pairs = cloth.reactions, cloth.contacts, cloth.pair_forces
+            touching = np.flatnonzero(contacts >= 0)
+            np.add.at(force, (self._owner[touching], self._others[contacts[touching]]), reactions[touching])
+            state[touching] = np.where(cloth.sliding[touching], 2, 1)
+            owner = self._owner[pairs.vertices]
+            first, last = owner[:, 0], owner[:, 3]
+            for corner in range(4):
+                own = owner[:, corner]
+                pull = pairs.weights[:, corner, None] * pairs.forces
+                np.add.at(force, (own, np.where(own == first, last, first)), pull)
+                here = (pairs.vertices[:, corner] < vertices) & (pairs.weights[:, corner] != 0.0)
+                np.maximum.at(state, pairs.vertices[here, corner], np.where(pairs.sliding[here], 2, 1).astype(np.uint8))
+            held = np.isin(np.arange(vertices), cloth.held)
+            for number, holder in enumerate(self._holders):
+                if held[holder.vertices].all():
+                    pulls[number] = reactions[holder.vertices].sum(axis=0)
+        found = {"contact_force": force[self._things :]}
+        found |= {
+            f"{name}.contact": own for name, own in zip(self._names, np.split(state, self._ends[:-1]), strict=True)
+        }
+        return found | ({"holder_force": pulls} if len(self._holders) else {})
+
+
+def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], ends: NDArray[np.int64]) -> Record:
+    """Return the arrays of sheets and surfaces."""
+    found: dict[str, Any] = {}
+    for one, path in zip(sheets, np.split(run.positions, ends[1:-1], axis=1), strict=True):
+        found[f"{one.name}.positions"] = path
+        found[f"{one.name}.rest"] = one.mesh.rest
+        found[f"{one.name}.triangles"] = one.mesh.triangles
+    for body in things:
+        if body.surface is not None:
+            found[f"{body.name}.rest"] = body.rest
+            found[f"{body.name}.triangles"] = np.asarray(body.surface.triangles)
+    return found
+
+
+def _labels(run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Floats) -> dict[str, Any]:
+    found: dict[str, Any] = {"least_distance": float(run.least_distance)}
+    for one in sheets:
+        found[f"{one.name}.areal_density"] = one.fabric.density
+        found[f"{one.name}.bending_rigidity"] = np.diag(one.fabric.rigidity).tolist()
+        found[f"{one.name}.stretching_stiffness"] = one.fabric.stretching[0].tolist()
+        if one.hung is not None:
+            found[f"{one.name}.tilt"] = one.hung.side * one.hung.bias
+    if document["bias"] is not None:
+        found["bias"] = bias.tolist()
+    if document["end"] is not None:
+        found["rest_time"] = run.rest_time
+    return found
+
+
+def _simulate(simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None) -> list[Outcome]:
+    return [scene(one["scene"], seed=one["seed"]).outcome(on_frame) for one in simulations]
+
+
+KIND = Kind(_simulate, "stickslip_sim_core.cloth", kernel=kernel_level)

@@ -1,0 +1,254 @@
+"""Parts of a scene, from its document: meshes and starts of sheets, motions, holders and bodies.
+
+The document is `Physics` of stickslip_schemas.scene, as JSON. Names of files are paths on this machine.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.bodies import Body, box, cylinder, plane, sphere
+from stickslip_sim_core.cloth.contact import Surface
+from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
+from stickslip_sim_core.scenes.hanging import Hung, hung
+from stickslip_sim_core.scenes.holders import ALWAYS, Holder
+from stickslip_sim_core.scenes.motions import (
+    Keyframes,
+    MovingMesh,
+    RigidMotion,
+    Spin,
+    read_moving_mesh,
+    read_path,
+    read_pattern,
+    rotation,
+)
+
+Document = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """One piece of cloth, where it starts."""
+
+    name: str
+    mesh: meshes.Mesh
+    fabric: Fabric
+    thickness: float
+    start: Floats
+    """(V, 3) [m]"""
+
+    hung: Hung | None
+    """Its start, if it hangs."""
+
+    holders: Mapping[str, Holder]
+    """By name; their vertices are those of the sheet."""
+
+    tracks: Mapping[str, Callable[[float], Floats]]
+    """By holder: its pose (3, 4), from its own axes, that are warp, weft and normal of the flat sheet, to the world."""
+
+    boxes: Mapping[str, Floats]
+    """By holder: sides of the box about what it holds, in its own axes (3,) [m]; NaN for a rim."""
+
+    last: float
+    """When the last motion of a holder ends, and the last of them lets go or takes hold [s]."""
+
+
+def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel: str | None) -> Sheet:
+    """Return a sheet of a document.
+
+    Args:
+        name: Of the sheet.
+        given: The sheet.
+        materials: Custom fabrics of the scene.
+        seed: Of the tilt of hung cloth.
+        kernel: Level of the kernels, see `Cloth`.
+
+    Raises:
+        ValueError: A value breaks its rule; the message begins with its place.
+        OSError: A file cannot be read.
+    """
+    place = f"sheets.{name}"
+    mesh, positions = _mesh(given["mesh"])
+    custom = materials.get(given["material"])
+    made = fabric(given["material"]) if custom is None else custom_fabric(given["material"], **custom)
+    made = made.scaled(**given["factors"])
+    turn, origin, begin = rotation(given["turn"]), np.array(given["origin"], float), given["start"]
+    local = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
+    if begin["type"] == "stretched":
+        local[:, :2] = (1.0 + np.array(begin["strain"])) * mesh.rest
+    elif begin["type"] == "file":
+        if begin["file"] is not None:
+            positions = _positions(Path(begin["file"]))
+        if positions is None or positions.shape != local.shape:
+            raise ValueError(f"{place}.start.file: must have {len(local)} vertices, as the mesh has")
+        local = positions
+    start = local @ turn.T + origin
+    holders: dict[str, Holder] = {}
+    tracks: dict[str, Callable[[float], Floats]] = {}
+    boxes: dict[str, Floats] = {}
+    last, taken = 0.0, np.zeros(len(start), dtype=bool)
+    for key, holder in sorted(given["holders"].items()):
+        held = _held(mesh, holder, f"{place}.holders.{key}")
+        if (held & taken).any():
+            raise ValueError(f"{place}.holders.{key}: must not hold what another holder holds")
+        taken |= held
+        middle = start[held].mean(axis=0)
+        motion = rigid_motion(holder["motion"], middle)
+        grasp = ALWAYS if holder["grasp"] is None else (holder["grasp"][0], holder["grasp"][1])
+        holders[key] = Holder(np.flatnonzero(held), motion.pose, grasp)
+        tracks[key] = _carried(motion, turn, middle)
+        boxes[key] = np.full(3, np.nan) if holder["rim"] else np.ptp((start[held] - middle) @ turn, axis=0)
+        last = max([last, motion.last, *(instant for instant in grasp if np.isfinite(instant))])
+    hanging = None
+    if begin["type"] == "hung":
+        held = np.flatnonzero(taken)
+        hanging = hung(mesh, made, start, held, normal=turn[:, 2], seed=seed, kernel=kernel)
+        start = hanging.positions
+    return Sheet(name, mesh, made, given["thickness"], start, hanging, holders, tracks, boxes, last)
+
+
+def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
+    """Return the mesh of a sheet and, of a file, its positions."""
+    if given["type"] == "grid":
+        return meshes.grid(*given["size"], *given["cells"]), None
+    if given["type"] == "unstructured":
+        return meshes.unstructured(*given["size"], given["spacing"], given["seed"]), None
+    return read_pattern(Path(given["file"]))
+
+
+def _positions(path: Path) -> Floats:
+    """Return the positions (V, 3) [m] of an OBJ or NPZ file."""
+    if path.suffix.lower() == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            return np.asarray(file["positions"], float)
+    return read_moving_mesh(path).at(0.0)
+
+
+def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
+    """Return which vertices a holder holds: (V,)."""
+    rest = mesh.rest
+    low, high = rest.min(axis=0), rest.max(axis=0)
+    slack = 1e-9 * float((high - low).max())
+    held = np.zeros(len(rest), dtype=bool)
+    if holder["vertices"] is not None:
+        if max(holder["vertices"]) >= len(rest):
+            raise ValueError(f"{place}.vertices: must be below {len(rest)}, got {max(holder['vertices'])}")
+        held[list(holder["vertices"])] = True
+    elif holder["rim"]:
+        held[np.unique(mesh.boundary(lambda points: np.ones(len(points), dtype=bool)))] = True
+    elif holder["edge"] is not None:
+        axis, at = {"left": (0, low), "right": (0, high), "bottom": (1, low), "top": (1, high)}[holder["edge"]]
+        held = np.abs(rest[:, axis] - at[axis]) <= slack
+    else:
+        held = ((rest >= np.array(holder["low"]) - slack) & (rest <= np.array(holder["high"]) + slack)).all(axis=1)
+        if not held.any():
+            raise ValueError(f"{place}: must hold a vertex, and none is in {holder['low']} to {holder['high']} [m]")
+    return held
+
+
+def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
+    """Return a motion of a document; turns are about `middle` (3,) [m] where it does not say about what."""
+    if given is None:
+        return Keyframes([0.0], np.zeros((1, 3)), np.zeros((1, 3)))
+    about = middle if given["about"] is None else np.array(given["about"], float)
+    if given["spin"] is not None:
+        spin = given["spin"]
+        return Spin(spin["axis"], spin["speed"], spin["begin"], spin["ramp"], about)
+    if given["path"] is not None:
+        times, moves, turns = read_path(Path(given["path"]))
+    else:
+        times, moves, turns = (np.array([key[name] for key in given["keys"]]) for name in ("time", "move", "turn"))
+    return Keyframes(times, moves, turns, about, linear=given["interpolation"] == "linear", ramp=given["ramp"])
+
+
+def _carried(motion: RigidMotion, turn: Floats, origin: Floats) -> Callable[[float], Floats]:
+    """Return the pose (3, 4) at a time [s] of what starts with axes `turn` (3, 3) at `origin` (3,) [m]."""
+
+    def at(time: float) -> Floats:
+        pose = motion.pose(time)
+        return np.column_stack([pose[:, :3] @ turn, pose[:, :3] @ origin + pose[:, 3]])
+
+    return at
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """A body: rigid, or a surface of triangles."""
+
+    name: str
+    pose: Callable[[float], Floats]
+    """(3, 4): from its own axes to the world, at a time [s]."""
+
+    last: float
+    """When its motion ends [s]."""
+
+    rigid: Callable[[float], Body] | None = None
+    surface: Surface | None = None
+
+    rest: Floats | None = None
+    """Of a surface: vertices at the first frame of its file (N, 3) [m]."""
+
+    deforms: bool = False
+    """Whether a surface moves other than by its pose."""
+
+
+def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
+    """Return a body of a document.
+
+    Args:
+        name: Of the body.
+        given: The body.
+        mu: Coefficient of friction with each sheet; all are equal, unless it is a mesh.
+
+    Raises:
+        ValueError: A value breaks its rule; the message begins with its place.
+        OSError: A file cannot be read.
+    """
+    if given["type"] == "plane":
+        still = plane(mu[0], normal=given["normal"], origin=given["origin"])
+        return Thing(name, lambda _time: still.pose, 0.0, rigid=lambda _time: still)
+    if given["type"] == "mesh":
+        return _surface(name, given, mu)
+    origin = np.array(given["origin"], float)
+    motion = rigid_motion(given["motion"], origin)
+    pose = _carried(motion, rotation(given["turn"]), origin)
+
+    def rigid(time: float) -> Body:
+        now = pose(time)
+        placed: dict[str, Any] = {"origin": now[:, 3], "rotation": now[:, :3]}
+        match given["type"]:
+            case "sphere":
+                return sphere(mu[0], given["radius"], **placed)
+            case "cylinder":
+                return cylinder(mu[0], given["radius"], **placed)
+            case _:
+                return box(mu[0], given["size"], **placed)
+
+    return Thing(name, pose, motion.last, rigid=rigid)
+
+
+def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
+    try:
+        mesh: MovingMesh = read_moving_mesh(
+            Path(given["file"]), frame_rate=given["frame_rate"], strength=given["strength"]
+        )
+        motion = rigid_motion(given["motion"], mesh.at(0.0).mean(axis=0))
+
+        def at(time: float) -> Floats:
+            if given["motion"] is None:
+                return mesh.at(time)
+            pose = motion.pose(time)
+            moved: Floats = mesh.at(time) @ pose[:, :3].T + pose[:, 3]
+            return moved
+
+        surface = Surface(mesh.triangles, at, list(mu), given["thickness"])
+    except ValueError as error:
+        raise ValueError(f"bodies.{name}: {error}") from error
+    last = max(motion.last, mesh.last)
+    return Thing(name, motion.pose, last, surface=surface, rest=mesh.at(0.0), deforms=mesh.last > 0.0)
