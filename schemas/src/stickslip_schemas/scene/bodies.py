@@ -55,11 +55,13 @@ class Box(_Placed):
 
     type: Literal["box"]
     size: tuple[Length, Length, Length] = Field(description="of its edges [m]")
-    rounding: Float = Field(default=0.0, ge=0, le=50, description="radius of its edges, within its size [m]")
+    rounding: Float | None = Field(
+        default=None, gt=0, le=50, description="radius of its edges [m]; null: 5 mm, or half the least of size"
+    )
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        if 2 * self.rounding > min(self.size):
+        if self.rounding is not None and 2 * self.rounding > min(self.size):
             raise ValueError(
                 f"rounding must be at most half the least of size, {min(self.size) / 2:g} m, and it is "
                 f"{self.rounding:g} m"

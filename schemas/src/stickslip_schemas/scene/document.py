@@ -166,11 +166,6 @@ class Physics(Document):
         if self.default_friction is None and (missing := sorted(sorted(two) for two in there - named)):
             rule = "must name each two that may touch where there is no default_friction; missing: "
             refuse(self, ("friction",), f"{rule}{missing[0][0]} with {missing[0][-1]}", None)
-        for name, body in self.bodies.items():
-            mus = {self.mu(sheet, name) for sheet in self.sheets}
-            if len(mus) > 1 and not isinstance(body, MeshBody):
-                rule = "must be the same for all sheets; only a body of type mesh may have one with each"
-                refuse(self, ("friction",), f"friction of {name}, a {body.type}, {rule}", sorted(mus))
         return self
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, box, cylinder, plane, sphere
+from stickslip_sim_core.cloth.bodies import Body, box, capsule, cylinder, plane, sphere
 from stickslip_sim_core.cloth.contact import Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.scenes.hanging import Hung, hung
@@ -204,14 +204,14 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
     Args:
         name: Of the body.
         given: The body.
-        mu: Coefficient of friction with each sheet; all are equal, unless it is a mesh.
+        mu: Coefficient of friction with each sheet.
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
         OSError: A file cannot be read.
     """
     if given["type"] == "plane":
-        still = plane(mu[0], normal=given["normal"], origin=given["origin"])
+        still = plane(mu, normal=given["normal"], origin=given["origin"])
         return Thing(name, lambda _time: still.pose, 0.0, rigid=lambda _time: still)
     if given["type"] == "mesh":
         return _surface(name, given, mu)
@@ -224,11 +224,13 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
         placed: dict[str, Any] = {"origin": now[:, 3], "rotation": now[:, :3]}
         match given["type"]:
             case "sphere":
-                return sphere(mu[0], given["radius"], **placed)
+                return sphere(mu, given["radius"], **placed)
             case "cylinder":
-                return cylinder(mu[0], given["radius"], **placed)
+                return cylinder(mu, given["radius"], **placed)
+            case "capsule":
+                return capsule(mu, given["radius"], given["length"], **placed)
             case _:
-                return box(mu[0], given["size"], **placed)
+                return box(mu, given["size"], rounding=given["rounding"], **placed)
 
     return Thing(name, pose, motion.last, rigid=rigid)
 
