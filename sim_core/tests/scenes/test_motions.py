@@ -90,7 +90,7 @@ class TestMovingMesh:
         mesh = read_moving_mesh(folder, frame_rate=10.0)
         assert np.asarray(mesh.times) == pytest.approx([0.0, 0.1, 0.2])
         assert mesh.at(0.1)[3, 2] == pytest.approx(1.5)
-        np.savez(tmp_path / "m.npz", positions=mesh.positions, triangles=mesh.triangles, times=mesh.times)
+        np.savez(tmp_path / "m.npz", positions=mesh.frames, triangles=mesh.triangles, times=mesh.times)
         assert read_moving_mesh(tmp_path / "m.npz").at(0.13) == pytest.approx(mesh.at(0.13))
 
     def test_refusals(self, tmp_path: Path) -> None:

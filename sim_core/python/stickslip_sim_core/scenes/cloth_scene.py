@@ -99,10 +99,10 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
 
 def _friction(document: Document) -> dict[tuple[str, str], float]:
     """Return the coefficient of friction of each sheet with each sheet and body."""
-    given = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
+    given: dict[frozenset[str], float] = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
     others = [*document["sheets"], *document["bodies"]]
     return {
-        (one, other): given.get(frozenset((one, other)), document["default_friction"])
+        (one, other): float(given.get(frozenset((one, other)), document["default_friction"] or 0.0))
         for one in document["sheets"]
         for other in others
     }

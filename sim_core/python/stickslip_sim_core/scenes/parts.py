@@ -107,8 +107,7 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
         last = max([last, motion.last, *(instant for instant in grasp if np.isfinite(instant))])
     hanging = None
     if begin["type"] == "hung":
-        held = np.flatnonzero(taken)
-        hanging = hung(mesh, made, start, held, normal=turn[:, 2], seed=seed, kernel=kernel)
+        hanging = hung(mesh, made, start, np.flatnonzero(taken), normal=turn[:, 2], seed=seed, kernel=kernel)
         start = hanging.positions
     return Sheet(name, mesh, made, given["thickness"], start, hanging, holders, tracks, boxes, last)
 
@@ -118,7 +117,7 @@ def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
     if given["type"] == "grid":
         return meshes.grid(*given["size"], *given["cells"]), None
     if given["type"] == "unstructured":
-        return meshes.unstructured(*given["size"], given["spacing"], given["seed"]), None
+        return meshes.unstructured(given["size"][0], given["size"][1], given["spacing"], given["seed"]), None
     return read_pattern(Path(given["file"]))
 
 
@@ -144,9 +143,9 @@ def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
         held[np.unique(mesh.boundary(lambda points: np.ones(len(points), dtype=bool)))] = True
     elif holder["edge"] is not None:
         axis, at = {"left": (0, low), "right": (0, high), "bottom": (1, low), "top": (1, high)}[holder["edge"]]
-        held = np.abs(rest[:, axis] - at[axis]) <= slack
+        held[:] = np.abs(rest[:, axis] - at[axis]) <= slack
     else:
-        held = ((rest >= np.array(holder["low"]) - slack) & (rest <= np.array(holder["high"]) + slack)).all(axis=1)
+        held[:] = ((rest >= np.array(holder["low"]) - slack) & (rest <= np.array(holder["high"]) + slack)).all(axis=1)
         if not held.any():
             raise ValueError(f"{place}: must hold a vertex, and none is in {holder['low']} to {holder['high']} [m]")
     return held
