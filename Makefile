@@ -88,6 +88,11 @@ check: setup
 	@for tests in $(TESTS); do $(PY) -m mypy $$tests || exit 1; done
 	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
 
+# The official library of LeRobot, which opens exports in a test; 8 GB.
+.venv-lerobot:
+	$(PYTHON) -m venv $@
+	$@/bin/pip install --quiet 'lerobot==0.4.4'
+
 # The lines of source, and what is longer than it should be.
 size:
 	@$(PY) tools/size.py
@@ -121,4 +126,4 @@ constraints:
 	tools/update_constraints.sh $(PYTHON)
 
 clean:
-	rm -rf .venv .venv-blender demo-out
+	rm -rf .venv .venv-blender .venv-lerobot demo-out

@@ -149,7 +149,7 @@ def test_the_same_export_has_the_same_bytes(clips: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "an export needs one of --hdf5, --webdataset, --huggingface, --usd, --obj, and has none"),
+        ([], "an export needs one of --hdf5, --webdataset, --huggingface, --lerobot, --obj, and has none"),
         (["--webdataset", "OUT", "--huggingface", "OUT"], "and has --webdataset, --huggingface"),
         (["--webdataset", "OUT", "--gzip", "3"], "--gzip is for --hdf5 only"),
         (["--webdataset", "OUT", "--arrays", "movie"], "got 'movie'"),

@@ -17,7 +17,7 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
-from stickslip_training.export import huggingface, meshes, webdataset
+from stickslip_training.export import huggingface, lerobot, meshes, webdataset
 from stickslip_training.export.coco import export_coco
 from stickslip_training.export.content import Content, OnBytes
 from stickslip_training.export.writing import to_directory, to_file
@@ -89,7 +89,9 @@ def export(
     to_huggingface: Annotated[
         Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
     ] = None,
-    to_usd: Annotated[Path | None, typer.Option("--usd", metavar="DIR", help="moving meshes of cloth for USD")] = None,
+    to_lerobot: Annotated[
+        Path | None, typer.Option("--lerobot", metavar="DIR", help="episodes of scenes with holders for LeRobot")
+    ] = None,
     to_obj: Annotated[
         Path | None, typer.Option("--obj", metavar="DIR", help="meshes of cloth, an instant each")
     ] = None,
@@ -104,7 +106,7 @@ def export(
         "--hdf5": to_hdf5,
         "--webdataset": to_webdataset,
         "--huggingface": to_huggingface,
-        "--usd": to_usd,
+        "--lerobot": to_lerobot,
         "--obj": to_obj,
     }
     with readable_errors():
@@ -134,18 +136,17 @@ def export(
 _DIRECTORIES = {
     "--webdataset": webdataset.write,
     "--huggingface": huggingface.write,
-    "--usd": meshes.write_usd,
+    "--lerobot": lerobot.write,
     "--obj": meshes.write_obj,
 }
-_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--usd": ["pxr"]}
+_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--lerobot": ["av", "pandas", "pyarrow"]}
 
 
 def _require(option: str) -> None:
     missing = [name for name in _NEEDED.get(option, []) if find_spec(name) is None]
     if missing:
-        extra = "usd" if option == "--usd" else "export"
         raise ImportError(
-            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[{extra}]'"
+            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[export]'"
         )
 
 

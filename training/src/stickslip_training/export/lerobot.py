@@ -3,7 +3,8 @@
 An episode is a simulation with one texture and one look of light and floor, seen by all viewpoints of the dataset.
 `action` has of each holder its position, the first two columns of its rotation [Zhou et al. 2019], and whether it
 holds, at the next frame; `observation.state` has the same of this frame, the poses of all bodies, and the places of
-five vertices of each sheet: four corners and the middle. Labels are columns of the episodes.
+five vertices of each sheet: four corners and the middle. `observation.time` is the time in the scene [s], for videos
+have their frames evenly. Labels are columns of the episodes.
 
 Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
 """
@@ -71,6 +72,8 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     for number, episode in enumerate(episodes):
         chunk, file = divmod(number, FILES)
         frames, names = _numbers(content, episode.slots[views[0]], instants)
+        frames["observation.time"] = (instants[:, None] / float(per_second)).astype(np.float32)
+        names["observation.time"] = ["s"]
         stats = {name: _statistics(values) for name, values in frames.items()}
         where: dict[str, Any] = {}
         for view, slot in episode.slots.items():
@@ -202,7 +205,10 @@ def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
 
     length = len(frames["action"])
     index = np.arange(length, dtype=np.int64)
-    columns = {name: pyarrow.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1]) for name, v in frames.items()}
+    columns = {
+        name: v.ravel() if v.shape[1] == 1 else pyarrow.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1])
+        for name, v in frames.items()
+    }
     counters = {"timestamp": (index / float(rate)).astype(np.float32), "frame_index": index}
     counters |= {"episode_index": np.full_like(index, number), "index": index + number * length}
     return pyarrow.table(columns | counters | {"task_index": np.zeros_like(index)})

@@ -1,0 +1,182 @@
+"""LeRobot's own library opens the export, and its frames and actions are those of the dataset."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from stickslip_schemas.spec.arrays import SPLITS, array
+from stickslip_training.export import lerobot
+
+FRAMES, INSTANTS, VERTICES, SIDE = 10, 46, 25, 64
+VIEWS = ("front", "high")
+PYTHON = Path(os.environ.get("STICKSLIP_LEROBOT_PYTHON", Path(__file__).parents[3] / ".venv-lerobot/bin/python"))
+RANDOM = np.random.Generator(np.random.PCG64(0))
+
+
+def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any, dict[str, Any]]:
+    """Return what an export reads of simulations that two cameras see, and all arrays by slot."""
+    instants = np.linspace(0, INSTANTS - 1, FRAMES).round().astype(int).tolist()
+    time = {"instants_per_second": 15.0}
+    layouts = (
+        array("slot", "slot", "int64"),
+        array("video", "clip", "uint8", {"frame": FRAMES, "y": SIDE, "x": SIDE, "rgb": 3}, per_sample=True,
+              attributes={"instants": instants}),
+        array("holder_pose", "poses", "float32", {"instant": INSTANTS, "holder": 2, "row": 3, "column": 4},
+              attributes=time | {"names": ["napkin.left", "napkin.right"]}),
+        array("grasped", "holds", "uint8", {"instant": INSTANTS, "holder": 2}),
+        array("body_pose", "poses", "float32", {"instant": INSTANTS, "body": 1, "row": 3, "column": 4},
+              attributes={"names": ["ball"]}),
+        array("napkin.positions", "places", "float32", {"instant": INSTANTS, "vertex": VERTICES, "xyz": 3}),
+        array("napkin.rest", "flat", "float32", {"vertex": VERTICES, "uv": 2}),
+        array("mu", "friction", "float64"),
+        array("fabric", "code", "int16", categories=("wool", "silk")),
+        array("viewpoint", "code", "int16", categories=VIEWS),
+        array("split", "code", "uint8", categories=SPLITS),
+    )  # fmt: skip
+    rest = np.stack(np.meshgrid(*[np.linspace(0.0, 0.2, 5)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    count = 2 * simulations
+
+    def random(*shape: int) -> Any:
+        return np.repeat(RANDOM.normal(size=(simulations, *shape)).astype(np.float32), 2, axis=0)
+
+    data: dict[str, Any] = {
+        "slot": np.arange(count),
+        "video": RANDOM.integers(0, 256, (count, FRAMES, SIDE, SIDE, 3)).astype(np.uint8),
+        "holder_pose": random(INSTANTS, 2, 3, 4),
+        "grasped": (random(INSTANTS, 2) > 0.0).astype(np.uint8),
+        "body_pose": random(INSTANTS, 1, 3, 4),
+        "napkin.positions": random(INSTANTS, VERTICES, 3),
+        "napkin.rest": np.repeat(rest[None], count, axis=0).astype(np.float32),
+        "mu": np.repeat(np.linspace(0.1, 0.9, simulations), 2),
+        "fabric": (np.arange(count) // 2 % 2).astype(np.int16),
+        "viewpoint": (np.arange(count) % 2).astype(np.int16),
+        "split": np.repeat(np.arange(simulations) % 3, 2).astype(np.uint8),
+    }
+    arrays = {layout.name: layout for layout in layouts}
+    reader = SimpleNamespace(
+        arrays=arrays,
+        spec=SimpleNamespace(named_axes=dict.fromkeys(("mu", "fabric", "viewpoint"))),
+        categories=lambda name: arrays[name].categories,
+        label=lambda name: data[name],
+    )
+    made = SimpleNamespace(
+        arrays=layouts,
+        labels=tuple(layout for layout in layouts if layout.is_label),
+        slots=np.array([slot for slot in range(count) if slot not in without]),
+        reader=reader,
+        name="ds-1:v1",
+        title="fold-napkin",
+        sample_bytes=1,
+        read=lambda name, slots: data[name][slots],
+    )
+    return made, data
+
+
+def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> None:
+    pytest.importorskip("pandas", reason="pandas is not installed: pip install 'stickslip-training[export]'")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    made, data = content(without=(3,))  # the second simulation lacks a view
+    lerobot.write(made, tmp_path, lambda _: None)
+    episodes = parquet.read_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert episodes["mu"] == data["mu"][[0, 6, 4]].tolist()  # train, train, test
+    assert episodes["fabric"] == ["wool", "silk", "wool"]
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    assert info["splits"] == {"train": "0:2", "test": "2:3"}
+    assert info["total_frames"] == 3 * FRAMES
+    rows = parquet.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
+    instants = made.arrays[1].attributes["instants"]
+    pose, grasped = data["holder_pose"][0][instants], data["grasped"][0][instants]
+    own = np.concatenate([pose[..., 3], pose[..., 0], pose[..., 1], grasped[..., None]], axis=-1).reshape(FRAMES, -1)
+    state, action = np.array(rows["observation.state"][:FRAMES]), np.array(rows["action"][:FRAMES])
+    np.testing.assert_array_equal(state[:, :20], own)
+    np.testing.assert_array_equal(action[:-1], own[1:])
+    np.testing.assert_array_equal(action[-1], own[-1])
+    corners = data["napkin.positions"][0][instants][:, [0, 20, 24, 4, 12]].reshape(FRAMES, -1)
+    np.testing.assert_array_equal(state[:, -15:], corners)
+    names = info["features"]["observation.state"]["names"]
+    assert names[9:11] == ["napkin.left.grasp", "napkin.right.x"]
+    assert names[-15:-12] == ["napkin.0.x", "napkin.0.y", "napkin.0.z"]
+    assert len(names) == state.shape[1]
+    np.testing.assert_allclose(rows["observation.time"][:FRAMES], np.array(instants) / 15.0, rtol=1e-6)
+    stats = json.loads((tmp_path / "meta/stats.json").read_text())
+    every = np.array(rows["action"])
+    np.testing.assert_allclose(stats["action"]["mean"], every.mean(axis=0), atol=1e-12)
+    np.testing.assert_allclose(stats["action"]["std"], every.std(axis=0), atol=1e-12)
+
+
+def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="av is not installed: pip install 'stickslip-training[export]'")
+    made, data = content(1)
+    lerobot.write(made, tmp_path, lambda _: None)
+    for slot, view in enumerate(VIEWS):
+        path = tmp_path / f"videos/observation.images.{view}/chunk-000/file-000.mp4"
+        with av.open(str(path)) as file:
+            frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+        np.testing.assert_array_equal(frames, data["video"][slot])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"arrays": ()}, "and video, holder_pose, grasped are not in this part of ds-1:v1"),
+        ({"slots": np.array([0, 3])}, "an episode needs a clip of each of front, high"),
+    ],
+)
+def test_what_is_no_episode_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    made, _ = content(2)
+    vars(made).update(change)
+    with pytest.raises(ValueError, match=message):
+        lerobot.write(made, tmp_path, lambda _: None)
+
+
+_READ = """
+import sys
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+wanted = np.load(sys.argv[2])
+dataset = LeRobotDataset("local/test", root=sys.argv[1], video_backend="pyav", tolerance_s=1e-4)
+assert len(dataset) == wanted["action"].shape[0] * wanted["action"].shape[1], len(dataset)
+for item in (dataset[index] for index in range(len(dataset))):
+    episode, frame = int(item["episode_index"]), int(item["frame_index"])
+    for number, view in enumerate(("front", "high")):
+        seen = (255.0 * item[f"observation.images.{view}"]).round().byte().permute(1, 2, 0).numpy()
+        assert np.array_equal(seen, wanted["video"][episode, number, frame]), (episode, frame, view)
+    assert np.array_equal(item["action"].numpy(), wanted["action"][episode, frame]), (episode, frame)
+    assert item["task"] == "fold-napkin"
+assert dataset.meta.episodes["mu"] == wanted["mu"].tolist()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PYTHON.exists(), reason="no environment with lerobot: make .venv-lerobot")
+def test_lerobot_reads_frames_and_actions(tmp_path: Path) -> None:
+    made, data = content(16)
+    out = tmp_path / "out"
+    out.mkdir()
+    lerobot.write(made, out, lambda _: None)
+    order = np.argsort(data["split"][::2], kind="stable")
+    instants = made.arrays[1].attributes["instants"]
+    pose, grasped = data["holder_pose"][::2][order][:, instants], data["grasped"][::2][order][:, instants]
+    own = np.concatenate([pose[..., 3], pose[..., 0], pose[..., 1], grasped[..., None]], axis=-1)
+    own = own.reshape(16, FRAMES, -1)
+    wanted = {
+        "action": np.concatenate([own[:, 1:], own[:, -1:]], axis=1),
+        "video": data["video"].reshape(16, 2, FRAMES, SIDE, SIDE, 3)[order],
+        "mu": data["mu"][::2][order],
+    }
+    np.savez(tmp_path / "wanted.npz", **wanted)
+    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [str(PYTHON), "-c", _READ, str(out), str(tmp_path / "wanted.npz")],
+        env=os.environ | offline,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
