@@ -19,6 +19,7 @@ MOVED = {
     "strip": 1e-4,
     "let down": 1e-3,
     "ball": 0.01,
+    "edges": 0.01,
     "crumple": 0.04,
     "push": 0.04,
 }
@@ -47,6 +48,7 @@ CASES: dict[str, str] = {
             control.novelty control.reject_at control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
+        "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond",
         "push": "stepping.near_patience stepping.strained_soon",
         "let down": "control.halvings control.halvings_near",
     }.items()

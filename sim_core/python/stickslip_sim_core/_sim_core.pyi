@@ -150,6 +150,10 @@ class StepReport:
         """Pairs of cloth with cloth that bear a force."""
 
     @property
+    def sharpest(self) -> float:
+        """Least radius of a skeleton that cloth touched, in cells."""
+
+    @property
     def least_distance(self) -> float:
         """
         Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.
@@ -158,7 +162,7 @@ class StepReport:
 class ClothSolver:
     """Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp."""
 
-    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')] | None, edge_share: float, second_share: float, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int], surface_positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: Sequence[float], constants: Mapping[str, float] = {}) -> None: ...
+    def __init__(self, rest: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C')], triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], fabrics: Sequence[tuple[float, Annotated[NDArray[numpy.float64], dict(shape=(6, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')], float]], held: Sequence[int], clamped: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C')], *, tolerance: float, newton_max: int, krylov_max: int, krylov_tolerance: float, refactor_after: int, patience: int, halvings_max: int, step_error: float, coarsest: int, finest: int, kernel: str, thickness: Sequence[float], mu: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='F')], edge_share: float, second_share: float, surface_triangles: Annotated[NDArray[numpy.int32], dict(shape=(None, 3), order='C')], surface_of_vertex: Sequence[int], surface_positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], crease: Sequence[float], constants: Mapping[str, float] = {}) -> None: ...
 
     def set_state(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], velocities: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], slopes: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], surfaces: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], bodies: Sequence[tuple[int, Sequence[float], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]]) -> None: ...
 
@@ -182,7 +186,7 @@ class ClothSolver:
 
     def surface_forces(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
 
-    def pair_forces(self) -> tuple[Annotated[NDArray[numpy.int32], dict(shape=(None, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], list[int]]: ...
+    def pair_forces(self) -> tuple[Annotated[NDArray[numpy.int32], dict(shape=(None, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')], list[int], list[int]]: ...
 
     def masses(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C')]: ...
 

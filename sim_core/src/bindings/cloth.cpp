@@ -4,7 +4,6 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/function.h>
 #include <nanobind/stl/map.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -81,6 +80,7 @@ void bind_cloth(nb::module_& m) {
       .def_ro("contacts", &StepReport::contacts)
       .def_ro("sliding", &StepReport::sliding)
       .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear a force.")
+      .def_ro("sharpest", &StepReport::sharpest, "Least radius of a skeleton that cloth touched, in cells.")
       .def_ro("least_distance", &StepReport::least_distance,
               "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
@@ -90,7 +90,7 @@ void bind_cloth(nb::module_& m) {
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, const Edges& clamped,
              double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
              int patience, int halvings_max, double step_error, int coarsest, int finest, const std::string& kernel,
-             const std::vector<double>& thickness, const std::optional<Eigen::MatrixXd>& mu, double edge_share,
+             const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_share,
              double second_share, const Triangles& surface_triangles,
              const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
              const std::vector<double>& crease, const std::map<std::string, double>& changed) {
@@ -103,15 +103,13 @@ void bind_cloth(nb::module_& m) {
                 rest, triangles, list, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
                 {step_error, coarsest, finest}, kernel,
-                mu ? std::optional<ContactMaterials>({thickness, *mu,
-                                                      static_cast<int>(thickness.size() - crease.size()), edge_share,
-                                                      second_share, constants.contact.surface_share})
-                   : std::nullopt,
+                {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share,
+                 constants.contact.surface_share},
                 {surface_triangles, surface_of_vertex, surface_positions, crease}, constants);
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
           "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
-          "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a.none(), "edge_share"_a, "second_share"_a,
+          "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a,
           "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a,
           "constants"_a = std::map<std::string, double>())
       .def(
@@ -154,7 +152,7 @@ void bind_cloth(nb::module_& m) {
       .def("pair_forces",
            [](const ClothSolver& self) {
              const ClothSolver::PairForces p = self.pair_forces();
-             return std::make_tuple(p.vertices, p.weights, p.forces, p.distance, p.sliding);
+             return std::make_tuple(p.vertices, p.weights, p.forces, p.distance, p.sliding, p.body);
            })
       .def("masses", &ClothSolver::masses)
       .def(

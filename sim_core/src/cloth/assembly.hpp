@@ -22,9 +22,9 @@ struct NeighbourNumbers {
 
 class Assembly {
  public:
-  // `others`: vertices of surfaces.
+  // `others`: vertices of surfaces; `bones`: points of skeletons.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, const Edges& clamped, int others,
+           const std::vector<std::int32_t>& held, const Edges& clamped, int others, int bones,
            const FactorSettings& settings = {});
   Assembly(const Assembly&) = delete;
 

@@ -16,6 +16,7 @@ void each(Any& constants, const Call& call) {
   group("node", constants.node);
   group("path", constants.path);
   group("smooth", constants.smooth);
+  group("skeleton", constants.skeleton);
   group("newton", constants.newton);
   group("stepping", constants.stepping);
   group("control", constants.control);

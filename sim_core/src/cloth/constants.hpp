@@ -11,6 +11,7 @@
 #include "contact/node_settings.hpp"
 #include "contact/path_settings.hpp"
 #include "contact/settings.hpp"
+#include "contact/skeleton_settings.hpp"
 #include "contact/smooth_settings.hpp"
 
 namespace sim_core {
@@ -20,6 +21,7 @@ struct Constants {
   NodeSettings node;
   PathSettings path;
   SmoothSettings smooth;
+  SkeletonSettings skeleton;
   NewtonSettings newton;
   SteppingSettings stepping;
   ControlSettings control;

@@ -52,28 +52,78 @@ double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
   return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
 }
 
-// Sheets, and after them surfaces; -1 of slopes.
-std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces) {
+// Sheets, and after them surfaces and skeletons; -1 of slopes.
+std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces,
+                                 const std::vector<Skeleton>& skeletons) {
   const std::vector<int> sheets = mesh.sheets();
   const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
   std::vector<int> out(numbering.nodes, -1);
   for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = sheets[i];
   const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
   for (int i = 0; i < numbering.others; ++i) out[others[i]] = count + surfaces.surface_of_vertex[i];
+  int next = numbering.nodes - numbering.bones, sheet = count + static_cast<int>(surfaces.crease.size());
+  for (const Skeleton& skeleton : skeletons) {
+    for (std::size_t p = 0; p < skeleton.points.size(); ++p) out[next++] = sheet;
+    ++sheet;
+  }
+  return out;
+}
+
+// Pieces of skeletons, by node.
+Bones bones_of(const Numbering& numbering, const std::vector<Skeleton>& skeletons) {
+  Bones out;
+  int first = numbering.nodes - numbering.bones;
+  for (const Skeleton& skeleton : skeletons) {
+    const int count = static_cast<int>(skeleton.points.size());
+    for (int p = 0; p < count; ++p) out.points.push_back(first + p);
+    for (const auto& [a, b] : skeleton.segments) out.segments.push_back({first + a, first + b});
+    for (const auto& [a, b, c] : skeleton.triangles) out.triangles.push_back({first + a, first + b, first + c});
+    first += count;
+  }
   return out;
 }
 
 }  // namespace
 
+double cell_of(const ClothMesh& mesh) {
+  const std::vector<int> sheets = mesh.sheets();
+  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
+  std::vector<double> area(count, 0.0), triangles(count, 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    area[sheets[mesh.triangles(t, 0)]] += mesh.area[t];
+    triangles[sheets[mesh.triangles(t, 0)]] += 1.0;
+  }
+  double out = 0.0;
+  for (int s = 0; s < count; ++s) out = std::max(out, std::sqrt(2.0 * area[s] / triangles[s]));
+  return out;
+}
+
+ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Skeleton>& skeletons,
+                                const std::vector<Body>& bodies, double cell) {
+  const Eigen::Index before = materials.mu.rows(), count = before + static_cast<Eigen::Index>(skeletons.size());
+  Eigen::MatrixXd mu = Eigen::MatrixXd::Constant(count, count, -1.0);
+  mu.topLeftCorner(before, before) = materials.mu;
+  materials.cell = cell;
+  for (const Skeleton& one : skeletons) {
+    const Eigen::Index row = before + static_cast<Eigen::Index>(materials.bones.size());
+    for (int sheet = 0; sheet < materials.sheets; ++sheet) {
+      mu(row, sheet) = mu(sheet, row) = bodies[one.body].mu_of(sheet);
+    }
+    materials.bones.push_back({one.body, one.radius, one.whole});
+  }
+  materials.mu = std::move(mu);
+  return materials;
+}
+
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials, const SurfaceMeshes& surfaces,
-                                           const Constants& constants) {
+                                           const std::vector<Skeleton>& skeletons, const Constants& constants) {
   check_thickness(mesh, mesh.sheets(), materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
   append(surfaces.triangles, numbering.node.data() + numbering.vertices + numbering.slopes, triangles);
-  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces),
-                  (materials.mu.array() >= 0.0).matrix());
+  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, skeletons),
+                  (materials.mu.array() >= 0.0).matrix(), bones_of(numbering, skeletons));
   const double cell = std::sqrt(2.0 * mesh.area.mean());
   return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact, constants.path,
                                       constants.path.margin * cell, numbering.free_nodes);
@@ -95,7 +145,7 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
       if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
     }
   }
-  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces), materials,
+  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, {}), materials,
                                          surfaces.crease, x, radius, settings);
 }
 

@@ -10,6 +10,7 @@
 #include "cloth/numbering.hpp"
 #include "contact/contact_set.hpp"
 #include "contact/materials.hpp"
+#include "contact/skeletons.hpp"
 #include "contact/smooth.hpp"
 
 namespace sim_core {
@@ -23,10 +24,16 @@ struct SurfaceMeshes {
   std::vector<double> crease;
 };
 
+// Side of a cell of the coarsest sheet, m.
+double cell_of(const ClothMesh& mesh);
+// The materials with skeletons of these bodies.
+ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Skeleton>& skeletons,
+                                const std::vector<Body>& bodies, double cell);
+
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials, const SurfaceMeshes& surfaces,
-                                           const Constants& constants);
+                                           const std::vector<Skeleton>& skeletons, const Constants& constants);
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
                                                  const ContactMaterials& materials, const SurfaceMeshes& surfaces,
                                                  const SmoothSettings& settings);

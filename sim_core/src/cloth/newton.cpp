@@ -64,8 +64,9 @@ void Newton::predict(const StepProblem& problem, const Buffer<double>& ends, Buf
   if (contact.surfaces) contact.surfaces->begin(problem.start, ends, x);
   for (int i = 0; i < free_nodes; ++i) {
     Vector3d p = at_node(x, i);
-    for (const Body& body : problem.at_end) {
-      const Gap gap = gap_of(body, p);
+    for (std::size_t b = 0; b < problem.at_end.size(); ++b) {
+      if (contact.by_pairs(b)) continue;
+      const Gap gap = gap_of(problem.at_end[b], p);
       if (gap.distance < 0.0) p -= gap.distance * gap.normal;
     }
     if (contact.surfaces) {
@@ -100,7 +101,11 @@ void Newton::begin(const StepProblem& problem, Buffer<double>& x, bool from_rest
   }
   std::vector<Eigen::Matrix3d> own(free_nodes);
   for (int i = 0; i < free_nodes; ++i) own[i] = assembly_.own_block(i);
-  pairs->begin(problem.start, ends_, expected, std::move(own));
+  std::vector<Eigen::Matrix3d> turns;
+  for (const Bone& bone : pairs->materials().bones) {
+    turns.push_back(problem.at_end[bone.body].rotation * problem.at_start[bone.body].rotation.transpose());
+  }
+  pairs->begin(problem.start, ends_, expected, std::move(own), std::move(turns));
 }
 
 // Goes a share of the change from x, as far as pairs let it, to `trial_`. Where they stop nodes, all go less far

@@ -44,11 +44,12 @@ Graph coupled(const std::vector<Stencil>& stencils, const std::vector<int>& loca
 }  // namespace
 
 Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
-                     const std::vector<std::int32_t>& held_vertices, int slopes_in, int others_in)
+                     const std::vector<std::int32_t>& held_vertices, int slopes_in, int others_in, int bones_in)
     : vertices(static_cast<int>(mesh.rest.rows())),
       slopes(slopes_in),
       others(others_in),
-      nodes(vertices + slopes + others) {
+      bones(bones_in),
+      nodes(vertices + slopes + others + bones) {
   const std::vector<int> free_vertices = free_of(vertices, held_vertices);
   free_nodes = static_cast<int>(free_vertices.size());
   std::vector<int> local(vertices, -1);

@@ -22,6 +22,7 @@ struct StepReport {
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
   int substeps = 0, newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
+  double sharpest = std::numeric_limits<double>::infinity();  // cells: least radius of a skeleton that bears
   double factorizations = 0.0;                                      // whole ones, and shares of those in part
 
   void add_work(const StepReport& other) {
@@ -42,6 +43,7 @@ struct StepReport {
     sliding = other.sliding;
     pairs = other.pairs;
     least_distance = std::min(least_distance, other.least_distance);
+    sharpest = std::min(sharpest, other.sharpest);
   }
 };
 

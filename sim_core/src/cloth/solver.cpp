@@ -16,7 +16,7 @@ namespace sim_core {
 struct ClothSolver::Impl {
   const ClothMesh mesh;
   const SurfaceMeshes surfaces;
-  const bool self_contact;
+  const ContactMaterials materials;
   Assembly assembly;
   Stepper stepper;
   StepController controller;
@@ -25,13 +25,14 @@ struct ClothSolver::Impl {
 
   Impl(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
        const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-       const StepControl& control, const std::string& kernel, const std::optional<ContactMaterials>& touch,
-       const SurfaceMeshes& surfaces_in, const Constants& constants)
+       const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
+       const SurfaceMeshes& surfaces_in, const Constants& constants, const std::vector<Body>& bodies = {},
+       const std::vector<Skeleton>& skeletons = {})
       : mesh(rest, triangles),
         surfaces(surfaces_in),
-        self_contact(touch && touch->mu(0, 0) >= 0.0),
+        materials(with_skeletons(touch, skeletons, bodies, cell_of(mesh))),
         assembly(cloth_kernel_named(kernel), mesh, Fabrics(mesh, fabrics), held, clamped,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), constants.factor),
+                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons), constants.factor),
         stepper(assembly, settings, constants),
         controller(stepper, control, constants.control),
         newton(stepper.newton),
@@ -39,10 +40,21 @@ struct ClothSolver::Impl {
     const std::vector<int> sheets = mesh.sheets();
     stepper.sheets = 1 + *std::max_element(sheets.begin(), sheets.end());
     for (int i = 0; i < numbering.free_nodes; ++i) newton.contact.sheet[i] = sheets[numbering.vertex[i]];
-    if (touch) newton.pairs = contact_set_of(mesh, numbering, *touch, surfaces, constants);
-    if (numbering.others > 0) {
-      newton.contact.surfaces = smooth_contact_of(mesh, numbering, *touch, surfaces, constants.smooth);
+    if ((materials.mu.array() >= 0.0).any()) {
+      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, skeletons, constants);
     }
+    if (numbering.others > 0) {
+      newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces, constants.smooth);
+    }
+    stepper.skeletons = skeletons;
+    newton.contact.whole_skeletons.assign(bodies.size(), 0);
+    for (const Skeleton& one : skeletons) newton.contact.whole_skeletons[one.body] = one.whole;
+  }
+
+  static int points_of(const std::vector<Skeleton>& skeletons) {
+    std::size_t count = 0;
+    for (const Skeleton& one : skeletons) count += one.points.size();
+    return static_cast<int>(count);
   }
 
   void load(const Points3& positions, const Points3& slopes, Buffer<double>& into) const {
@@ -77,7 +89,7 @@ struct ClothSolver::Impl {
     Triangles all(mesh.triangles.rows() + surfaces.triangles.rows(), 3);
     all << mesh.triangles, (surfaces.triangles.array() + static_cast<std::int32_t>(positions.rows())).matrix();
     int unfelt = self_intersections(others, surfaces.triangles);
-    if (!self_contact) unfelt += self_intersections(positions, mesh.triangles);
+    if (!(materials.mu(0, 0) >= 0.0)) unfelt += self_intersections(positions, mesh.triangles);
     return self_intersections(points, all) > unfelt;
   }
 
@@ -91,11 +103,32 @@ struct ClothSolver::Impl {
 ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
                          const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
                          const StepControl& control, const std::string& kernel,
-                         const std::optional<ContactMaterials>& touch, const SurfaceMeshes& surfaces,
-                         const Constants& constants)
-    : impl_(std::make_unique<Impl>(rest, triangles, fabrics, held, clamped, settings, control, kernel, touch, surfaces,
-                                   constants)) {}
+                         const ContactMaterials& touch, const SurfaceMeshes& surfaces, const Constants& constants)
+    : make_([=](const std::vector<Body>& bodies, const std::vector<Skeleton>& skeletons) {
+        return std::make_unique<Impl>(rest, triangles, fabrics, held, clamped, settings, control, kernel, touch,
+                                      surfaces, constants, bodies, skeletons);
+      }),
+      constants_(constants.skeleton),
+      impl_(make_({}, {})) {}
 ClothSolver::~ClothSolver() = default;
+
+// Before a first step: takes skeletons of these bodies in place of those of others.
+void ClothSolver::meet(const std::vector<Body>& bodies) {
+  if (impl_->stepper.started()) return;
+  const Points3 at = positions();
+  const Points2& rest = impl_->mesh.rest;
+  const double across = (rest.colwise().maxCoeff() - rest.colwise().minCoeff()).norm();
+  const std::vector<Skeleton> skeletons =
+      skeletons_of(bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(),
+                   at.colwise().maxCoeff().transpose(), constants_.beyond * across, constants_);
+  if (skeletons.empty() && impl_->stepper.skeletons.empty()) return;
+  std::unique_ptr<Impl> next = make_(bodies, skeletons);
+  const long kept = 4L * (next->numbering.nodes - next->numbering.bones);
+  std::copy(impl_->stepper.x.begin(), impl_->stepper.x.begin() + kept, next->stepper.x.begin());
+  std::copy(impl_->stepper.v.begin(), impl_->stepper.v.begin() + kept, next->stepper.v.begin());
+  next->newton.phases = impl_->newton.phases;
+  impl_ = std::move(next);
+}
 
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes,
                             const Points3& surfaces, const std::vector<Body>& bodies) {
@@ -105,16 +138,20 @@ void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
     refuse("positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
+  impl_->stepper.restart({});
+  meet(bodies);
   impl_->stepper.restart(bodies);
   impl_->controller.restart();
 }
 
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
                              const Points3& surfaces, const std::vector<Body>& bodies, double damping) {
+  meet(bodies);
   return impl_->stepper.step(dt, {gravity, held, slopes, surfaces, bodies, damping});
 }
 
 StepReport ClothSolver::advance(double begin, double end, const Motion& motion) {
+  if (!impl_->stepper.started()) meet(motion(end).bodies);
   return impl_->controller.advance(begin, end, motion);
 }
 
@@ -125,10 +162,24 @@ Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x);
 Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.v); }
 Points3 ClothSolver::reactions() const { return impl_->unload(impl_->newton.residual); }
 
+template <class Call>
+void ClothSolver::each_bone_contact(const Call& call) const {
+  if (!impl_->newton.pairs) return;
+  for (const Pair& pair : impl_->newton.pairs->list()) {
+    const Bone* bone = impl_->newton.pairs->bone_of(pair);
+    if (!bone || !pair.active()) continue;
+    for (int c = 0; c < 4; ++c) {
+      const int vertex = impl_->numbering.vertex[pair.who.node[c]];
+      if (vertex < impl_->numbering.vertices && pair.weights[c] != 0.0) call(vertex, pair, bone->body);
+    }
+  }
+}
+
 std::vector<std::int32_t> ClothSolver::contacts() const {
   const Numbering& numbering = impl_->numbering;
   std::vector<std::int32_t> out(numbering.vertices, -1);
   for (int i = 0; i < numbering.free_nodes; ++i) out[numbering.vertex[i]] = impl_->newton.contact.touched[i];
+  each_bone_contact([&](int vertex, const Pair&, int body) { out[vertex] = body; });
   return out;
 }
 
@@ -138,6 +189,7 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
   }
+  each_bone_contact([&](int vertex, const Pair& pair, int) { out[vertex] |= pair.row.mode == contact_slip; });
   return out;
 }
 
@@ -168,7 +220,7 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
     }
   }
   const auto count = static_cast<Eigen::Index>(some.size());
-  PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), {}};
+  PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), {}, {}};
   for (Eigen::Index p = 0; p < count; ++p) {
     for (int c = 0; c < 4; ++c) {
       const int vertex = numbering.vertex[some[p]->who.node[c]];
@@ -178,6 +230,8 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
     out.forces.row(p) = some[p]->at.force.transpose();
     out.distance[p] = some[p]->at.gap + some[p]->thickness;
     out.sliding.push_back(some[p]->row.mode == contact_slip);
+    const Bone* bone = impl_->newton.pairs->bone_of(*some[p]);
+    out.body.push_back(bone ? bone->body : -1);
   }
   return out;
 }

@@ -4,8 +4,8 @@
 #include <Eigen/Core>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <memory>
-#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -24,11 +24,11 @@ class ClothSolver {
  public:
   // `kernel`: level of the kernels, "" for the widest that this processor runs. `fabrics`: one, or one of each sheet.
   // `held`: vertices whose positions are prescribed; `clamped`: boundary edges whose outward slope is prescribed;
-  // `touch`: contact among the sheets and then the surfaces, if any touch.
+  // `touch`: contact among the sheets and then the surfaces.
   ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-              const StepControl& control, const std::string& kernel = "",
-              const std::optional<ContactMaterials>& touch = std::nullopt, const SurfaceMeshes& surfaces = {},
+              const StepControl& control, const std::string& kernel,
+              const ContactMaterials& touch, const SurfaceMeshes& surfaces = {},
               const Constants& constants = {});
   ~ClothSolver();
 
@@ -59,14 +59,14 @@ class ClothSolver {
   // Force of the cloth on each vertex of the surfaces at the end of the last step, N.
   Points3 surface_forces() const;
 
-  // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices of surfaces come
-  // after those of the cloth.
+  // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices of surfaces and
+  // points of skeletons come after those of the cloth.
   struct PairForces {
     Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
     Eigen::Matrix<double, Eigen::Dynamic, 4, Eigen::RowMajor> weights;
     Points3 forces;            // N: on sum w_i x_i
     Eigen::VectorXd distance;  // m
-    std::vector<std::int32_t> sliding;
+    std::vector<std::int32_t> sliding, body;  // -1: of no body
   };
   PairForces pair_forces() const;
 
@@ -93,7 +93,15 @@ class ClothSolver {
 
  private:
   struct Impl;
+  std::function<std::unique_ptr<Impl>(const std::vector<Body>& bodies, const std::vector<Skeleton>& skeletons)> make_;
+  SkeletonSettings constants_;
   std::unique_ptr<Impl> impl_;
+
+  // Calls with each vertex of a pair with a skeleton that bears, the pair, and the body.
+  template <class Call>
+  void each_bone_contact(const Call& call) const;
+
+  void meet(const std::vector<Body>& bodies);
 };
 
 }  // namespace sim_core

@@ -23,12 +23,21 @@ Stepper::Stepper(Assembly& assembly, const ClothSettings& settings, const Consta
 void Stepper::restart(const std::vector<Body>& bodies) {
   bodies_before_ = bodies;
   started_ = !bodies.empty();
+  if (started_) place_skeletons(bodies);
   newton.contact.forget();
   if (newton.pairs) newton.pairs->restart();
 }
 
+void Stepper::place_skeletons(const std::vector<Body>& bodies) {
+  int node = assembly_.numbering.nodes - assembly_.numbering.bones;
+  for (const Skeleton& skeleton : skeletons) {
+    const int count = static_cast<int>(skeleton.points.size());
+    for (int p = 0; p < count; ++p) at_node(x, node++) = skeleton.point(bodies[skeleton.body], p);
+  }
+}
+
 // Sets the inertial positions and the ends of held vertices, for the part from `begin` to `end` of the step.
-void Stepper::drive_nodes(double begin, double end, double part, const Drive& drive) {
+void Stepper::drive_nodes(double begin, double end, double part, const Drive& drive, const std::vector<Body>& bodies) {
   const Numbering& numbering = assembly_.numbering;
   start_ = x;
   for (int i = 0; i < numbering.vertices; ++i) {
@@ -49,6 +58,7 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
     const int node = numbering.node[numbering.vertices + numbering.slopes + o];
     at_node(x, node) += share * (drive.others.row(o).transpose() - at_node(x, node));
   }
+  place_skeletons(bodies);
 }
 
 int Stepper::patience(bool near) const {
@@ -81,7 +91,7 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
     at_start.push_back(between(bodies_before_[b], drive.bodies[b], begin));
     at_end.push_back(between(bodies_before_[b], drive.bodies[b], end));
   }
-  drive_nodes(begin, end, part, drive);
+  drive_nodes(begin, end, part, drive, at_end);
   const Buffer<double> driven = x;
   assembly_.read_table(start_);
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
@@ -125,7 +135,7 @@ void Stepper::take(double dt, double residual, StepReport& report) {
 
 bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   check(dt, drive);
-  drive_nodes(0.0, 1.0, dt, drive);
+  drive_nodes(0.0, 1.0, dt, drive, drive.bodies);
   assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
@@ -159,7 +169,9 @@ void Stepper::count_contacts(StepReport& report) const {
     report.contacts += mode != contact_open;
     report.sliding += mode == contact_slip;
   }
-  if (newton.pairs) report.pairs = newton.pairs->active_count();
+  if (!newton.pairs) return;
+  report.pairs = newton.pairs->active_count();
+  report.sharpest = std::min(report.sharpest, newton.pairs->sharpest());
 }
 
 void Stepper::check(double dt, const Drive& drive) {
@@ -175,9 +187,18 @@ void Stepper::check(double dt, const Drive& drive) {
   if (!drive.held.allFinite() || !drive.slopes.allFinite() || !drive.gravity.allFinite()) {
     refuse("held, slopes and gravity: must be finite");
   }
-  if (!started_) bodies_before_ = drive.bodies;
+  if (!started_) {
+    bodies_before_ = drive.bodies;
+    place_skeletons(drive.bodies);
+  }
   started_ = true;
   if (bodies_before_.size() != drive.bodies.size()) refuse("bodies: must keep their number");
+  for (std::size_t b = 0; b < drive.bodies.size(); ++b) {
+    const Body &before = bodies_before_[b], &now = drive.bodies[b];
+    if (now.shape != before.shape || now.core != before.core || now.radius != before.radius || now.mu != before.mu) {
+      refuse(text("bodies: must keep their shapes and friction, and body ", b, " does not"));
+    }
+  }
   for (const Body& body : drive.bodies) {
     if (body.mu.size() == 1 || static_cast<int>(body.mu.size()) == sheets) continue;
     refuse(text("mu: of a body must be one or of ", sheets, " sheets, got ", body.mu.size()));

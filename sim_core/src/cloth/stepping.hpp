@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "cloth/newton.hpp"
+#include "contact/skeletons.hpp"
 
 namespace sim_core {
 
@@ -26,9 +27,11 @@ class Stepper {
   Newton newton;
 
   int sheets = 1;
+  std::vector<Skeleton> skeletons;
 
   // `bodies`: where they are; without, they do not move in the next step.
   void restart(const std::vector<Body>& bodies);
+  bool started() const { return started_; }
   StepReport step(double dt, const Drive& drive);
 
   // One attempt at a step, as a whole and within the settings' patience, to be accepted or rejected: then nothing has
@@ -56,7 +59,8 @@ class Stepper {
   void take(double dt, double residual, StepReport& report);
   void count_contacts(StepReport& report) const;
   bool solve_part(double begin, double end, double dt, const Drive& drive, StepReport& report);
-  void drive_nodes(double begin, double end, double part, const Drive& drive);
+  void drive_nodes(double begin, double end, double part, const Drive& drive, const std::vector<Body>& bodies);
+  void place_skeletons(const std::vector<Body>& bodies);
 
   Assembly& assembly_;
   ClothSettings settings_;

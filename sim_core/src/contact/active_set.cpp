@@ -8,7 +8,7 @@ using Eigen::Vector3d;
 bool resume(std::vector<Pair>& pairs, const ContactSettings& settings) {
   bool any = false;
   for (Pair& pair : pairs) {
-    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings.closing_gap * pair.thickness) continue;
+    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings.closing_gap * pair.scale) continue;
     PairKinematics touching = pair.at;
     touching.gap = 0.0;
     const PairLinearization row = linearize(touching);
@@ -37,7 +37,7 @@ bool activate(std::vector<Pair>& pairs, const Buffer<float>& change, int free_no
     for (Pair& pair : pairs) {
       if (pair.who.kind != kind || pair.active() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes);
-      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings.closing_gap * pair.thickness)) continue;
+      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings.closing_gap * pair.scale)) continue;
       pair.row = linearize_closing(pair.at, motion);
       pair.added = any = true;
     }

@@ -119,23 +119,87 @@ void add_if_near(std::vector<Candidate>& out, Candidate pair, const Buffer<doubl
   if (pair.distance <= reach) out.push_back(pair);
 }
 
+bool in_order(const Candidate& p, const Candidate& q) {
+  return p.first != q.first ? p.first < q.first : p.second < q.second;
+}
+
+// Pairs with skeletons, which have few pieces and reach far: each is compared with all of the cloth.
+struct SkeletonSearch {
+  const Surface& surface;
+  const Buffer<double>& x;
+  const double reach;
+  const std::vector<double>& farther;
+
+  double reach_of(int node) const { return reach + farther[surface.sheet_of_node[node]]; }
+
+  // Calls with each piece of the cloth whose box meets that of a piece of a skeleton.
+  template <class Pieces, class Call>
+  void near(const Box& box, int node, const Pieces& pieces, int count, const Call& call) const {
+    for (int i = 0; i < count; ++i) {
+      const Box other = box_of(pieces[i], x, 0.0);
+      if ((other.low > box.high).any() || (other.high < box.low).any()) continue;
+      if (surface.may_touch(pieces[i][0], node)) call(i);
+    }
+  }
+
+  void find_vertices(std::vector<Candidate>& out) const {
+    const std::size_t before = out.size();
+    for (std::size_t t = surface.bone_triangles; t < surface.triangles.size(); ++t) {
+      const auto& corner = surface.triangles[t];
+      const Box box = box_of(corner, x, reach_of(corner[0]));
+      for (int v = 0; v < surface.bone_vertices; ++v) {
+        const int vertex = surface.vertices[v];
+        const Array3d p = at_node(x, vertex).array();
+        if ((p < box.low).any() || (p > box.high).any() || !surface.may_touch(vertex, corner[0])) continue;
+        add_if_near(
+            out,
+            {PairKind::vertex_triangle, vertex, static_cast<int>(t), {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
+            reach_of(corner[0]));
+      }
+    }
+    for (std::size_t v = surface.bone_vertices; v < surface.vertices.size(); ++v) {
+      const int vertex = surface.vertices[v];
+      const Box box = box_of(std::array<int, 1>{vertex}, x, reach_of(vertex));
+      near(box, vertex, surface.triangles, surface.bone_triangles, [&](int t) {
+        const auto& corner = surface.triangles[t];
+        add_if_near(out, {PairKind::vertex_triangle, vertex, t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
+                    reach_of(vertex));
+      });
+    }
+    if (out.size() > before) std::sort(out.begin(), out.end(), in_order);
+  }
+
+  void find_edges(std::vector<Candidate>& out) const {
+    for (std::size_t e = surface.bone_edges; e < surface.edges.size(); ++e) {
+      const auto& b = surface.edges[e];
+      near(box_of(b, x, reach_of(b[0])), b[0], surface.edges, surface.bone_edges, [&](int i) {
+        const auto& a = surface.edges[i];
+        add_if_near(out, {PairKind::edge_edge, i, static_cast<int>(e), {a[0], a[1], b[0], b[1]}, 0.0}, x,
+                    reach_of(b[0]));
+      });
+    }
+  }
+};
+
 }  // namespace
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x) {
   return {at_node(x, pair.node[0]), at_node(x, pair.node[1]), at_node(x, pair.node[2]), at_node(x, pair.node[3])};
 }
 
-std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach) {
+std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach,
+                                  const std::vector<double>& farther) {
   std::vector<Candidate> out;
   std::vector<Box> boxes;
-  for (const auto& corners : surface.triangles) boxes.push_back(box_of(corners, x, reach));
+  for (int t = 0; t < surface.bone_triangles; ++t) boxes.push_back(box_of(surface.triangles[t], x, reach));
   if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(), [](const Box& box) {
         return box.low.isFinite().all() && box.high.isFinite().all();
       })) {
     return out;
   }
   const Grid around_triangles(boxes);
-  for (int vertex : surface.vertices) {
+  for (int v = 0; v < surface.bone_vertices; ++v) {
+    const int vertex = surface.vertices[v];
     const Array3d p = at_node(x, vertex).array();
     const int cell = around_triangles.cell_at(p);
     if (cell < 0) continue;
@@ -147,9 +211,11 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
                   reach);
     }
   }
+  const SkeletonSearch skeletons{surface, x, reach, farther};
+  skeletons.find_vertices(out);
   const std::size_t vertex_pairs = out.size();
   boxes.clear();
-  for (const auto& ends : surface.edges) boxes.push_back(box_of(ends, x, 0.5 * reach));
+  for (int e = 0; e < surface.bone_edges; ++e) boxes.push_back(box_of(surface.edges[e], x, 0.5 * reach));
   const Grid edges(boxes);
   Around around;
   for (int cell = 0; cell < edges.cells(); ++cell) {
@@ -170,10 +236,8 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
       }
     }
   }
-  std::sort(out.begin() + static_cast<std::ptrdiff_t>(vertex_pairs), out.end(),
-            [](const Candidate& p, const Candidate& q) {
-              return p.first != q.first ? p.first < q.first : p.second < q.second;
-            });
+  skeletons.find_edges(out);
+  std::sort(out.begin() + static_cast<std::ptrdiff_t>(vertex_pairs), out.end(), in_order);
   return out;
 }
 

@@ -1,6 +1,7 @@
 #include "contact/contact_set.hpp"
 
 #include <algorithm>
+#include <limits>
 #include <utility>
 
 #include "contact/matching.hpp"
@@ -21,8 +22,8 @@ void ContactSet::restart() {
 }
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-                       std::vector<Matrix3d> own) {
-  detection_.begin(start, ends, expected, std::move(own));
+                       std::vector<Matrix3d> own, std::vector<Matrix3d> bone_turns) {
+  detection_.begin(start, ends, expected, std::move(own), std::move(bone_turns));
   base_ = kept_;
 }
 
@@ -72,6 +73,20 @@ bool ContactSet::relevant() const {
     const int last = std::max(sheet_of_node[pair.who.node[0]], sheet_of_node[pair.who.node[3]]);
     return pair.active() || last < detection_.materials.sheets;
   });
+}
+
+const Bone* ContactSet::bone_of(const Pair& pair) const {
+  const std::vector<int>& sheet_of_node = detection_.near.surface.sheet_of_node;
+  return materials().bone_of(sheet_of_node[pair.who.node[0]], sheet_of_node[pair.who.node[3]]);
+}
+
+double ContactSet::sharpest() const {
+  double out = std::numeric_limits<double>::infinity();
+  for (const Pair& pair : pairs_) {
+    const Bone* bone = bone_of(pair);
+    if (bone && pair.active()) out = std::min(out, bone->radius / materials().cell);
+  }
+  return out;
 }
 
 bool ContactSet::active() const {

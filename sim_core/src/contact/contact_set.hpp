@@ -27,9 +27,10 @@ class ContactSet {
   // Forgets all forces.
   void restart();
   // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`; all nodes are
-  // `expected` where velocities lead. `own`: stiffness of the free nodes, N/m.
+  // `expected` where velocities lead. `own`: stiffness of the free nodes, N/m; `bone_turns`: of the
+  // skeletons in the step.
   void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-             std::vector<Eigen::Matrix3d> own);
+             std::vector<Eigen::Matrix3d> own, std::vector<Eigen::Matrix3d> bone_turns);
   // Keeps the forces at the end of a step for the next one.
   void keep();
 
@@ -53,6 +54,11 @@ class ContactSet {
 
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
+  const ContactMaterials& materials() const { return detection_.materials; }
+  // The skeleton of a pair, or null.
+  const Bone* bone_of(const Pair& pair) const;
+  // Least radius over the side of a cell of a skeleton that bears; infinite where none does.
+  double sharpest() const;
   // Whether there is a force or an active pair.
   bool active() const;
   int active_count() const;

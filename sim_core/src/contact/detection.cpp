@@ -42,11 +42,18 @@ std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights)
   return {first, second};
 }
 
+// How much farther than other pairs those with each sheet, surface and skeleton reach, m.
+std::vector<double> farther_of(const ContactMaterials& materials) {
+  std::vector<double> out(materials.thickness.size(), 0.0);
+  for (const Bone& bone : materials.bones) out.push_back(bone.radius - materials.farthest());
+  return out;
+}
+
 }  // namespace
 
 PairDetection::PairDetection(Surface surface, const ContactMaterials& materials_in, const ContactSettings& settings,
                              const PathSettings& path, double margin, int free_nodes)
-    : near(std::move(surface), materials_in.farthest(), margin, path),
+    : near(std::move(surface), materials_in.farthest(), margin, path, farther_of(materials_in)),
       materials(materials_in),
       settings_(settings),
       free_nodes_(free_nodes),
@@ -54,25 +61,31 @@ PairDetection::PairDetection(Surface surface, const ContactMaterials& materials_
       turns_(settings.turn_max) {}
 
 void PairDetection::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-                          std::vector<Matrix3d> own) {
+                          std::vector<Matrix3d> own, std::vector<Matrix3d> bone_turns) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
   own_ = std::move(own);
+  bone_turns_ = std::move(bone_turns);
 }
 
 void PairDetection::find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs) {
   smoothing_ = smoothing;
   stiff_ = stiff;
   std::vector<Candidate>& candidates = near.pairs(x);
-  const double reach = settings_.detection_range * near.thickness + 2.0 * near.moved(*start_, x);
+  const double reach = (settings_.detection_range - 1.0) * near.thickness + 2.0 * near.moved(*start_, x);
   pairs.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
   find_vertices(candidates, reach, x, pairs);
   find_edges(candidates, reach, x, pairs);
 }
 
-// A vertex may be closest to an edge or a corner of a triangle. Such a pair counts once, and only where all triangles
+const Bone* PairDetection::bone_of(const Candidate& pair) const {
+  const std::vector<int>& sheet = near.surface.sheet_of_node;
+  return materials.bone_of(sheet[pair.node[0]], sheet[pair.node[3]]);
+}
+
+// `reach`: beyond what a pair keeps apart, m. A vertex may be closest to an edge or a corner of a triangle. Such a pair counts once, and only where all triangles
 // around the feature agree: otherwise a point inside one of them is closer.
 void PairDetection::find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
                                   std::vector<Pair>& pairs) {
@@ -87,7 +100,7 @@ void PairDetection::find_vertices(std::vector<Candidate>& candidates, double rea
     for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
          ++c) {
       Candidate& who = candidates[c];
-      if (who.distance > reach) continue;
+      if (who.distance > near.apart(who) + reach) continue;
       const FourPoints at = points_of(who, x);
       const Vector4d weights = closest_weights(who.kind, at);
       who.distance = between_closest(weights, at).norm();
@@ -114,7 +127,11 @@ void PairDetection::find_vertices(std::vector<Candidate>& candidates, double rea
       const int around = feature < triangles           ? 1
                          : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
                                                        : around_node(feature - triangles - edges);
-      if (static_cast<int>(next - i) != around || candidates[found[i].candidate].distance > reach) continue;
+      if (static_cast<int>(next - i) != around) continue;
+      const Candidate& who = candidates[found[i].candidate];
+      if (who.distance > near.apart(who) + reach) continue;
+      // Corners of the cloth touch a body by themselves where pairs only hold what lies between them.
+      if (const Bone* bone = bone_of(who); bone && !bone->whole && feature >= triangles + edges) continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
         const auto first = std::lower_bound(pairs.begin(), pairs.end(), other,
@@ -133,11 +150,11 @@ void PairDetection::find_vertices(std::vector<Candidate>& candidates, double rea
 void PairDetection::find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
                                std::vector<Pair>& pairs) {
   for (Candidate& who : candidates) {
-    if (who.kind != PairKind::edge_edge || who.distance > reach) continue;
+    if (who.kind != PairKind::edge_edge || who.distance > near.apart(who) + reach) continue;
     const FourPoints at = points_of(who, x);
     const Vector4d weights = closest_weights(who.kind, at);
     who.distance = between_closest(weights, at).norm();
-    if (who.distance > reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
+    if (who.distance > near.apart(who) + reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
         crossing_squared(at) < settings_.crossing_least)
       continue;
     add(who, who.second, weights, x, pairs);
@@ -151,7 +168,9 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
   const FourPoints at = points_of(who, x);
   const Vector3d rho = between_closest(weights, at);
   const double distance = rho.norm();
-  least_distance_ = std::min(least_distance_, distance);
+  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
+  const Bone* bone = materials.bone_of(a, b);
+  if (!bone) least_distance_ = std::min(least_distance_, distance);
   if (!(distance > 0.0)) return;
   const auto [along_first, along_second] = directions(who.kind, weights);
   PairMotions given = PairMotions::Zero();
@@ -174,7 +193,6 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
     softness_along += weights[c] * weights[c] / (share * mean + std::max(n.dot(own * n), 0.0));
   }
   if (!(softness > 0.0)) return;
-  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
   Vector3d slip = this->slip(who, weights, rho);
   slip -= slip.dot(n) * n;
   const double thickness = materials.apart(who.kind, a, b), k = settings_.law_stiffness / softness;
@@ -187,18 +205,23 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
                    weights,
                    {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
                     k * smoothing_ * smoothing_},
-                   first - 0.5 * rho,
+                   first - (!bone ? 0.5 : a > b ? 1.0 : 0.0) * rho,
                    thickness,
+                   bone ? materials.thickness[std::min(a, b)] : thickness,
                    along_first,
                    along_second,
                    given});
 }
 
-// Motion of the first point over the second, less that by which rho turns: with a surface, or half with each sheet.
+// Motion of the first point over the second, less that by which rho turns: with a body or surface, or half with each sheet.
 Vector3d PairDetection::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];
   Matrix3d turn = Matrix3d::Zero();
+  if (materials.bone_of(a, b)) {
+    turn = bone_turns_[std::max(a, b) - materials.first_bone()];
+    return rho - turn * between_closest(weights, points_of(who, *start_));
+  }
   for (int c = 0; c < 4; ++c) {
     const int own = sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
     const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;

@@ -22,7 +22,7 @@ class PairDetection {
 
   // See ContactSet::begin.
   void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-             std::vector<Eigen::Matrix3d> own);
+             std::vector<Eigen::Matrix3d> own, std::vector<Eigen::Matrix3d> bone_turns);
   // Replaces `pairs` by those at x, sorted by kind, first and feature, without forces. `smoothing` [m] and `stiff`: see
   // ContactSet.
   void find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs);
@@ -30,6 +30,7 @@ class PairDetection {
   double least_distance() const { return least_distance_; }
 
  private:
+  const Bone* bone_of(const Candidate& pair) const;
   void find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
                      std::vector<Pair>& pairs);
   void find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x, std::vector<Pair>& pairs);
@@ -43,6 +44,7 @@ class PairDetection {
   bool stiff_ = false;
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
+  std::vector<Eigen::Matrix3d> bone_turns_;
   std::vector<Eigen::Matrix3d> own_;  // stiffness of the free nodes, N/m
 };
 

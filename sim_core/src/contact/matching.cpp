@@ -31,7 +31,7 @@ void transfer(std::vector<Pair>& pairs, const std::vector<PairPast>& before, dou
       const int mode = before[o].mode;
       const double last = before[o].missed, now = violation(pairs[i].at, mode);
       if (exact && share == 1.0 && mode != contact_open && last > settings.length_tolerance &&
-          last < settings.stall_up_to * pairs[i].thickness && now > settings.stall_ratio * last) {
+          last < settings.stall_up_to * pairs[i].scale && now > settings.stall_ratio * last) {
         pairs[i].penalty_scale = std::min(settings.penalty_growth * before[o].penalty_scale, settings.penalty_max);
       }
       pairs[i].at.along *= pairs[i].penalty_scale;
@@ -61,7 +61,7 @@ void transfer(std::vector<Pair>& pairs, const std::vector<PairPast>& before, dou
       pairs[match].at.force += force;
       continue;
     }
-    best = settings.transfer_radius * orphan->thickness;
+    best = settings.transfer_radius * orphan->scale;
     for (std::size_t i = 0; i < pairs.size(); ++i) {
       const double far = (pairs[i].middle - orphan->middle).norm();
       const double alike = pairs[i].at.normal.dot(orphan->normal);
@@ -93,9 +93,13 @@ void merge(std::vector<Pair>& pairs, const Surface& surface, const ContactMateri
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
-    const double radius = settings.merge_radius * pairs[i].thickness;
+    const double radius = settings.merge_radius * pairs[i].scale;
+    const auto body = [&](std::size_t j) {
+      const auto& node = pairs[j].who.node;
+      return materials.bone_of(surface.sheet_of_node[node[0]], surface.sheet_of_node[node[3]]);
+    };
     const auto take = [&](std::size_t j) {
-      if (gone[j] || (pairs[j].middle - pairs[i].middle).squaredNorm() > radius * radius) return;
+      if (gone[j] || body(j) != body(i) || (pairs[j].middle - pairs[i].middle).squaredNorm() > radius * radius) return;
       const Vector3d& force = pairs[j].at.force;
       pairs[i].at.force += pairs[i].at.normal.dot(pairs[j].at.normal) > 0.0 ? force : Vector3d(-force);
       gone[j] = 1;

@@ -14,7 +14,7 @@ PairPast::PairPast(const Pair& pair)
       change(pair.change),
       normal(pair.at.normal),
       middle(pair.middle),
-      thickness(pair.thickness),
+      scale(pair.scale),
       penalty_scale(pair.penalty_scale),
       missed(violation(pair.at, pair.row.mode)) {}
 

@@ -18,8 +18,9 @@ struct Pair {
                 // or the second edge
   Eigen::Vector4d weights;
   PairKinematics at;
-  Eigen::Vector3d middle;  // of the two points, m
-  double thickness;        // m
+  Eigen::Vector3d middle;  // of the two points, or with a skeleton that of the cloth, m
+  double thickness;        // m: that it keeps apart
+  double scale;            // m: that of the cloth, which is less with a skeleton
   // Derivatives of the weights by the places of the closest points on their pieces.
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
@@ -46,7 +47,7 @@ struct PairPast {
   Candidate who;
   int feature, mode;
   Eigen::Vector3d force, change, normal, middle;
-  double thickness, penalty_scale;
+  double scale, penalty_scale;
   double missed;  // violation of its row, m; see `violation`
 
   PairPast(const Pair& pair);

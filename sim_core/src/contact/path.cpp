@@ -30,15 +30,28 @@ double fastest(const Candidate& pair, const std::vector<double>& ways) {
 
 }  // namespace
 
-Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin, const PathSettings& settings)
+Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin, const PathSettings& settings,
+                             std::vector<double> farther)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
-      leaves{settings.keep, thickness_in, settings.floor * thickness_in, settings.rest},
       margin_(margin),
-      rounds_max_(settings.rounds_max),
+      settings_(settings),
+      farther_(std::move(farther)),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
-      way_(share_) {}
+      way_(share_) {
+  farther_.resize(surface.collides.rows(), 0.0);
+}
+
+double Neighbourhood::apart(const Candidate& pair) const {
+  const std::vector<int>& sheet = surface.sheet_of_node;
+  return thickness + farther_[std::max(sheet[pair.node[0]], sheet[pair.node[3]])];
+}
+
+Leaves Neighbourhood::leaves(const Candidate& pair) const {
+  const double most = apart(pair);
+  return {settings_.keep, most, settings_.floor * most, settings_.rest};
+}
 
 // Half of the diagonal of the box of the motions, which bounds them but for a common one.
 double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to) const {
@@ -63,7 +76,7 @@ Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<
 
 void Neighbourhood::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
-  pairs_ = candidates(surface, x, thickness + 2.0 * margin_);
+  pairs_ = candidates(surface, x, thickness + 2.0 * margin_, farther_);
   ++rebuilds;
 }
 
@@ -123,8 +136,8 @@ double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<doub
   const std::vector<Candidate>& near = pairs(from);
   measure(from, to, way_);
   for (const Candidate& pair : near) {
-    if (fastest(pair, way_) <= pair.distance - leaves.of(pair.distance)) continue;
-    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), leaves));
+    if (fastest(pair, way_) <= pair.distance - leaves(pair).of(pair.distance)) continue;
+    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), leaves(pair)));
   }
   return least;
 }
@@ -142,21 +155,21 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
     way_[i] = (place(i) - at_node(from, i) - common).norm();
   };
   bool whole = true;
-  for (int round = 0; round <= rounds_max_; ++round) {
+  for (int round = 0; round <= settings_.rounds_max; ++round) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
       const double distance = pair.distance - fastest(pair, drift_);
-      if (fastest(pair, way_) <= distance - leaves.of(distance)) continue;
+      if (fastest(pair, way_) <= distance - leaves(pair).of(distance)) continue;
       const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]), place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, leaves);
+      const double safe = safe_share(pair.kind, points_of(pair, from), ends, leaves(pair));
       if (safe == 1.0) continue;
       least = std::min(least, safe);
-      if (round == rounds_max_) continue;
+      if (round == settings_.rounds_max) continue;
       for (int i : pair.node) shorten(i, safe);
     }
     if (least == 1.0) break;
     whole = false;
-    if (round == rounds_max_) {
+    if (round == settings_.rounds_max) {
       for (int i : surface.vertices) share_[i] *= least;
     }
   }

@@ -8,15 +8,18 @@
 
 namespace sim_core {
 
-// Knows which pairs are near: all that can come within `thickness`, the largest, while no node has moved further than
-// `margin` from where it was, whatever common way all of them have come.
+// Knows which pairs are near: all that can come within `thickness`, the largest, or `farther` than that by sheet, of
+// skeletons, while no node has moved further than `margin` from where it was, whatever common way all have come.
 class Neighbourhood {
  public:
-  Neighbourhood(Surface surface, double thickness, double margin, const PathSettings& settings = {});
+  Neighbourhood(Surface surface, double thickness, double margin, const PathSettings& settings = {},
+                std::vector<double> farther = {});
 
   const Surface surface;
   const double thickness;
-  const Leaves leaves;
+
+  // What a pair keeps apart at most, m.
+  double apart(const Candidate& pair) const;
 
   // The pairs, for positions x. Of each, `distance` is at most its distance there.
   std::vector<Candidate>& pairs(const Buffer<double>& x);
@@ -39,12 +42,14 @@ class Neighbourhood {
  private:
   double moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const;
   void rebuild(const Buffer<double>& x);
+  Leaves leaves(const Candidate& pair) const;
   bool cap_near(const Buffer<double>& from, Buffer<double>& to);
   // Of each vertex the length of its way but for a common one, which it returns: the middle of the box of all ways.
   Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to, std::vector<double>& ways) const;
 
   double margin_;
-  int rounds_max_;
+  PathSettings settings_;
+  std::vector<double> farther_;
   std::vector<Candidate> pairs_;
   Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
   std::vector<double> share_, drift_, way_;

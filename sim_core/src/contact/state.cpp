@@ -66,6 +66,7 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     Gap gap{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()};
     int which = -1;
     for (std::size_t b = 0; b < at_end.size(); ++b) {
+      if (by_pairs(b)) continue;
       const Gap one = gap_of(at_end[b], p);
       if (one.distance < gap.distance) gap = one, which = static_cast<int>(b);
     }

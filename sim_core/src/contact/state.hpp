@@ -32,6 +32,8 @@ class ContactState {
   Buffer<float> normal, direction, mu, turning;
   Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
+  std::vector<char> whole_skeletons;  // (bodies): those that nodes do not feel; none: all are felt
+  bool by_pairs(std::size_t body) const { return body < whole_skeletons.size() && whole_skeletons[body]; }
   std::unique_ptr<SmoothContact> surfaces;  // null if there are none
 
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method

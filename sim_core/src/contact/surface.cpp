@@ -6,12 +6,15 @@
 namespace sim_core {
 
 Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in,
-                 CollisionMask collides_in)
+                 CollisionMask collides_in, const Bones& bones)
     : triangles(std::move(triangles_in)),
       around_begin(sheet_of_node_in.size() + 1, 0),
       sheet_of_node(std::move(sheet_of_node_in)),
       collides(std::move(collides_in)),
+      bone_triangles(static_cast<int>(triangles.size())),
       last_collider(collides.rows(), -1) {
+  triangles.insert(triangles.end(), bones.triangles.begin(), bones.triangles.end());
+  const int first_bone = bones.points.empty() ? static_cast<int>(sheet_of_node.size()) : bones.points.front();
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
     if (sheet_of_node[i] < 0) continue;
     for (Eigen::Index sheet = 0; sheet < collides.rows(); ++sheet) {
@@ -21,10 +24,11 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
   for (const auto& corners : triangles) {
     for (int c = 0; c < 3; ++c) {
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
-      edges.push_back({std::min(i, j), std::max(i, j)});
-      ++around_begin[corners[c] + 1];
+      if (i != j) edges.push_back({std::min(i, j), std::max(i, j)});
+      if (c == 0 || corners[c] != corners[c - 1]) ++around_begin[corners[c] + 1];
     }
   }
+  edges.insert(edges.end(), bones.segments.begin(), bones.segments.end());
   std::sort(edges.begin(), edges.end());
   edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
   triangles_of_edge.assign(edges.size(), 0);
@@ -34,19 +38,27 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
       const std::array<int, 2> edge{std::min(i, j), std::max(i, j)};
       own[c] = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), edge) - edges.begin());
-      ++triangles_of_edge[own[c]];
+      const bool counts = i != j && std::find(own.begin(), own.begin() + c, own[c]) == own.begin() + c;
+      triangles_of_edge[own[c]] += counts;
     }
     triangle_edges.push_back(own);
   }
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
-    if (around_begin[i + 1] > 0) vertices.push_back(static_cast<int>(i));
+    if (around_begin[i + 1] > 0 || static_cast<int>(i) >= first_bone) vertices.push_back(static_cast<int>(i));
     around_begin[i + 1] += around_begin[i];
   }
   around.resize(around_begin.back());
   std::vector<int> next(around_begin.begin(), around_begin.end() - 1);
   for (std::size_t t = 0; t < triangles.size(); ++t) {
-    for (int node : triangles[t]) around[next[node]++] = static_cast<int>(t);
+    const auto& corners = triangles[t];
+    for (int c = 0; c < 3; ++c) {
+      if (c == 0 || corners[c] != corners[c - 1]) around[next[corners[c]]++] = static_cast<int>(t);
+    }
   }
+  bone_edges = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_bone, -1}) -
+                                edges.begin());
+  bone_vertices =
+      static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) - vertices.begin());
 }
 
 }  // namespace sim_core

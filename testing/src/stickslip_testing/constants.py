@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, plane
+from stickslip_sim_core.cloth.bodies import Body, box, plane, sphere
 from stickslip_sim_core.cloth.contact import SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
@@ -144,6 +144,18 @@ def ball(preset: SolverSettings) -> Cloth:
     return cloth
 
 
+def edges(preset: SolverSettings) -> Cloth:
+    """A sheet falls onto a ball and the edges of a box, both small against its cells."""
+    mesh = meshes.unstructured(0.08, 0.08, 0.01, 5)
+    cloth = Cloth(mesh, fabric(FABRIC), preset)
+    cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), 0.002)]))
+    ball = sphere(0.5, 0.012, origin=(-0.02, 0.003, -0.012))
+    block = box(0.5, (0.03, 0.03, 0.03), rounding=0.01, origin=(0.022, 0.0, -0.015))
+    for _ in range(15):
+        cloth.step(STEP, bodies=[ball, block])
+    return cloth
+
+
 def strip(preset: SolverSettings) -> Cloth:
     """A wavy strip is pushed and pulled over a floor by its end, by steps of the controller's choice."""
     mesh = meshes.grid(0.02, 0.12, 3, 16)
@@ -179,12 +191,13 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
         "squeeze": lambda preset: _steps(squeeze(1, preset), 9),
         "ball": ball,
         "strip": strip,
+        "edges": edges,
         "push": lambda preset: controlled(crumple(1, preset), 0.05, 3),
         "let down": lambda preset: controlled(folding(1, preset), 0.1, 10),
     }
 )
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
-within its plane, one on a ball, one that slides; the crumple and the fold by steps of the controller's choice."""
+within its plane, one on a ball, one that slides, one on edges; the crumple and the fold by steps of the controller's choice."""
 
 
 def main(out: Path) -> None:

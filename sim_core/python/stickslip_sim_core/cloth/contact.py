@@ -149,10 +149,10 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class PairForces:
-    """Forces of cloth on cloth and surfaces, at P pairs of closest points."""
+    """Forces of cloth on cloth, surfaces and the skeletons of bodies, at P pairs of closest points."""
 
     vertices: NDArray[np.int32]
-    """(P, 4); those of surfaces come after those of the cloth."""
+    """(P, 4); those of surfaces and then of skeletons come after those of the cloth."""
 
     weights: Floats
     """(P, 4): the force acts on each vertex by its weight."""
@@ -165,3 +165,6 @@ class PairForces:
 
     sliding: NDArray[np.bool_]
     """(P,)"""
+
+    body: NDArray[np.int32]
+    """(P,): number of the body, -1 where there is none."""

@@ -118,6 +118,8 @@ class Cloth:
         self._solver = self._make(held=self.held.tolist())
         self.least_distance = np.inf
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
+        self.sharpest = np.inf
+        """Least radius over the side of a cell of a body that cloth touched by more than its vertices."""
         self.steps = self.unconverged_steps = 0
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
@@ -126,10 +128,8 @@ class Cloth:
         """Whole factorizations, plus shares of partial ones."""
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
-    def _touch(self, sheets: int) -> tuple[Floats | None, Floats]:
-        """Return friction between sheets and surfaces (-1: no contact; None: no contact at all), and thicknesses."""
-        if not self.self_contact and not self.surfaces:
-            return None, np.empty(0)
+    def _touch(self, sheets: int) -> tuple[Floats, Floats]:
+        """Return friction between sheets and surfaces (-1: no contact), and thicknesses."""
         mu = np.full((sheets + len(self.surfaces),) * 2, -1.0)
         thickness = np.full(sheets, THICKNESS)
         if self.self_contact:
@@ -187,8 +187,10 @@ class Cloth:
     def pair_forces(self) -> PairForces:
         """Forces of pairs of closest points, of cloth and cloth and of cloth and triangles of surfaces, at the end of
         the last step."""
-        vertices, weights, forces, distance, sliding = self._solver.pair_forces()
-        return PairForces(vertices, weights, forces, distance, np.asarray(sliding, dtype=bool))
+        vertices, weights, forces, distance, sliding, body = self._solver.pair_forces()
+        return PairForces(
+            vertices, weights, forces, distance, np.asarray(sliding, dtype=bool), np.asarray(body, dtype=np.int32)
+        )
 
     @property
     def surface_forces(self) -> list[Floats]:
@@ -286,6 +288,18 @@ class Cloth:
             report = self.step((end - begin) / steps, held=held, bodies=bodies, damping=damping)
         return report
 
+    def body_forces(self, count: int) -> Floats:
+        """Return the forces of the first `count` bodies on the cloth in the last step (count, 3) [N]."""
+        pairs, contacts, reactions = self.pair_forces, self.contacts, self.reactions
+        free = np.setdiff1d(np.arange(len(contacts)), self.held)
+        on_cloth = (pairs.weights * (pairs.vertices < len(contacts))).sum(axis=1)[:, None] * pairs.forces
+        return np.stack(
+            [
+                reactions[free][contacts[free] == body].sum(axis=0) + on_cloth[pairs.body == body].sum(axis=0)
+                for body in range(count)
+            ]
+        )
+
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
@@ -310,6 +324,7 @@ class Cloth:
         self.flips += report.flips
         self.halvings += report.halvings
         self.least_distance = min(self.least_distance, report.least_distance)
+        self.sharpest = min(self.sharpest, report.sharpest)
         return report
 
     def softest(self) -> float:
