@@ -197,7 +197,8 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
     }
 )
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
-within its plane, one on a ball, one that slides, one on edges; the crumple and the fold by steps of the controller's choice."""
+within its plane, one on a ball, one that slides, one on edges; the crumple and the fold by steps of the controller's
+choice."""
 
 
 def main(out: Path) -> None:

@@ -120,6 +120,6 @@ KIND = cloth_kind(scene)
 
 
 def forces(cloth: Cloth) -> Record:
-    """Return the forces on the cloth (3,) [N]: of all bodies, and of floor and sphere over the vertices they touch."""
-    of_floor, of_sphere = (cloth.reactions[cloth.contacts == body].sum(axis=0) for body in (0, 1))
+    """Return the forces on the cloth (3,) [N]: of all bodies, of the floor and of the sphere."""
+    of_floor, of_sphere = cloth.body_forces(2)
     return {"contact_force": cloth.contact_force(), "floor_force": of_floor, "sphere_force": of_sphere}
