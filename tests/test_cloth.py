@@ -9,7 +9,7 @@ import pytest
 from harness import STICKSLIP, Service, read_arrays
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.kinds.cloth.arrays import SEGMENTS
+from stickslip_schemas.kinds.cloth.spec import SEGMENTS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_sim_core.scenes import cloth_drag

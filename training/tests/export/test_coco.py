@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from stickslip_schemas.kinds.cloth.arrays import SEGMENTS
+from stickslip_schemas.kinds.cloth.spec import SEGMENTS
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.export.coco import export_coco, run_lengths
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -61,6 +62,16 @@ ArtifactRef = Annotated[
 def referred(name: str) -> Sha256 | None:
     """Return the digest that a reference to an artifact names; None where `name` is a name."""
     return name.removeprefix(ARTIFACT) if name.startswith(ARTIFACT) else None
+
+
+def placed(document: Any, place: Sequence[str | int], value: Any) -> Any:
+    """Return a copy of a JSON document with another value at a place; positions in lists may be texts."""
+    if not place:
+        return value
+    step, *rest = place
+    if isinstance(document, list):
+        return [placed(item, rest, value) if at == int(step) else item for at, item in enumerate(document)]
+    return {**document, step: placed(document[step], rest, value)}
 
 
 def _normalised(value: Any) -> Any:

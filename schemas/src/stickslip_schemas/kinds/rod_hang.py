@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from stickslip_schemas.base.document import Document, Float
+from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
@@ -51,6 +52,8 @@ class RodHangRender(Render):
     """How a rod is seen: all that its views depend on besides its shape and the build."""
 
     kind: Literal["rod_hang"] = "rod_hang"
+    rig: str
+    rig_digest: Sha256
     color_seed: Seed
     radius: float = Field(default=0.008, gt=0, lt=0.1, description="radius over length")
 

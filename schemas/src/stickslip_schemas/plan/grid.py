@@ -77,7 +77,11 @@ def count(spec: JobSpec) -> Counts:
 def _axes_of(spec: JobSpec, document: type[Document], seeds: Collection[SeedRule]) -> set[str]:
     """Return the axes that a document of a sample depends on."""
     entering = {axis for rule in seeds for axis in spec.seed_axes(rule)}
-    return entering | {name for name in spec.named_axes if name in document.model_fields}
+    return entering | {
+        axis
+        for axis in spec.named_axes
+        if any(path.partition("/")[0] in document.model_fields for path in spec.fields_of(axis))
+    }
 
 
 def _distinct(spec: JobSpec, names: Collection[str]) -> int:

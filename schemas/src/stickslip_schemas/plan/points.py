@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.keys import canonical_json, content_key, keyed_text, seed_of_key, sha256
+from stickslip_schemas.base.keys import canonical_json, content_key, keyed_text, placed, seed_of_key, sha256
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import columns_of, combined
@@ -141,14 +141,11 @@ class _Template(NamedTuple):
         dumped = model.model_dump(mode="json")
         varying = {field for axis, value in point.items() for field in spec.document_fields(axis, value)}
         seeds = {rule.field for rule in rules}
-        document = {
-            name: _hole(f"{type(model).__name__}/{name}")
-            if name in seeds
-            else _hole(name)
-            if name in varying
-            else value
-            for name, value in dumped.items()
-        }
+        document = {name: _hole(f"{type(model).__name__}/{name}") if name in seeds else dumped[name] for name in dumped}
+        for path in varying:
+            name, *inner = path.split("/")
+            if name in dumped:
+                document[name] = placed(document[name], inner, _hole(path))
         return cls(
             document,
             {name: value for name, value in document.items() if name not in seeds},
@@ -188,7 +185,7 @@ def _format(document: Any, purpose: str | None = None) -> str:
     """Return the canonical JSON of `document` (what `content_key` hashes, with a purpose) as a %-format."""
     text = canonical_json(document)
     text = (text if purpose is None else keyed_text(purpose, text)).replace("%", "%%")
-    return re.sub(r'"\\u0000([\w/]+)\\u0000"', r"%(\1)s", text)
+    return re.sub(r'"\\u0000([\w/-]+)\\u0000"', r"%(\1)s", text)
 
 
 def _seed_of(text: str) -> int:

@@ -11,15 +11,27 @@ from stickslip_schemas.base.keys import content_key
 from stickslip_schemas.scene.bodies import Body, MeshBody, Plane
 from stickslip_schemas.scene.looks import Looks
 from stickslip_schemas.scene.motion import BY_NAME, Motion, Time, Vector
-from stickslip_schemas.scene.parameters import Parameter, ParameterName, Path, Value, at, found, refuse, with_values
+from stickslip_schemas.scene.parameters import (
+    Parameter,
+    ParameterName,
+    Path,
+    Value,
+    at,
+    found,
+    refuse,
+    refuse_as,
+    with_values,
+)
 from stickslip_schemas.scene.sheets import FileMesh, FromFile, Sheet
-from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, did_you_mean
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean
 from stickslip_schemas.spec.jobs import PresetName
 
 MAX_FRAMES = 10_000
 """Of a scene."""
 MAX_VERTICES = 100_000
 """Of all sheets of a scene."""
+MAX_TRACK = 2**31 // 12
+"""Vertices times frames of a sheet: a chunk of its positions, in single precision, has at most 2 GiB."""
 
 Friction = Annotated[Float, Field(ge=0, le=10)]
 
@@ -143,7 +155,12 @@ class Physics(Document):
         if vertices > MAX_VERTICES:
             refuse(self, ("sheets",), f"must have at most {MAX_VERTICES} vertices together", vertices)
         for name, sheet in self.sheets.items():
+            if not sheet.self_contact and len(self.sheets) > 1:
+                refuse(self, ("sheets", name, "self_contact"), "must be true where there are several sheets", False)
             count = sheet.mesh.shape[0]
+            if count * self.frames > MAX_TRACK:
+                rule = f"vertices times frames must be at most {MAX_TRACK}, and there are {count} and {self.frames}"
+                refuse(self, ("sheets", name, "mesh"), rule, count * self.frames)
             for key, held in sheet.holders.items():
                 if count and held.vertices and max(held.vertices) >= count:
                     place = ("sheets", name, "holders", key, "vertices", held.vertices.index(max(held.vertices)))
@@ -169,7 +186,32 @@ class Physics(Document):
         return self
 
 
-class Scene(Physics):
+class Staged(Physics):
+    """A scene whose parameters are set: its physics, and what is seen."""
+
+    looks: Looks = Looks()
+
+    def files(self) -> Iterator[tuple[Path, str]]:
+        """Yield the files that the scene names: their place in the document, and their name."""
+        yield from super().files()
+        for name, look in self.looks.sheets.items():
+            if look.texture not in list(Texture):
+                yield ("looks", "sheets", name, "texture"), look.texture
+
+    @model_validator(mode="after")
+    def _looks_of_what_is_there(self) -> Self:
+        for what in ("sheets", "bodies"):
+            there = getattr(self, what)
+            for name in getattr(self.looks, what):
+                if name not in there:
+                    hint = did_you_mean(name, there)
+                    refuse(self, ("looks", what, name), f"must be one of {', '.join(there) or 'none'}{hint}", name)
+        if len(self.looks.sheets) == len(self.sheets):
+            refuse(self, ("looks", "sheets"), "must leave one sheet to the axis texture", list(self.looks.sheets))
+        return self
+
+
+class Scene(Staged):
     """A scene: its physics, what may vary, and what is seen."""
 
     name: CustomName | None = Field(default=None, description="of the scene, for people")
@@ -177,12 +219,15 @@ class Scene(Physics):
     parameters: Annotated[dict[ParameterName, Parameter], BY_NAME] = Field(
         default_factory=dict, max_length=32, description="what may vary, by the name of its axis and label"
     )
-    looks: Looks = Looks()
 
     @property
     def digest(self) -> str:
         """Content key of all of the scene."""
         return content_key("scene", self.model_dump(mode="json"))
+
+    def staged(self) -> dict[str, Any]:
+        """Return the part of the document, as JSON, that pictures depend on."""
+        return self.model_dump(mode="json", include=set(Staged.model_fields))
 
     def physics(self) -> dict[str, Any]:
         """Return the part of the document, as JSON, that a trajectory depends on."""
@@ -215,17 +260,5 @@ class Scene(Physics):
                 try:
                     self.checked(dict.fromkeys(self.places(name), value))
                 except ValidationError as error:
-                    first = error.errors(include_url=False)[0]
-                    rule = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-                    refuse(self, ("parameters", name, *end), rule, value)
-        return self
-
-    @model_validator(mode="after")
-    def _looks_of_what_is_there(self) -> Self:
-        for what in ("sheets", "bodies"):
-            there = getattr(self, what)
-            for name in getattr(self.looks, what):
-                if name not in there:
-                    hint = did_you_mean(name, there)
-                    refuse(self, ("looks", what, name), f"must be one of {', '.join(there) or 'none'}{hint}", name)
+                    refuse_as(error, self, ("parameters", name, *end), value)
         return self

@@ -7,6 +7,7 @@ from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base.document import Document, Float
+from stickslip_schemas.base.keys import placed
 from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 
 Path = tuple[str | int, ...]
@@ -67,11 +68,10 @@ class Parameter(Document):
         self._check_range(scene, here, defaults[0])
 
     def _check_range(self, scene: Any, here: Path, default: Value) -> None:
-        ends = {"low": self.low, "high": self.high}
         if isinstance(default, str) or self.values is not None:
-            for end, value in ends.items():
-                if value is not None:
-                    refuse(scene, (*here, end), "is for numbers without a list of values", value)
+            for end in ("low", "high"):
+                if getattr(self, end) is not None:
+                    refuse(scene, (*here, end), "is for numbers without a list of values", getattr(self, end))
             for number, value in enumerate(self.values or ()):
                 if type(value) is not type(default):
                     kind = "name" if isinstance(default, str) else "number"
@@ -84,8 +84,12 @@ class Parameter(Document):
     @property
     def extremes(self) -> list[tuple[Path, Value]]:
         """Values that stand for all others, each with its place in the parameter: rules of numbers are ranges."""
-        listed = [(("values", number), value) for number, value in enumerate(self.values or ())]
-        ends = [((name,), value) for name, value in (("low", self.low), ("high", self.high)) if value is not None]
+        listed: list[tuple[Path, Value]] = [
+            (("values", number), value) for number, value in enumerate(self.values or ())
+        ]
+        ends: list[tuple[Path, Value]] = [
+            ((name,), value) for name, value in (("low", self.low), ("high", self.high)) if value is not None
+        ]
         return [*listed, *ends]
 
     @property
@@ -145,16 +149,6 @@ def at(document: Any, place: Path) -> Any:
     return document
 
 
-def placed(document: Any, place: Path, value: Any) -> Any:
-    """Return a copy of a document with another value at a place."""
-    if not place:
-        return value
-    step, *rest = place
-    if isinstance(document, list):
-        return [placed(item, tuple(rest), value) if at == step else item for at, item in enumerate(document)]
-    return {**document, step: placed(document[step], tuple(rest), value)}
-
-
 def with_values(document: Any, values: Mapping[Path, Any]) -> Any:
     """Return a copy of a document with other values at some places."""
     for place, value in values.items():
@@ -168,3 +162,9 @@ def refuse(model: BaseModel, place: Path, rule: str, value: Any) -> Never:
     raise ValidationError.from_exception_data(
         type(model).__name__, [InitErrorDetails(type=broken, loc=place, input=value)]
     )
+
+
+def refuse_as(error: ValidationError, model: BaseModel, place: Path, value: Any) -> Never:
+    """Raise a ValidationError for a value that another part of a document makes wrong."""
+    first = error.errors(include_url=False)[0]
+    refuse(model, place, f"sets {'.'.join(map(str, first['loc']))}: {first['msg']}", value)

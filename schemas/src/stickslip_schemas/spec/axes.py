@@ -142,6 +142,14 @@ def axis_values(axis: AnyAxis, *, dimension: int = 0) -> list[Any]:
     return list(axis.values) if isinstance(axis, ListAxis) else range_values(axis, dimension=dimension).tolist()
 
 
+def extremes(axis: AnyAxis) -> list[tuple[tuple[str | int, ...], Any]]:
+    """Return values that stand for all others in rules of ranges, each with its place in the axis."""
+    if isinstance(axis, ListAxis):
+        return [(("values", position), value) for position, value in enumerate(axis.values)]
+    ends = ("start", "stop") if isinstance(axis, LinspaceAxis) else ("low", "high")
+    return [((end,), getattr(axis, end)) for end in ends]
+
+
 def range_values(
     axis: LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any], *, dimension: int = 0
 ) -> npt.NDArray[np.float64]:

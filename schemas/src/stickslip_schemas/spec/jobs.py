@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self, Type
 from pydantic import Field, model_validator
 
 from stickslip_schemas.base.document import Document, Float, Int
-from stickslip_schemas.base.keys import Sha256, content_key, derived_seed
+from stickslip_schemas.base.keys import Sha256, content_key, derived_seed, placed
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, Seed
@@ -69,14 +69,24 @@ class Simulation(Document):
 
     kind: str
 
+    @property
+    def artifacts(self) -> tuple[Sha256, ...]:
+        """Files in the store that the trajectory is made from."""
+        return ()
+
 
 class Render(Document):
     """What the pictures of one sample depend on besides their trajectory and the renderer's build."""
 
     kind: str
-    rig: str
-    rig_digest: Sha256
+    rig: str | None = Field(description="null: the cameras are of the document or of the sample")
+    rig_digest: Sha256 | None
     quality: Quality
+
+    @property
+    def artifacts(self) -> tuple[Sha256, ...]:
+        """Files in the store that the pictures are made from, besides the variant."""
+        return ()
 
     @property
     def shading(self) -> dict[str, Any] | None:
@@ -182,9 +192,16 @@ class JobSpec(Document):
         """Return a text that is the same for samples whose `stage` costs about the same; of simulate or render."""
         return str(self.quality) if stage is Stage.render else ""
 
+    def fields_of(self, axis: str) -> tuple[str, ...]:
+        """Return the fields of documents that an axis sets: by default the one of its name.
+
+        `field/0/name` is a place in a field that holds JSON.
+        """
+        return (axis,)
+
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
-        """Return the fields of documents that a value of an axis sets: by default the one of the axis's name."""
-        return {axis: value}
+        """Return what a value of an axis puts into these fields."""
+        return dict.fromkeys(self.fields_of(axis), value)
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
@@ -227,17 +244,17 @@ class JobSpec(Document):
     def _document(
         self, model: type[D], point: Mapping[str, Any], settings: dict[str, Any], seeds: tuple[SeedRule, ...]
     ) -> D:
-        fields = {
-            name: value
-            for axis, given in point.items()
-            for name, value in self.document_fields(axis, given).items()
-            if name in model.model_fields
-        }
+        fields: dict[str, Any] = {}
+        for axis, given in point.items():
+            for path, value in self.document_fields(axis, given).items():
+                name, *inner = path.split("/")
+                if name in model.model_fields:
+                    fields[name] = placed(fields.get(name, settings.get(name)), inner, value)
         drawn = {
             rule.field: derived_seed(self.seed, rule.purpose, {axis: point[axis] for axis in self.seed_axes(rule)})
             for rule in seeds
         }
-        return model(**settings, **fields, **drawn)
+        return model(**{**settings, **fields, **drawn})
 
     def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:
         """Return the axes of this spec whose values enter a seed."""

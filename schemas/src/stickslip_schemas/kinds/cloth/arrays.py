@@ -4,15 +4,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from stickslip_schemas.kinds.cloth.spec import ClothSpec, GroundTruth
+from stickslip_schemas.kinds.cloth.spec import ClipSpec, ClothSpec, GroundTruth
 from stickslip_schemas.spec.appearance import CLIP_SIZE, Lighting, Substrate
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
 """Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""
-
-SEGMENTS = ("background", "floor", "cloth", "prop")
-"""Names of the codes of the array `segmentation`: add new ones at the end."""
 
 
 def scene_segments(sheets: Iterable[str], bodies: Iterable[str]) -> tuple[str, ...]:
@@ -26,14 +23,14 @@ def codes(name: str, names: tuple[str, ...]) -> ArrayLayout:
 
 
 def over_time(
-    spec: ClothSpec, name: str, text: str, dtype: str = "float32", of: Mapping[str, int] | None = None, **more: Any
+    spec: ClipSpec, name: str, text: str, dtype: str = "float32", of: Mapping[str, int] | None = None, **more: Any
 ) -> ArrayLayout:
     """Return an array of the record that has a number, or an array of dimensions `of`, at each instant."""
-    rate = {"instants_per_second": spec.instants_per_second}
-    return array(name, text, dtype, {"instant": spec.instants, **(of or {})}, is_recorded=True, attributes=rate, **more)
+    said = {"instants_per_second": spec.instants_per_second, **more.pop("attributes", {})}
+    return array(name, text, dtype, {"instant": spec.instants, **(of or {})}, is_recorded=True, attributes=said, **more)
 
 
-def clip_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
+def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     """Return the clip and the labels of what it shows."""
     pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
     instants = {"instants": list(spec.shown_instants)}
@@ -62,11 +59,17 @@ def clip_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
     )
 
 
-def _ground_truth_arrays(spec: ClothSpec, pixels: dict[str, int]) -> tuple[ArrayLayout, ...]:
+def _ground_truth_arrays(spec: ClipSpec, pixels: dict[str, int]) -> tuple[ArrayLayout, ...]:
     """Return the arrays per pixel that the spec asks for. Textures share them, and each of their samples has them."""
     arrays = (
         array("depth", "depth along the optical axis [m], infinite where nothing is", "float32", pixels),
-        array("segmentation", "code of the visible object", "uint8", pixels, attributes={"categories": list(SEGMENTS)}),
+        array(
+            "segmentation",
+            "code of the visible object",
+            "uint8",
+            pixels,
+            attributes={"categories": list(spec.segments)},
+        ),
         array(
             "normals",
             "normals towards the camera, in its axes (right, down, forward); 0 where nothing is",
@@ -109,7 +112,7 @@ def physical_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
     )
 
 
-def solver_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
+def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     """Return the solver's diagnostics."""
     return (
         codes("kernel", KERNELS),
@@ -120,7 +123,7 @@ def solver_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
     )
 
 
-def forces(spec: ClothSpec, **texts: str) -> tuple[ArrayLayout, ...]:
+def forces(spec: ClipSpec, **texts: str) -> tuple[ArrayLayout, ...]:
     """Return arrays of forces (xyz) [N] over time, by name."""
     return tuple(over_time(spec, name, f"{text} [N]", of={"xyz": 3}) for name, text in texts.items())
 

@@ -9,9 +9,10 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import ArtifactRef, Sha256, referred
+from stickslip_schemas.scene.looks import View
 from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
-from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean, name_schema
+from stickslip_schemas.spec.fabrics import CustomName, Material, Texture, did_you_mean, name_schema
 from stickslip_schemas.spec.jobs import JobSpec
 
 
@@ -73,29 +74,42 @@ class NamingSpec(JobSpec):
     custom: ClassVar[Mapping[str, Custom]]
     """By axis of names, what the user may add to it."""
 
-    materials: dict[CustomName, FabricNumbers] = definitions("fabrics", "material", at_most=None)
     textures: dict[CustomName, ArtifactRef] = definitions(
         "textures", "texture", ": `sha256:` and the digest that `stickslip upload` prints"
     )
     viewpoints: dict[CustomName, Calibration] = definitions("cameras", "viewpoint")
 
+    def fields_of(self, axis: str) -> tuple[str, ...]:
+        """Return the fields of documents that an axis sets: its name, and what the name means."""
+        return (axis, self.custom[axis].field) if axis in self.custom else (axis,)
+
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         """Return the fields that a value of an axis sets: what the user has defined brings its numbers along."""
         if axis not in self.custom:
             return {axis: value}
-        _, field, _ = self.custom[axis]
-        given = self._defined(axis).get(value)
-        if isinstance(given, Calibration):
+        given = self.meaning(axis, value)
+        if isinstance(given, Calibration | View):
             given = given.camera(value)
-        return {axis: value, field: given.model_dump(mode="json") if isinstance(given, Document) else given}
+        return {
+            axis: value,
+            self.custom[axis].field: given.model_dump(mode="json") if isinstance(given, Document) else given,
+        }
 
     def _defined(self, axis: str) -> dict[str, Any]:
         defined: dict[str, Any] = getattr(self, self.custom[axis].key)
         return defined
 
+    def built_in(self, axis: str) -> tuple[str, ...]:
+        """Return the names that an axis may use without a definition in the spec."""
+        return tuple(map(str, self.custom[axis].built_in))
+
+    def meaning(self, axis: str, name: str) -> Any:
+        """Return what the user has defined a name of an axis to be; None where it needs no definition."""
+        return self._defined(axis).get(name)
+
     def names(self, axis: str) -> tuple[str, ...]:
         """Return the names that an axis may use, the built-in ones first: they are the codes of the label."""
-        return (*map(str, self.custom[axis].built_in), *self._defined(axis))
+        return (*self.built_in(axis), *self._defined(axis))
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
@@ -105,10 +119,10 @@ class NamingSpec(JobSpec):
     @model_validator(mode="after")
     def _known_names(self) -> Self:
         unknown = []
-        for axis, (key, _, built_in) in self.custom.items():
+        for axis in self.custom:
             for name in self._defined(axis):
-                if name in built_in:
-                    raise ValueError(f"{key} must not redefine what is built in, and {name!r} is")
+                if name in self.built_in(axis):
+                    raise ValueError(f"{self.custom[axis].key} must not redefine what is built in, and {name!r} is")
             known = self.names(axis)
             given = getattr(self.axes, axis)
             unknown += [

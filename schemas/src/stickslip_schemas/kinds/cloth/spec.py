@@ -7,13 +7,13 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import Field, model_validator
 
 from stickslip_schemas.base.document import Bool, Document, Float, Int
-from stickslip_schemas.base.keys import ArtifactRef
+from stickslip_schemas.base.keys import ArtifactRef, Sha256
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.names import MaterialAxis, NamingSpec
+from stickslip_schemas.kinds.cloth.names import MaterialAxis, NamingSpec, definitions
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate, shown_frames
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import FabricNumbers
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers
 from stickslip_schemas.spec.jobs import PresetName, Quality, Render, SeedRule, Simulation
 
 Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
@@ -42,6 +42,10 @@ middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.
 
 PICTURE_DECIBELS = {Quality.preview: 34.8, Quality.draft: 38.9, Quality.standard: 40.9, Quality.high: 43.1}
 """PSNR of the cloth's pixels by quality [dB]: `benchmarks/render_cloth.py` measures it."""
+
+
+SEGMENTS = ("background", "floor", "cloth", "prop")
+"""Names of the codes of the array `segmentation` where there is one cloth: add new ones at the end."""
 
 
 class ClothAxes(Document):
@@ -79,13 +83,12 @@ class ClothSimulation(Simulation):
     seed: Seed
 
 
-class ClothRender(Render):
-    """How a cloth is seen: all that its clip depends on besides its trajectory and the build.
+class ClipRender(Render):
+    """How cloth is seen: all that its clip depends on besides its trajectory and the build.
 
     Everything but the texture decides on the shading; clips that differ only in their texture share it.
     """
 
-    material: str
     texture: str
     image: ArtifactRef | None = Field(default=None, description="picture of a custom texture; null: a built-in one")
     viewpoint: str
@@ -111,32 +114,24 @@ class ClothRender(Render):
         return self.image or self.texture
 
 
-class ClothSpec(NamingSpec):
-    """What the specs of all kinds of cloth have in common."""
+class ClothRender(ClipRender):
+    """How a square of cloth is seen by the cameras of a rig."""
+
+    rig: str
+    rig_digest: Sha256
+    material: str
+
+
+class ClipSpec(NamingSpec):
+    """What the specs of all kinds of cloth have in common: clips of trajectories."""
 
     variant_axis = "texture"
     instants: ClassVar[int]
     """How many instants of the motion a trajectory holds."""
     instants_per_second: ClassVar[float]
-    rig: ClassVar[str]
-    """The cameras; their names are those of the viewpoints."""
-    preset: PresetName = Field(
-        default=PresetName.certified,
-        description="named solver settings",
-        json_schema_extra={"x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"},
-    )
     allow_uncertified: Bool = Field(
         default=False,
         description="make the dataset without a passing certificate of the preset",
-    )
-    mesh: Int = Field(
-        default=41,
-        ge=5,
-        le=161,
-        description="vertices along a side of the square mesh",
-        json_schema_extra={
-            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 5 s, 41 takes 33 s, 81 takes 5 min"
-        },
     )
     frames: Int = Field(
         default=30,
@@ -172,43 +167,31 @@ class ClothSpec(NamingSpec):
     )
 
     @property
-    def certified_preset(self) -> str:
-        """Name of the preset whose certificate vouches for the samples."""
-        return self.preset.value
-
-    @property
     def needs_certificate(self) -> bool:
         """True unless the spec allows for the lack of one."""
         return not self.allow_uncertified
 
-    def simulation_settings(self) -> dict[str, Any]:
-        """Return the fields of the simulation document that are the same for all samples."""
-        return {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
-
     def render_settings(self) -> dict[str, Any] | None:
         """Return the fields of the render document that are the same for all samples."""
         return {
-            "rig": self.rig,
-            "rig_digest": rig_digest(self.rig),
             "quality": self.quality,
             "instants": self.shown_instants,
             "creases": self.creases,
             "ground_truth": self.ground_truth,
         }
 
-    def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras of the viewpoints, by name."""
-        return (*load_rig(self.rig), *(camera.camera(name) for name, camera in self.viewpoints.items()))
-
     def picture_decibels(self) -> float | None:
         """Return the PSNR of the pictures of this quality, as measured [dB]."""
         return PICTURE_DECIBELS[self.quality]
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
-        if stage is Stage.render:
-            return f"{self.quality}, {self.frames} frames"
-        return f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
+        """Return what the cost of a sample hangs on."""
+        return f"{self.quality}, {self.frames} frames" if stage is Stage.render else ""
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """Names of the codes of the array `segmentation`."""
+        return SEGMENTS
 
     @property
     def shown_instants(self) -> tuple[int, ...]:
@@ -226,3 +209,49 @@ class ClothSpec(NamingSpec):
         if self.frames > self.instants:
             raise ValueError(f"frames must be at most {self.instants}, the instants of the motion; got {self.frames}")
         return self
+
+
+class ClothSpec(ClipSpec):
+    """What the specs of the kinds of a square of cloth have in common."""
+
+    rig: ClassVar[str]
+    """The cameras; their names are those of the viewpoints."""
+
+    materials: dict[CustomName, FabricNumbers] = definitions("fabrics", "material", at_most=None)
+    preset: PresetName = Field(
+        default=PresetName.certified,
+        description="named solver settings",
+        json_schema_extra={"x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"},
+    )
+    mesh: Int = Field(
+        default=41,
+        ge=5,
+        le=161,
+        description="vertices along a side of the square mesh",
+        json_schema_extra={
+            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 5 s, 41 takes 33 s, 81 takes 5 min"
+        },
+    )
+
+    @property
+    def certified_preset(self) -> str:
+        """Name of the preset whose certificate vouches for the samples."""
+        return self.preset.value
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        return {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
+
+    def render_settings(self) -> dict[str, Any] | None:
+        """Return the fields of the render document that are the same for all samples."""
+        return (super().render_settings() or {}) | {"rig": self.rig, "rig_digest": rig_digest(self.rig)}
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras of the viewpoints, by name."""
+        return (*load_rig(self.rig), *(camera.camera(name) for name, camera in self.viewpoints.items()))
+
+    def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
+        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
+        if stage is Stage.render:
+            return super().cost_group(stage, point)
+        return f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"

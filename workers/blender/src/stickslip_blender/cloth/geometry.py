@@ -20,7 +20,7 @@ from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Textures, decoded, fans
 
 BACKGROUND, GROUND, CLOTH, PROP = range(4)
-"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.arrays.SEGMENTS`."""
+"""Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.spec.SEGMENTS`."""
 
 FLOOR = -0.0005
 """Height at which the floor is seen [m]: half a thickness below the middle surface of a cloth that lies on it."""

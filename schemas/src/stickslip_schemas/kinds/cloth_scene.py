@@ -1,0 +1,394 @@
+"""A scene of cloth that is data: what stands where, how it moves, and what of it varies."""
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from itertools import combinations, product
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import ConfigDict, Field, JsonValue, ValidationError, ValidationInfo, field_validator, model_validator
+
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.keys import Sha256, referred
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.kinds.cloth.arrays import clip_arrays, codes, over_time, solver_arrays
+from stickslip_schemas.kinds.cloth.drag_scene import LampAxis
+from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, VIEWPOINT, Custom, SubstrateAxis, TextureAxis, definitions
+from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
+from stickslip_schemas.scene.bodies import MeshBody
+from stickslip_schemas.scene.document import Physics, Scene, Staged
+from stickslip_schemas.scene.library import load_scene
+from stickslip_schemas.scene.looks import FRAMING, View
+from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
+from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.axes import (
+    SHORTHAND,
+    TAGGED,
+    AnyAxis,
+    LinspaceAxis,
+    ListAxis,
+    RandomAxis,
+    Seed,
+    SobolAxis,
+    extremes,
+    quantity,
+)
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import CustomName, Material, did_you_mean
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule, Simulation
+
+OF_SCENE = "scene"
+"""Name of the light and the floor that the scene gives as numbers."""
+
+STATES = ("open", "stick", "slip")
+"""Names of the codes of the arrays of contact: add new ones at the end."""
+
+Number = Annotated[float, quantity("Number"), Field(strict=True)]
+Choice = Annotated[Value, quantity("Value")]
+ParameterAxis = Annotated[
+    ListAxis[Choice] | LinspaceAxis[Number] | RandomAxis[Number] | SobolAxis[Number], TAGGED, SHORTHAND
+]
+
+
+class ClothSceneAxes(Document):
+    """What a clip of a scene depends on: any parameter of the scene, by its name, and looks."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[ParameterName, ParameterAxis]
+
+    texture: TextureAxis
+    viewpoint: Annotated[ListAxis[Annotated[CustomName, quantity("Camera")]], SHORTHAND, VIEWPOINT]
+    lighting: LampAxis = None
+    substrate: SubstrateAxis | None = Field(
+        default=None, description="finish of the floor, or a custom one under `substrates`; by default the scene's"
+    )
+
+
+class ClothSceneSimulation(Simulation):
+    """The trajectory of a scene: all that it depends on besides the build."""
+
+    kind: Literal["cloth_scene"] = "cloth_scene"
+    scene: Physics
+    seed: Seed
+
+    @property
+    def artifacts(self) -> tuple[Sha256, ...]:
+        """Meshes, starts and paths that the scene names."""
+        return tuple(filter(None, (referred(name) for _, name in self.scene.files())))
+
+
+class ClothSceneRender(ClipRender):
+    """How a scene is seen."""
+
+    kind: Literal["cloth_scene"] = "cloth_scene"
+    rig: str | None = Field(default=None, description="null: `camera`, or one that frames all that moves")
+    rig_digest: Sha256 | None = None
+    scene: Staged
+
+    @property
+    def artifacts(self) -> tuple[Sha256, ...]:
+        """Pictures of sheets with a texture of their own."""
+        return tuple(filter(None, (referred(name) for place, name in self.scene.files() if place[0] == "looks")))
+
+
+class ClothSceneSpec(ClipSpec):
+    """A scene of cloth that is data: built in, or of the user."""
+
+    simulation_type = ClothSceneSimulation
+    render_type = ClothSceneRender
+    simulation_seeds = (SeedRule("seed", "bias", None),)
+    render_seeds = (SeedRule("light_seed", "light", None), SeedRule("crease_seed", "creases", None))
+    custom: ClassVar[Mapping[str, Custom]] = {
+        "texture": CUSTOM_LOOKS["texture"],
+        "viewpoint": Custom("viewpoints", "camera", ()),
+        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
+        "substrate": Custom("substrates", "finish", tuple(Substrate)),
+    }
+
+    kind: Literal["cloth_scene"]
+    scene: Scene = Field(description="the name of a built-in scene, or the document of a scene")
+    set: dict[str, JsonValue] = Field(
+        default_factory=dict, max_length=64, description="other values of the scene for all samples, by path"
+    )
+    axes: ClothSceneAxes
+    lamps: dict[CustomName, LampNumbers] = definitions("lamps", "lighting")
+    substrates: dict[CustomName, FloorNumbers] = definitions("floors", "substrate")
+
+    @field_validator("scene", mode="before")
+    @classmethod
+    def _built_in(cls, scene: Any) -> Any:
+        return load_scene(scene) if isinstance(scene, str) else scene
+
+    # --- rules --------------------------------------------------------------------------------------------
+
+    @field_validator("set")
+    @classmethod
+    def _can_be_set(cls, values: dict[str, JsonValue], info: ValidationInfo) -> dict[str, JsonValue]:
+        if isinstance(scene := info.data.get("scene"), Scene):
+            for path, value in values.items():
+                try:
+                    scene.checked({found(scene.physics(), path): value})
+                except LookupError as error:
+                    refuse(scene, (path,), str(error.args[0]), path)
+                except ValidationError as error:
+                    refuse_as(error, scene, (path,), value)
+        return values
+
+    @model_validator(mode="after")
+    def _within_the_scene(self) -> Self:
+        for name, axis in (self.axes.__pydantic_extra__ or {}).items():
+            known = self.stage.parameters
+            if name not in known:
+                rule = f"must be one of {', '.join((*known, *LOOKS_AXES))}{did_you_mean(name, known)}"
+                refuse(self, ("axes", name), rule, name)
+            for place, value in extremes(axis):
+                if not known[name].allows(value):
+                    refuse(self, ("axes", name, *place), f"must be within {known[name].range}", value)
+        for corner in self._corners():
+            try:
+                self.stage.checked({place: v for name, v in corner.items() for place in self.stage.places(name)})
+            except ValidationError as error:
+                refuse_as(error, self, ("axes",), corner)
+        return self
+
+    def _corners(self) -> Iterator[dict[str, Any]]:
+        """Yield points that stand for all others: names, and ends of numbers, one by one and two together.
+
+        Rules between two numbers are linear, so what holds at all ends holds between them.
+        """
+        ends: dict[str, list[Any]] = {}
+        for name, axis in (self.axes.__pydantic_extra__ or {}).items():
+            values = [value for _, value in extremes(axis)]
+            is_number = isinstance(self.stage.default(name), float)
+            ends[name] = [min(values), max(values)] if is_number else values
+            yield from ({name: value} for value in ends[name])
+        for one, other in combinations(ends, 2):
+            yield from ({one: a, other: b} for a, b in product(ends[one], ends[other]))
+
+    # --- the scene ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def stage(self) -> Scene:
+        """The scene with the values of `set`."""
+        document = self.scene.model_dump(mode="json")
+        return Scene.model_validate(with_values(document, {found(document, path): v for path, v in self.set.items()}))
+
+    @cached_property
+    def _places(self) -> dict[str, tuple[str, ...]]:
+        """Fields of documents that each parameter sets."""
+        return {
+            name: tuple("/".join(map(str, ("scene", *place))) for place in self.stage.places(name))
+            for name in self.stage.parameters
+        }
+
+    @property
+    def named_axes(self) -> dict[str, AnyAxis]:
+        """The axes by name: all parameters of the scene, then looks. A parameter without an axis has its default."""
+        given = self.axes.__pydantic_extra__ or {}
+        default = {name: self.stage.default(name) for name in self.stage.parameters if name not in given}
+        unvaried = {name: ListAxis[Any](type="list", values=(value,)) for name, value in default.items()}
+        if self.combine == "zip":
+            unvaried = {}
+        parameters: dict[str, AnyAxis] = {**given, **unvaried}
+        looks = {name: getattr(self.axes, name) for name in LOOKS_AXES}
+        return {**dict(sorted(parameters.items())), **{name: axis for name, axis in looks.items() if axis is not None}}
+
+    @property
+    def instants(self) -> int:  # type: ignore[override]
+        """How many instants of the motion a trajectory holds."""
+        return self.stage.frames
+
+    @property
+    def instants_per_second(self) -> float:  # type: ignore[override]
+        """How many instants of the motion there are in a second."""
+        return self.stage.frame_rate
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """Names of the codes of the array `segmentation`."""
+        return self.stage.segments
+
+    # --- documents ----------------------------------------------------------------------------------------
+
+    def fields_of(self, axis: str) -> tuple[str, ...]:
+        """Return the fields of documents that an axis sets; those of a parameter are places in the scene."""
+        return self._places.get(axis) or super().fields_of(axis)
+
+    def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
+        """Return what a value of an axis puts into these fields."""
+        return (
+            dict.fromkeys(self._places[axis], value) if axis in self._places else super().document_fields(axis, value)
+        )
+
+    def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:
+        """Return the axes whose values enter a seed: parameters, and for light all that does not share a shading."""
+        left_out = ("texture",) if rule.purpose == "light" else LOOKS_AXES
+        return tuple(axis for axis in self.named_axes if axis not in left_out)
+
+    def simulation_settings(self) -> dict[str, Any]:
+        """Return the fields of the simulation document that are the same for all samples."""
+        return {"scene": self.stage.physics()}
+
+    def render_settings(self) -> dict[str, Any] | None:
+        """Return the fields of the render document that are the same for all samples."""
+        looks = self.stage.looks
+        of_rig = (
+            {"rig": looks.cameras, "rig_digest": rig_digest(looks.cameras)} if isinstance(looks.cameras, str) else {}
+        )
+        light = {"lamp": looks.light} if isinstance(looks.light, LampNumbers) else {}
+        floor = {"finish": looks.floor} if isinstance(looks.floor, FloorNumbers) else {}
+        return {
+            **(super().render_settings() or {}),
+            **of_rig,
+            "scene": self.stage.staged(),
+            "lighting": OF_SCENE if light else str(looks.light),
+            "substrate": OF_SCENE if floor else str(looks.floor),
+            **light,
+            **floor,
+        }
+
+    def built_in(self, axis: str) -> tuple[str, ...]:
+        """Return the names that an axis may use without a definition in the spec: those of the scene, too."""
+        looks = self.stage.looks
+        if axis == "viewpoint":
+            rig = [camera.name for camera in load_rig(looks.cameras)] if isinstance(looks.cameras, str) else FRAMING
+            return tuple(looks.cameras if isinstance(looks.cameras, dict) else rig)
+        is_own = {"lighting": isinstance(looks.light, LampNumbers), "substrate": isinstance(looks.floor, FloorNumbers)}
+        return (*super().built_in(axis), *((OF_SCENE,) if is_own.get(axis) else ()))
+
+    def meaning(self, axis: str, name: str) -> Any:
+        """Return what the spec or the scene has defined a name of an axis to be."""
+        looks = self.stage.looks
+        views: dict[str, View] = looks.cameras if isinstance(looks.cameras, dict) else {}
+        own: dict[str, Mapping[str, Any]] = {
+            "viewpoint": views,
+            "lighting": {OF_SCENE: looks.light},
+            "substrate": {OF_SCENE: looks.floor},
+        }
+        return super().meaning(axis, name) or own.get(axis, {}).get(name)
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras by name, but for those that frame what moves: each sample has its own of them."""
+        given = self.stage.looks.cameras
+        rig = load_rig(given) if isinstance(given, str) else ()
+        views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
+        return (*rig, *views, *(camera.camera(name) for name, camera in self.viewpoints.items()))
+
+    @property
+    def artifacts(self) -> dict[str, Sha256]:
+        """Files of the scene, and pictures of custom textures."""
+        files = ((place, referred(name)) for place, name in self.scene.files())
+        return {"/".join(("/scene", *map(str, place))): digest for place, digest in files if digest} | super().artifacts
+
+    # --- certificate, cost, arrays ------------------------------------------------------------------------
+
+    @property
+    def certified_preset(self) -> str:
+        """Name of the preset whose certificate vouches for the samples."""
+        return self.stage.preset.value
+
+    @property
+    def certified_protocols(self) -> tuple[str, ...]:
+        """Return the protocols of contact, where cloth touches cloth or meshes."""
+        of_cloth = any(other in self.stage.sheets for _, other in self.stage.pairs())
+        of_mesh = any(isinstance(body, MeshBody) for body in self.stage.bodies.values())
+        return CONTACT_PROTOCOLS if of_cloth or of_mesh else ()
+
+    @cached_property
+    def _cost_of_scene(self) -> str:
+        return self.stage.digest[:12]
+
+    def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
+        """Return what the cost of a sample hangs on: the scene, names of fabrics, and numbers to one digit."""
+        if stage is Stage.render:
+            return f"{super().cost_group(stage, point)}, {self._cost_of_scene}"
+        shown = (f"{v:.1g}" if isinstance(v, float) else str(v) for v in (point.get(name) for name in self._places))
+        return ", ".join((self._cost_of_scene, *shown))
+
+    def arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the arrays of a dataset of the scene."""
+        scene = self.stage
+        bias = array("bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2})
+        rest = array("rest_time", "when all was at rest [s]; NaN where it was not")
+        return (
+            *clip_arrays(self),
+            array("camera", "of the clip: fx, fy, cx, cy [px], rotation (rows), translation [m]", of={"camera": 16}),
+            *(self._label(name) for name in scene.parameters if name in self.named_axes),
+            *((bias,) if scene.bias else ()),
+            *((rest,) if scene.end else ()),
+            array("least_distance", "of vertices and edges of cloth in contact, at the ends of all steps [m]"),
+            *(each for name in scene.sheets for each in self._sheet_labels(name)),
+            *solver_arrays(self),
+            *self._tracks(),
+            *(each for name in scene.sheets for each in self._mesh(name) if self.store_positions),
+        )
+
+    def _label(self, parameter: str) -> ArrayLayout:
+        given = self.stage.parameters[parameter]
+        if isinstance(self.stage.default(parameter), float):
+            return array(parameter, f"{given.description or 'parameter of the scene'} [{given.unit}]")
+        return codes(parameter, (*Material, *self.stage.materials))
+
+    def _sheet_labels(self, sheet: str) -> tuple[ArrayLayout, ...]:
+        hung = array(f"{sheet}.tilt", "lean of gravity along the normal as it came to hang, over gravity")
+        return (
+            array(f"{sheet}.areal_density", "mass per area [kg/m^2]"),
+            array(
+                f"{sheet}.bending_rigidity",
+                "plate rigidities along the warp, along the weft, and of twist [N m]",
+                of={"direction": 3},
+            ),
+            array(
+                f"{sheet}.stretching_stiffness",
+                "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]",
+                of={"coefficient": 4},
+            ),
+            *((hung,) if self.stage.sheets[sheet].start.type == "hung" else ()),
+        )
+
+    def _tracks(self) -> tuple[ArrayLayout, ...]:
+        """Return forces and poses, in the order of names that their attributes give."""
+        scene = self.stage
+        sheets, bodies, holders = list(scene.sheets), list(scene.bodies), [f"{a}.{b}" for a, b in scene.holders]
+        others = [*bodies, *sheets]
+        by = {"sheet": len(sheets), "other": len(others), "xyz": 3}
+        held, pose = {"holder": len(holders)}, {"row": 3, "column": 4}
+        on = {"sheets": sheets, "others": others}
+        of_bodies = over_time(
+            self,
+            "body_pose",
+            "x -> A x + b from a body's axes [m]",
+            of={"body": len(bodies), **pose},
+            attributes={"names": bodies},
+        )
+        said: dict[str, Any] = {"attributes": {"names": holders}}
+        of_holders = (
+            over_time(self, "holder_force", "force of each holder on its sheet [N]", of={**held, "xyz": 3}, **said),
+            over_time(self, "holder_pose", "x -> A x + b from a holder's axes [m]", of={**held, **pose}, **said),
+            over_time(self, "grasped", "1 while a holder holds", "uint8", held, **said),
+        )
+        return (
+            over_time(self, "contact_force", "force of bodies, then sheets, on each sheet [N]", of=by, attributes=on),
+            *((of_bodies,) if bodies else ()),
+            *(of_holders if holders else ()),
+        )
+
+    def _mesh(self, sheet: str) -> tuple[ArrayLayout, ...]:
+        vertices, triangles = self.stage.sheets[sheet].mesh.shape
+        vertex = {f"{sheet}.vertex": vertices}
+        corners = {f"{sheet}.triangle": triangles, "corner": 3}
+        return (
+            over_time(
+                self,
+                f"{sheet}.positions",
+                "positions of the vertices [m]",
+                of={**vertex, "xyz": 3},
+                per_sample=True,
+                is_trajectory=True,
+            ),
+            over_time(
+                self, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes={"categories": STATES}
+            ),
+            array(f"{sheet}.rest", "the flat sheet (warp, weft) [m]", "float32", {**vertex, "uv": 2}, is_recorded=True),
+            array(f"{sheet}.triangles", "vertices of the triangles", "int32", corners, is_recorded=True),
+        )

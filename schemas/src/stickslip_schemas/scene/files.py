@@ -1,0 +1,278 @@
+"""The files of a scene: limits, checks, and references by digest.
+
+What a file is for follows from its place in the document: a flat pattern, a start, a body, a motion or a texture.
+"""
+
+import io
+import zipfile
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from stickslip_schemas.base.keys import ARTIFACT, sha256
+from stickslip_schemas.scene.document import MAX_VERTICES, Scene
+from stickslip_schemas.scene.parameters import Path, at, with_values
+
+MAX_FILE_BYTES = 32 * 2**20
+"""Of a file of a scene, and of the arrays of an NPZ file."""
+MAX_TRIANGLES = 2 * MAX_VERTICES
+"""Of one mesh."""
+FARTHEST = 100.0
+"""Largest coordinate in a file [m]."""
+MAX_DOCUMENT_BYTES = 64 * 2**10
+"""Of the document of a scene, as JSON."""
+
+Floats = npt.NDArray[np.float64]
+Triangles = npt.NDArray[np.int64]
+
+
+class UnfitFileError(ValueError):
+    """A file cannot be what a scene needs; the message has the rule, and what was found."""
+
+
+def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str, bytes]]:
+    """Return a scene with references by digest instead of names of files, and these files by digest.
+
+    Args:
+        scene: A scene whose files may be local.
+        read: Returns the bytes of a file by its name.
+
+    Raises:
+        UnfitFileError: A file is not what the scene needs there; the message begins with the place.
+    """
+    values: dict[Path, Any] = {}
+    found: dict[str, bytes] = {}
+    for place, name in scene.files():
+        if name.startswith(ARTIFACT):
+            continue
+        data = read(name)
+        try:
+            counts = check_file(place, data)
+        except UnfitFileError as error:
+            raise UnfitFileError(f"{'.'.join(map(str, place))}: {error}, in {name}") from error
+        digest = sha256(data)
+        found[digest] = data
+        values[place] = f"{ARTIFACT}{digest}"
+        if counts is not None:
+            values[(*place[:-1], "counts")] = counts
+    return Scene.model_validate(with_values(scene.model_dump(mode="json"), values)), found
+
+
+def check_scene_file(scene: Scene, place: Path, data: bytes) -> None:
+    """Check a file that is in the store: it is what the scene needs, and has the counts that the scene gives.
+
+    Raises:
+        UnfitFileError: It is not.
+    """
+    counts = check_file(place, data)
+    document = scene.physics()
+    if counts is not None and (said := at(document, (*place[:-1], "counts"))) != list(counts):
+        raise UnfitFileError(f"counts must be the vertices and triangles of the file, {list(counts)}, and are {said}")
+    if place[0] == "sheets" and place[2] == "start":
+        vertices, expected = _start(data), scene.sheets[str(place[1])].mesh.shape[0]
+        if len(vertices) != expected:
+            raise UnfitFileError(f"must have the vertices of its sheet, {expected}, and has {len(vertices)}")
+
+
+def check_file(place: Path, data: bytes) -> tuple[int, int] | None:
+    """Check a file of a scene by itself; return the numbers of vertices and triangles of a flat pattern.
+
+    Raises:
+        UnfitFileError: It breaks a rule.
+    """
+    if len(data) > MAX_FILE_BYTES:
+        raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes, and has {len(data)}")
+    if place[0] == "looks":
+        return None  # a picture, which has rules of its own
+    if place[-1] == "path":
+        _path(data)
+    elif place[0] == "bodies":
+        _body(data)
+    elif place[2] == "start":
+        _start(data)
+    else:
+        return _pattern(data)
+    return None
+
+
+def _pattern(data: bytes) -> tuple[int, int]:
+    vertices, triangles, flat = read_obj(data)
+    if flat is None:
+        raise UnfitFileError("must have texture coordinates (vt), one for each vertex: the flat pattern [m]")
+    u, v = (flat[triangles[:, corner]] - flat[triangles[:, 0]] for corner in (1, 2))
+    area = 0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    if not (area > 0).all():
+        place = int(np.argmin(area))
+        raise UnfitFileError(
+            f"all triangles of the flat pattern must have areas above 0 m^2; {place} has {area[place]:g}"
+        )
+    _check_edges(triangles, len(vertices))
+    if len(np.unique(triangles)) != len(vertices):
+        raise UnfitFileError("must have no vertex without a triangle")
+    return len(vertices), len(triangles)
+
+
+def _body(data: bytes) -> None:
+    if not data.startswith(b"PK"):
+        vertices, triangles, _ = read_obj(data)
+        return _check_edges(triangles, len(vertices))
+    skinned = ("rest", "weights", "bones", "times", "triangles")
+    found = _arrays(data, skinned if "rest" in _names(data) else ("positions", "triangles", "times"))
+    rest = found["rest"] if "rest" in found else found["positions"][0]
+    frames = found.get("bones", found.get("positions"))
+    assert frames is not None
+    _ascending(found["times"], len(frames))
+    if rest.ndim != 2 or rest.shape[1] != 3:
+        raise UnfitFileError(f"vertices must be (frame, vertex, 3) or, at rest, (vertex, 3), and are {rest.shape}")
+    if "weights" in found and found["weights"].shape != (len(rest), frames.shape[1]):
+        raise UnfitFileError(f"weights must be (vertex, bone), and are {found['weights'].shape}")
+    triangles = found["triangles"].astype(np.int64)
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.min() < 0 or triangles.max() >= len(rest):
+        raise UnfitFileError(f"triangles must be (triangle, 3) of vertices below {len(rest)}")
+    return _check_edges(triangles, len(rest))
+
+
+def _start(data: bytes) -> Floats:
+    if not data.startswith(b"PK"):
+        return read_obj(data)[0]
+    found: Floats = _arrays(data, ("positions",))["positions"]
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise UnfitFileError(f"positions must be (vertex, 3), and are {found.shape}")
+    return found
+
+
+def _path(data: bytes) -> None:
+    if data.startswith(b"PK"):
+        found = _arrays(data, ("time", "move", "turn"))
+        _ascending(found["time"], len(found["move"]))
+        shapes = {name: found[name].shape for name in ("move", "turn")}
+        if set(shapes.values()) != {(len(found["time"]), 3)}:
+            raise UnfitFileError(f"move and turn must be (time, 3), and are {shapes}")
+        return
+    lines = _text(data).splitlines()
+    if not lines or lines[0].replace(" ", "") != "time,x,y,z,rx,ry,rz":
+        raise UnfitFileError(
+            f"must begin with the line time,x,y,z,rx,ry,rz, and begins with {''.join(lines[:1])[:80]!r}"
+        )
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        try:
+            row = [float(word) for word in line.split(",")]
+        except ValueError:
+            row = []
+        if len(row) != 7 or not np.isfinite(row).all() or max(map(abs, row[1:4])) > FARTHEST:
+            raise UnfitFileError(f"line {number} must be seven finite numbers [s, m, rad], and is {line[:80]!r}")
+        rows.append(row[0])
+    _ascending(np.array(rows), len(rows))
+
+
+def _ascending(times: Floats, count: int) -> None:
+    if times.shape != (count,) or not count or times[0] < 0 or not (np.diff(times) > 0).all():
+        raise UnfitFileError(f"times must be {count} instants that ascend from 0 s or later, one for each frame")
+
+
+def _names(data: bytes) -> dict[str, int]:
+    """Return the arrays of an NPZ file with their sizes [bytes], before anything is decompressed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            return {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
+    except (zipfile.BadZipFile, OSError) as error:
+        raise UnfitFileError(f"must be an NPZ file: {error}") from error
+
+
+def _arrays(data: bytes, names: tuple[str, ...]) -> Mapping[str, npt.NDArray[Any]]:
+    sizes = _names(data)
+    if missing := [name for name in names if name not in sizes]:
+        raise UnfitFileError(f"must have {', '.join(names)}, and {', '.join(missing)} is missing")
+    if sum(sizes.values()) > MAX_FILE_BYTES:
+        raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes when unpacked, and has {sum(sizes.values())}")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            found = {name: file[name] for name in names}
+    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+        raise UnfitFileError(f"must be an NPZ file of plain arrays: {error}") from error
+    for name, values in found.items():
+        if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+            raise UnfitFileError(f"{name} must be finite numbers, and is {values.dtype} with others")
+        if values.dtype.kind == "f" and values.size and np.abs(values).max() > FARTHEST and "time" not in name:
+            raise UnfitFileError(f"{name} must be within {FARTHEST:g} m, and reaches {np.abs(values).max():g} m")
+    return found
+
+
+def _check_edges(triangles: Triangles, vertices: int) -> None:
+    """Raise UnfitFileError where more than two triangles share an edge, or two that are turned against each other."""
+    if vertices > MAX_VERTICES or len(triangles) > MAX_TRIANGLES:
+        raise UnfitFileError(
+            f"must have at most {MAX_VERTICES} vertices and {MAX_TRIANGLES} triangles, and has {vertices} and "
+            f"{len(triangles)}"
+        )
+    if len(same := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))):
+        raise UnfitFileError(f"a triangle must have three vertices, and triangle {same[0]} names one twice")
+    edges = np.concatenate([triangles[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    if (counts > 1).any():
+        raise UnfitFileError(
+            "must be a manifold: at most two triangles share an edge, turned alike; "
+            f"{int((counts > 1).sum())} edges are not so"
+        )
+
+
+def _text(data: bytes) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UnfitFileError(f"must be text in UTF-8, or an NPZ file: {error}") from error
+
+
+def read_obj(data: bytes) -> tuple[Floats, Triangles, Floats | None]:
+    """Return the vertices (N, 3), triangles (T, 3) and, if each vertex has one, texture coordinates (N, 2).
+
+    Raises:
+        UnfitFileError: A line is no vertex or face.
+    """
+    vertices: list[list[float]] = []
+    texture: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    flat: dict[int, int] = {}
+    for number, line in enumerate(_text(data).splitlines(), 1):
+        word, *rest = line.split() or [""]
+        try:
+            if word in ("v", "vt"):
+                wanted = 3 if word == "v" else 2
+                numbers = [float(text) for text in rest[:wanted]]
+                if len(numbers) != wanted or not all(abs(value) <= FARTHEST for value in numbers):
+                    raise ValueError
+                (vertices if word == "v" else texture).append(numbers)
+            elif word == "f":
+                corners = [_corner(text, len(vertices), len(texture)) for text in rest]
+                if len(corners) < 3:
+                    raise ValueError
+                for vertex, of_texture in corners:
+                    if of_texture is not None and flat.setdefault(vertex, of_texture) != of_texture:
+                        raise UnfitFileError(f"line {number}: a vertex must have one texture coordinate")
+                names = [vertex for vertex, _ in corners]
+                triangles += [(names[0], b, c) for b, c in pairwise(names[1:])]
+        except UnfitFileError:
+            raise
+        except (ValueError, IndexError) as error:
+            rule = f"must be a vertex within {FARTHEST:g} m or a face of its vertices"
+            raise UnfitFileError(f"line {number} {rule}, and is {line.strip()[:80]!r}") from error
+    if not triangles:
+        raise UnfitFileError("must have faces, and has none")
+    every = [texture[flat[vertex]] for vertex in range(len(vertices))] if len(flat) == len(vertices) else None
+    return np.array(vertices), np.array(triangles), None if every is None else np.array(every)
+
+
+def _corner(text: str, vertices: int, texture: int) -> tuple[int, int | None]:
+    """Return a corner of a face from 0: an OBJ file counts from 1, or from -1 back from the last one."""
+    found: list[int | None] = []
+    for word, count in zip(text.split("/"), (vertices, texture), strict=False):
+        number = int(word) if word else 0
+        if abs(number) > count or (not number and (word or not found)):
+            raise ValueError
+        found.append(None if not number else number - 1 if number > 0 else count + number)
+    assert found[0] is not None
+    return found[0], found[1] if len(found) > 1 else None
