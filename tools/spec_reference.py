@@ -10,7 +10,7 @@ from typing import Any
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.kinds.cloth.spec import ClothSpec
+from stickslip_schemas.kinds.cloth.spec import ClipSpec, ClothSpec
 from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
 from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import JobSpec
@@ -57,7 +57,7 @@ def reference() -> str:
     """Return the page: what all kinds share, what all kinds of cloth share, then each kind, then custom entries."""
     keys = {name: _keys(kind) for name, kind in KINDS.items()}
     axes = {name: _axes(kind) for name, kind in KINDS.items()}
-    cloth = [name for name, kind in KINDS.items() if issubclass(kind, ClothSpec)]
+    cloth = [name for name, kind in KINDS.items() if issubclass(kind, ClipSpec)]
     every, every_cloth = _shared(keys.values()), _shared(keys[name] for name in cloth)
     cloth_axes = _shared(axes[name] for name in cloth)
     lines = [HEAD, "## Keys of every kind\n", *_table(KEY_HEAD, every), "## Keys of every kind of cloth\n"]

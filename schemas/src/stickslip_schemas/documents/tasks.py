@@ -189,7 +189,7 @@ def input_digests(
     """Return the artifacts that a task needs; `read` reads artifacts that list others, which may be damaged or lost."""
     if isinstance(task, RenderTask):
         pictures = map(referred, task.textures or (task.render.variant,))
-        return tuple(dict.fromkeys([task.record.digest, *filter(None, pictures)]))
+        return tuple(dict.fromkeys([task.record.digest, *filter(None, pictures), *task.render.artifacts]))
     if isinstance(task, PublishTask):
         digests = list(task.sections)
         for digest in task.sections:
@@ -198,6 +198,6 @@ def input_digests(
                 digests += [*(file.sha256 for file in section.files), *section.labels]
         return tuple(dict.fromkeys(digests))
     if isinstance(task, SimulateTask):
-        return ()
+        return task.simulation.artifacts
     records = [slot.record.digest for slot in task.slots if slot.record is not None]
     return tuple(dict.fromkeys([*records, *(chunk.digest for slot in task.slots for chunk in slot.chunks.values())]))

@@ -5,22 +5,35 @@ from functools import cached_property
 from itertools import combinations, product
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import ConfigDict, Field, JsonValue, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    JsonValue,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import Sha256, referred
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.arrays import clip_arrays, codes, over_time, solver_arrays
+from stickslip_schemas.kinds.cloth.arrays import clip_arrays, scene_segments
 from stickslip_schemas.kinds.cloth.drag_scene import LampAxis
 from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, VIEWPOINT, Custom, SubstrateAxis, TextureAxis, definitions
+from stickslip_schemas.kinds.cloth.scene_arrays import parameter_label, scene_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import Physics, Scene, Staged
-from stickslip_schemas.scene.library import load_scene
-from stickslip_schemas.scene.looks import FRAMING, View
+from stickslip_schemas.scene.library import load_scene, scene_names
+from stickslip_schemas.scene.looks import View
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate
-from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import (
     SHORTHAND,
     TAGGED,
@@ -33,21 +46,30 @@ from stickslip_schemas.spec.axes import (
     extremes,
     quantity,
 )
-from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import CustomName, Material, did_you_mean
+from stickslip_schemas.spec.cameras import FRAMING, Camera, load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, SeedRule, Simulation
 
 OF_SCENE = "scene"
 """Name of the light and the floor that the scene gives as numbers."""
-
-STATES = ("open", "stick", "slip")
-"""Names of the codes of the arrays of contact: add new ones at the end."""
 
 Number = Annotated[float, quantity("Number"), Field(strict=True)]
 Choice = Annotated[Value, quantity("Value")]
 ParameterAxis = Annotated[
     ListAxis[Choice] | LinspaceAxis[Number] | RandomAxis[Number] | SobolAxis[Number], TAGGED, SHORTHAND
 ]
+
+
+class _BuiltIn(BeforeValidator):
+    """Accepts the name of a built-in scene, in validation and in the JSON schema."""
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        document = handler(core)
+        return document if handler.mode == "serialization" else {"anyOf": [{"enum": list(scene_names())}, document]}
+
+
+def _built_in(scene: Any) -> Any:
+    return load_scene(scene) if isinstance(scene, str) else scene
 
 
 class ClothSceneAxes(Document):
@@ -106,18 +128,15 @@ class ClothSceneSpec(ClipSpec):
     }
 
     kind: Literal["cloth_scene"]
-    scene: Scene = Field(description="the name of a built-in scene, or the document of a scene")
+    scene: Annotated[Scene, _BuiltIn(_built_in)] = Field(
+        description="the name of a built-in scene, or the document of a scene"
+    )
     set: dict[str, JsonValue] = Field(
         default_factory=dict, max_length=64, description="other values of the scene for all samples, by path"
     )
     axes: ClothSceneAxes
     lamps: dict[CustomName, LampNumbers] = definitions("lamps", "lighting")
     substrates: dict[CustomName, FloorNumbers] = definitions("floors", "substrate")
-
-    @field_validator("scene", mode="before")
-    @classmethod
-    def _built_in(cls, scene: Any) -> Any:
-        return load_scene(scene) if isinstance(scene, str) else scene
 
     # --- rules --------------------------------------------------------------------------------------------
 
@@ -206,7 +225,7 @@ class ClothSceneSpec(ClipSpec):
     @property
     def segments(self) -> tuple[str, ...]:
         """Names of the codes of the array `segmentation`."""
-        return self.stage.segments
+        return scene_segments(self.stage.sheets, self.stage.bodies)
 
     # --- documents ----------------------------------------------------------------------------------------
 
@@ -307,88 +326,5 @@ class ClothSceneSpec(ClipSpec):
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays of a dataset of the scene."""
-        scene = self.stage
-        bias = array("bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2})
-        rest = array("rest_time", "when all was at rest [s]; NaN where it was not")
-        return (
-            *clip_arrays(self),
-            array("camera", "of the clip: fx, fy, cx, cy [px], rotation (rows), translation [m]", of={"camera": 16}),
-            *(self._label(name) for name in scene.parameters if name in self.named_axes),
-            *((bias,) if scene.bias else ()),
-            *((rest,) if scene.end else ()),
-            array("least_distance", "of vertices and edges of cloth in contact, at the ends of all steps [m]"),
-            *(each for name in scene.sheets for each in self._sheet_labels(name)),
-            *solver_arrays(self),
-            *self._tracks(),
-            *(each for name in scene.sheets for each in self._mesh(name) if self.store_positions),
-        )
-
-    def _label(self, parameter: str) -> ArrayLayout:
-        given = self.stage.parameters[parameter]
-        if isinstance(self.stage.default(parameter), float):
-            return array(parameter, f"{given.description or 'parameter of the scene'} [{given.unit}]")
-        return codes(parameter, (*Material, *self.stage.materials))
-
-    def _sheet_labels(self, sheet: str) -> tuple[ArrayLayout, ...]:
-        hung = array(f"{sheet}.tilt", "lean of gravity along the normal as it came to hang, over gravity")
-        return (
-            array(f"{sheet}.areal_density", "mass per area [kg/m^2]"),
-            array(
-                f"{sheet}.bending_rigidity",
-                "plate rigidities along the warp, along the weft, and of twist [N m]",
-                of={"direction": 3},
-            ),
-            array(
-                f"{sheet}.stretching_stiffness",
-                "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]",
-                of={"coefficient": 4},
-            ),
-            *((hung,) if self.stage.sheets[sheet].start.type == "hung" else ()),
-        )
-
-    def _tracks(self) -> tuple[ArrayLayout, ...]:
-        """Return forces and poses, in the order of names that their attributes give."""
-        scene = self.stage
-        sheets, bodies, holders = list(scene.sheets), list(scene.bodies), [f"{a}.{b}" for a, b in scene.holders]
-        others = [*bodies, *sheets]
-        by = {"sheet": len(sheets), "other": len(others), "xyz": 3}
-        held, pose = {"holder": len(holders)}, {"row": 3, "column": 4}
-        on = {"sheets": sheets, "others": others}
-        of_bodies = over_time(
-            self,
-            "body_pose",
-            "x -> A x + b from a body's axes [m]",
-            of={"body": len(bodies), **pose},
-            attributes={"names": bodies},
-        )
-        said: dict[str, Any] = {"attributes": {"names": holders}}
-        of_holders = (
-            over_time(self, "holder_force", "force of each holder on its sheet [N]", of={**held, "xyz": 3}, **said),
-            over_time(self, "holder_pose", "x -> A x + b from a holder's axes [m]", of={**held, **pose}, **said),
-            over_time(self, "grasped", "1 while a holder holds", "uint8", held, **said),
-        )
-        return (
-            over_time(self, "contact_force", "force of bodies, then sheets, on each sheet [N]", of=by, attributes=on),
-            *((of_bodies,) if bodies else ()),
-            *(of_holders if holders else ()),
-        )
-
-    def _mesh(self, sheet: str) -> tuple[ArrayLayout, ...]:
-        vertices, triangles = self.stage.sheets[sheet].mesh.shape
-        vertex = {f"{sheet}.vertex": vertices}
-        corners = {f"{sheet}.triangle": triangles, "corner": 3}
-        return (
-            over_time(
-                self,
-                f"{sheet}.positions",
-                "positions of the vertices [m]",
-                of={**vertex, "xyz": 3},
-                per_sample=True,
-                is_trajectory=True,
-            ),
-            over_time(
-                self, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes={"categories": STATES}
-            ),
-            array(f"{sheet}.rest", "the flat sheet (warp, weft) [m]", "float32", {**vertex, "uv": 2}, is_recorded=True),
-            array(f"{sheet}.triangles", "vertices of the triangles", "int32", corners, is_recorded=True),
-        )
+        labels = (parameter_label(self.stage, name) for name in self.stage.parameters if name in self.named_axes)
+        return (*clip_arrays(self), *labels, *scene_arrays(self, self.stage))

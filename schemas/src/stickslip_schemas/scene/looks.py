@@ -23,9 +23,6 @@ from stickslip_schemas.spec.fabrics import CustomName, Texture, did_you_mean
 FILM = 36.0
 """Width of the film that focal lengths refer to [mm]."""
 
-FRAMING = ("front", "side", "high")
-"""The cameras of a scene without cameras of its own: each frames all that moves in a sample."""
-
 
 class View(Document):
     """A camera, by where it is and where it looks."""

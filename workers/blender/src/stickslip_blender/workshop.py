@@ -141,7 +141,7 @@ class Workshop:
 
 def check_rig(render: Render) -> None:
     """Raise a ValueError if the cameras of a render document are not those of this installation."""
-    if render.rig_digest != rig_digest(render.rig):
+    if render.rig is not None and render.rig_digest != rig_digest(render.rig):
         raise ValueError(
             f"render.rig_digest must be that of {render.rig} here, {rig_digest(render.rig)}; got {render.rig_digest}"
         )

@@ -7,8 +7,7 @@ import numpy as np
 from stickslip_blender.cloth import ground_truth as module
 from stickslip_blender.cloth.geometry import BACKGROUND, CLOTH, FLOOR, GROUND, PROP, Geometry, Holders
 from stickslip_blender.cloth.ground_truth import ground_truth
-from stickslip_schemas.kinds.cloth.spec import SEGMENTS
-from stickslip_schemas.kinds.cloth.spec import GroundTruth
+from stickslip_schemas.kinds.cloth.spec import SEGMENTS, GroundTruth
 from stickslip_schemas.spec.cameras import load_rig
 
 
