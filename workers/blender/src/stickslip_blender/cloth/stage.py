@@ -36,6 +36,9 @@ ENDLESS, TILE = 1.0, 0.1
 JAWS = 0.004
 """By how much a holder is larger than what it holds, along each axis [m]."""
 
+ROUNDING = 0.005
+"""Radius of the edges of a box that gives none [m], as in the simulation."""
+
 MOVING = 0.005
 """A vertex that goes farther than this moves [m]: cameras frame all that do."""
 
@@ -180,7 +183,7 @@ def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces, bool]:
         vertices, faces = tiles(body["normal"], 2.0 * ENDLESS, round(2.0 * ENDLESS / TILE))
         return vertices - SUNK * np.asarray(body["normal"]) / np.linalg.norm(body["normal"]), faces, False
     if kind == "box":
-        rounding = max(body["rounding"], 2.0 * SUNK)
+        rounding = max(body["rounding"] or min(ROUNDING, 0.5 * min(body["size"])), 2.0 * SUNK)
         return *rounded(0.5 * np.asarray(body["size"]) - rounding, rounding - SUNK), True
     half = {"sphere": 0.0, "capsule": 0.5 * body.get("length", 0.0), "cylinder": ENDLESS}[kind]
     return *rounded((0.0, 0.0, half), body["radius"] - SUNK), True

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a scene."""
-    scene = look.scene
+    scene = look.scene.model_dump(mode="json")
     stage = Stage(scene, workshop.record(task.record), lambda name: picture(name, workshop))
     return render_clips(
         look,
