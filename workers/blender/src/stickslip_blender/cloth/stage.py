@@ -48,6 +48,7 @@ PLAIN = (168, 164, 156)
 _STILL_COLOR, _STILL_ROUGHNESS = (0.5, 0.5, 0.5), 0.5
 _TURNS = (0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0, 120.0, -120.0, 150.0, -150.0, 180.0)  # [degree]
 _ENOUGH = 0.6  # of the most that any turn shows of the cloth: the smallest turn that shows as much is taken
+_WATCHED = 60  # instants at which it is found out what moves
 _LOOKS, _THUMB = 5, 56  # instants that are looked at, and the side of their pictures [px]
 
 Array = npt.NDArray[Any]
@@ -106,8 +107,8 @@ class Stage:
     def moving(self, geometry: Geometry) -> Array:
         """Return the places (n, 3) [m], over time, of all that moves, and of all of the first sheet."""
         track = self._record[f"{self._sheet}.positions"]
-        instants = np.unique(np.linspace(0, len(track) - 1, 60).astype(int))
-        parts = [track[instants].reshape(-1, 3)]
+        instants = np.unique(np.linspace(0, len(track) - 1, _WATCHED).astype(int))
+        parts = [track.reshape(-1, 3)]
         for place in self._placers:
             places = np.stack([place(instant) for instant in instants])
             moves = (np.ptp(places, axis=0) > MOVING).any(axis=1)
