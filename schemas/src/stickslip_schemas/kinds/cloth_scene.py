@@ -108,6 +108,16 @@ class ClothSceneRender(ClipRender):
     scene: Staged
 
     @property
+    def material(self) -> str:
+        """The fabric of the sheet that takes the texture."""
+        return self.scene.sheets[self.scene.textured].material
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """Names of the codes of the array `segmentation`."""
+        return scene_segments(self.scene.sheets, self.scene.bodies)
+
+    @property
     def artifacts(self) -> tuple[Sha256, ...]:
         """Pictures of sheets with a texture of their own."""
         return tuple(filter(None, (referred(name) for place, name in self.scene.files() if place[0] == "looks")))

@@ -191,6 +191,11 @@ class Staged(Physics):
 
     looks: Looks = Looks()
 
+    @property
+    def textured(self) -> str:
+        """The sheet that takes the axis `texture`: the first without a texture of its own."""
+        return next(name for name in self.sheets if name not in self.looks.sheets)
+
     def files(self) -> Iterator[tuple[Path, str]]:
         """Yield the files that the scene names: their place in the document, and their name."""
         yield from super().files()

@@ -9,10 +9,10 @@ from stickslip_blender.cloth.geometry import FLOOR, Geometry
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.shading import Composer
 from stickslip_blender.cloth.shapes import gores, rounded
-from stickslip_blender.cloth.stage import SUNK, Stage, first_sheet
+from stickslip_blender.cloth.stage import SUNK, Stage
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.kinds.cloth.arrays import scene_segments
-from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.document import Staged
 from stickslip_schemas.spec.cameras import FRAMING, framed
 from stickslip_schemas.spec.fabrics import Texture
 
@@ -42,7 +42,7 @@ def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     }
     if screen is not None:
         bodies["wall"] = {"type": "box", "size": [1.0, 0.02, 1.0], "origin": [0.0, screen, 0.5]}
-    scene = Scene.model_validate(
+    scene = Staged.model_validate(
         {
             "format": "stickslip-scene/1",
             "duration": 1.0,
@@ -79,9 +79,13 @@ def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def staged(**options: Any) -> tuple[Stage, Geometry, Any]:
     scene, record = made(**options)
-    stage = Stage(scene, record, lambda name: texture_image(Texture(name)))
-    sheet = first_sheet(scene)
-    return stage, Geometry(record[f"{sheet}.triangles"], record[f"{sheet}.rest"], stage), record[f"{sheet}.positions"]
+    return *set_up(scene, record), record["towel.positions"]
+
+
+def set_up(scene: dict[str, Any], record: dict[str, Any]) -> tuple[Stage, Geometry]:
+    names = scene_segments(scene["sheets"], scene["bodies"])
+    stage = Stage(scene, "towel", names, record, lambda name: texture_image(Texture(name)))
+    return stage, Geometry(record["towel.triangles"], record["towel.rest"], stage)
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +107,6 @@ def test_round_bodies_are_their_cores_grown_by_the_radius(core: tuple[float, flo
     assert volume == pytest.approx(exact, rel=0.03)  # outward, closed, and a polyhedron
     colors = gores(np.ones((1, 3)), len(faces))
     assert 0.4 < (colors[:, 0] < 0.5).mean() < 0.6
-
-
-def test_the_first_sheet_without_a_texture_takes_the_axis() -> None:
-    scene, _ = made()
-    assert first_sheet(scene) == "towel"
-    scene["looks"]["sheets"]["towel"] = {"texture": "dots"}
-    assert first_sheet(scene) == "rug"
 
 
 def test_bodies_are_where_the_record_has_them_and_a_little_inside(usual: Any) -> None:
@@ -169,8 +166,7 @@ def test_a_scene_without_a_plane_has_no_floor() -> None:
     scene, record = made()
     record["body_pose"] = np.delete(record["body_pose"], [*scene["bodies"]].index("floor"), axis=1)
     del scene["bodies"]["floor"]
-    stage = Stage(scene, record, lambda name: texture_image(Texture(name)))
-    geometry = Geometry(record["towel.triangles"], record["towel.rest"], stage)
+    stage, geometry = set_up(scene, record)
     points = geometry.points(record["towel.positions"][0], 0)
     truth = ground_truth(geometry, points, points, framed("front", record["towel.positions"], size=224))
     assert stage.floor is None

@@ -36,6 +36,9 @@ from stickslip_blender.workshop import Workshop, rejected, why_unfit
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask
     from stickslip_schemas.kinds.cloth.spec import ClothRender
+    from stickslip_schemas.kinds.cloth_scene import ClothSceneRender
+
+    AnyLook = ClothRender | ClothSceneRender
 
 GATE = 32.0
 """Least PSNR of composed pictures against direct ones, in means of 4 x 4 pixels of 8-bit sRGB [dB]."""
@@ -85,7 +88,7 @@ class ClothRenderer:
         self.scene.close()
 
     def clip(
-        self, look: ClothRender, camera: Camera, positions: npt.ArrayLike, *, sampling: ClothSampling | None = None
+        self, look: AnyLook, camera: Camera, positions: npt.ArrayLike, *, sampling: ClothSampling | None = None
     ) -> ClipRenderer:
         """Set the scene for a clip of positions (frames, V', 3) [m], at the instants that `look` names."""
         track = self.geometry.checked(positions)
@@ -201,7 +204,7 @@ def block_decibels(one: Clip, other: Clip) -> float:
 
 
 def render_clips(
-    look: ClothRender,
+    look: AnyLook,
     task: RenderTask,
     workshop: Workshop,
     make: Callable[[Any], Surroundings],
@@ -211,8 +214,8 @@ def render_clips(
 ) -> TaskResult:
     """Render the clips of a task on the scene that `make` makes of a rest shape.
 
-    `sheet` is before the names of the cloth's arrays. `frame` makes the camera of a scene that has no other, and the
-    camera is then a label.
+    `sheet` is before the names of the cloth's arrays. With `frame`, which makes the camera where the task has none, the
+    camera is a label.
     """
     record = workshop.record(task.record)
     track, rest, triangles = (record[f"{sheet}{name}"] for name in ("positions", "rest", "triangles"))
@@ -222,11 +225,7 @@ def render_clips(
         (look.kind, None if make is Holders else task.record, triangles.tobytes(), rest.tobytes()),
         lambda: ClothRenderer(triangles, rest, make, workshop.scratch),
     )
-    camera = look.camera or (
-        frame(renderer.geometry)
-        if frame
-        else next(camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
-    )
+    camera = look.camera or (frame(renderer.geometry) if frame else rig_camera(look))
     if unfit := why_unfit("cloth", track, 0.0, (camera,)):
         return unfit
     clip = renderer.clip(look, camera, track[list(look.instants)])
@@ -253,13 +252,19 @@ def render_clips(
     return TaskResult(outcome="succeeded", output=output)
 
 
+def rig_camera(look: AnyLook) -> Camera:
+    """Return the camera of a viewpoint of the rig."""
+    assert look.rig is not None
+    return next(camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
+
+
 def picture(texture: str, workshop: Workshop) -> Clip:
     """Return the picture of a texture that is built in, or that a user has put into the store."""
     digest = referred(texture)
     return texture_image(Texture(texture)) if digest is None else custom_texture(workshop.store.read(digest))
 
 
-def _shading(clip: ClipRenderer, look: ClothRender, task: RenderTask, workshop: Workshop) -> Shading:
+def _shading(clip: ClipRenderer, look: AnyLook, task: RenderTask, workshop: Workshop) -> Shading:
     """Return the shading of a clip: one that was made before, if it is still kept, or a new one."""
     light = {name: value for name, value in look.shading.items() if name != "ground_truth"}
     shared = {"record": task.record.model_dump(), "look": light, "build": build_digest(look.kind)}

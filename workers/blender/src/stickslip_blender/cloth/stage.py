@@ -1,16 +1,15 @@
-"""What a scene shows besides its first sheet: further sheets, bodies and holders, from its document and a record.
+"""What a scene shows besides one sheet: further sheets, bodies and holders, from its document and a record.
 
 Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of its names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.kinds.cloth.arrays import scene_segments
 from stickslip_schemas.spec.cameras import Camera, framed
 
 from stickslip_blender.cloth.geometry import (
@@ -54,33 +53,37 @@ _LOOKS, _THUMB = 5, 56  # instants that are looked at, and the side of their pic
 Array = npt.NDArray[Any]
 
 
-def first_sheet(scene: Mapping[str, Any]) -> str:
-    """Return the name of the sheet that takes the axis `texture`: the first without one of its own, or the first."""
-    names, own = list[str](scene["sheets"]), scene["looks"]["sheets"]
-    return next((name for name in names if name not in own), names[0])
-
-
 class Stage:
-    """The surroundings of the first sheet of a scene."""
+    """The surroundings of one sheet of a scene: the one that takes the axis `texture`."""
 
     def __init__(
         self,
         scene: Mapping[str, Any],
+        sheet: str,
+        segments: Sequence[str],
         record: Mapping[str, Array],
         picture: Callable[[str], npt.NDArray[np.uint8]],
     ) -> None:
-        """Make the props of a scene, as JSON, from the arrays of a sample; `picture` returns a texture by name."""
-        codes = {name: code for code, name in enumerate(scene_segments(scene["sheets"], scene["bodies"]))}
+        """Make the props of a scene.
+
+        Args:
+            scene: `Staged` of stickslip_schemas.scene, as JSON.
+            sheet: The sheet that is no prop.
+            segments: Names of the codes of the segmentation.
+            record: Arrays of a sample.
+            picture: Returns a texture by name.
+        """
+        codes = {name: code for code, name in enumerate(segments)}
         self._record = record
-        self._sheet = first_sheet(scene)
+        self._sheet = sheet
         self.segment = codes[self._sheet]
         self.floor: float | None = None
         self.ground = BACKGROUND
         self._placers: list[Callable[[int], Array]] = []
         props: list[Prop] = []
-        for name, sheet in scene["sheets"].items():
-            if name != self._sheet:
-                props.append(self._printed(name, sheet, scene["looks"]["sheets"].get(name), picture, codes[name]))
+        for name, other in scene["sheets"].items():
+            if name != sheet:
+                props.append(self._printed(name, other, scene["looks"]["sheets"].get(name), picture, codes[name]))
         for number, (name, body) in enumerate(scene["bodies"].items()):
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
                 self.floor, self.ground = body["origin"][2] + FLOOR, codes[name]
@@ -100,12 +103,12 @@ class Stage:
         return [place(instant) for place in self._placers]
 
     def aim(self, _instant: int, vertices: Array) -> Array:
-        """Return the middle of the box about the first sheet."""
+        """Return the middle of the box about the sheet."""
         middle: Array = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         return middle
 
     def moving(self, geometry: Geometry) -> Array:
-        """Return the places (n, 3) [m], over time, of all that moves, and of all of the first sheet."""
+        """Return the places (n, 3) [m], over time, of all that moves, and of all of the sheet."""
         track = self._record[f"{self._sheet}.positions"]
         instants = np.unique(np.linspace(0, len(track) - 1, _WATCHED).astype(int))
         parts = [track.reshape(-1, 3)]
@@ -116,7 +119,7 @@ class Stage:
         return np.concatenate(parts)
 
     def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
-        """Return the camera that frames all that moves, turned about it until enough of the first sheet is in sight."""
+        """Return the camera that frames all that moves, turned about it until enough of the sheet is in sight."""
         points, track = self.moving(geometry), self._record[f"{self._sheet}.positions"]
         instants = np.linspace(0, len(track) - 1, _LOOKS).astype(int)
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
@@ -191,7 +194,7 @@ def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces, bool]:
 
 
 def _shown(camera: Camera, geometry: Geometry, scenes: list[Array]) -> int:
-    """Return how many pixels show the first sheet, over several instants."""
+    """Return how many pixels show the sheet, over several instants."""
     window = Window(0, 0, camera.width, camera.height)
     count = 0
     for points in scenes:

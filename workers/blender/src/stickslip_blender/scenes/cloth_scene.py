@@ -1,13 +1,15 @@
-"""Scenes as data: the first sheet takes the axis `texture`, everything else is a prop."""
+"""Scenes as data: one sheet takes the axis `texture`, everything else is a prop."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from stickslip_schemas.spec.appearance import CLIP_SIZE
+from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.cloth.clips import picture, render_clips
-from stickslip_blender.cloth.stage import Stage, first_sheet
+from stickslip_blender.cloth.clips import picture, render_clips, rig_camera
+from stickslip_blender.cloth.geometry import Geometry
+from stickslip_blender.cloth.stage import Stage
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -17,13 +19,16 @@ if TYPE_CHECKING:
 
 def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     """Render the clips of a scene."""
-    scene = look.scene.model_dump(mode="json")
-    stage = Stage(scene, workshop.record(task.record), lambda name: picture(name, workshop))
-    return render_clips(
-        look,
-        task,
-        workshop,
-        lambda _rest: stage,
-        sheet=f"{first_sheet(scene)}.",
-        frame=lambda geometry: stage.camera(look.viewpoint, geometry, CLIP_SIZE),
+    sheet = look.scene.textured
+    stage = Stage(
+        look.scene.model_dump(mode="json"),
+        sheet,
+        look.segments,
+        workshop.record(task.record),
+        lambda name: picture(name, workshop),
     )
+
+    def frame(geometry: Geometry) -> Camera:
+        return stage.camera(look.viewpoint, geometry, CLIP_SIZE) if look.rig is None else rig_camera(look)
+
+    return render_clips(look, task, workshop, lambda _rest: stage, sheet=f"{sheet}.", frame=frame)
