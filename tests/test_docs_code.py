@@ -22,7 +22,7 @@ import pytest
 import yaml
 from harness import STICKSLIP, Service
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.spec.scene_file import SceneFile
+from stickslip_schemas.scene.document import Scene
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -109,7 +109,7 @@ def test_every_block_runs(
         elif block.language == "yaml":
             document = yaml.safe_load(block.code)
             if "format" in document:
-                SceneFile.model_validate(document)
+                Scene.model_validate(document)
             else:
                 job_spec_adapter.validate_python(document)
             if name := re.match(r"# (\S+\.yaml)\n", block.code):

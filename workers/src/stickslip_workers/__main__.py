@@ -1,4 +1,4 @@
-"""Command line: `python -m stickslip_workers dispatch | replay | certify | scene | describe`."""
+"""Command line: `python -m stickslip_workers dispatch | replay | certify | describe`."""
 
 import argparse
 import ctypes
@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from stickslip_schemas.store import open_store, store_place
 from stickslip_workers.lease_client import Backoff, CoordinatorError
 from stickslip_workers.settings import Settings, default_blender_python
 
+FRAMES_SECONDS = 5.0
+"""Between two reports of a replay's progress [s]."""
 STEADY_SECONDS = 60.0
 """A dispatcher that has run for so long starts again without a wait that has grown [s]."""
 
@@ -52,14 +55,6 @@ def main(arguments: list[str] | None = None) -> int:
         "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
     )
 
-    scene = commands.add_parser("scene", help="run a custom scene, as `stickslip simulate` hands it over")
-    scene.add_argument("scene", type=Path, help="the scene as JSON")
-    scene.add_argument("--folder", type=Path, required=True, help="where the files are that the scene names")
-    scene.add_argument("--out", type=Path, required=True, help="a new directory for the trajectories")
-    scene.add_argument("--certificate", type=Path, help="certificate.json of the scene's preset")
-    scene.add_argument("--allow-uncertified", action="store_true", help="run it even without a certificate")
-    scene.add_argument("--obj", action="store_true", help="write an OBJ file for each sheet and frame, too")
-
     commands.add_parser("describe", help="print the builds of this environment")
 
     options = parser.parse_args(arguments)
@@ -72,8 +67,6 @@ def main(arguments: list[str] | None = None) -> int:
         return _replay(options)
     if options.command == "certify":
         return _certify(options)
-    if options.command == "scene":
-        return _scene(options)
     from stickslip_workers.stages.run import StageActor
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
@@ -192,13 +185,21 @@ def _replay(options: argparse.Namespace) -> int:
     except ValidationError as error:
         sys.stderr.write(f"error: {options.task} is not a task as GET /v1/tasks/ID returns it: {error}\n")
         return 2
-    result = replay(
-        task,
-        store=options.store,
-        blender_python=options.blender_python.absolute(),
-    )
+    over = threading.Event()
+    threading.Thread(target=_show_frames, args=(over,), daemon=True).start()
+    result = replay(task, store=options.store, blender_python=options.blender_python.absolute())
+    over.set()
     sys.stdout.write(result.model_dump_json(indent=2) + "\n")
     return 1 if result.outcome == "failed" else 0
+
+
+def _show_frames(over: threading.Event) -> None:
+    """Write to standard error how far the simulation of this process is."""
+    from stickslip_workers import progress
+
+    while not over.wait(FRAMES_SECONDS):
+        if (frames := progress.current()) is not None:
+            sys.stderr.write(f"{frames[0]} of {frames[1]} frames\n")
 
 
 def _certify(options: argparse.Namespace) -> int:
@@ -220,35 +221,6 @@ def _certify(options: argparse.Namespace) -> int:
         return 2
     sys.stdout.write(certificate.digest + "\n")
     return 0 if certificate.passed else 1
-
-
-def _scene(options: argparse.Namespace) -> int:
-    """Return 0 if the trajectories are valid, 1 if not, 2 if there was nothing to run."""
-    from stickslip_schemas.documents.certificate import Certificate
-    from stickslip_schemas.spec.scene_file import SceneFile
-
-    from stickslip_workers.custom_scene import simulate_scene
-
-    def show(done: int, frames: int) -> None:
-        if done == frames or done % max(frames // 20, 1) == 0:
-            sys.stderr.write(f"{done} of {frames} frames\n")
-
-    try:
-        path = options.certificate
-        result = simulate_scene(
-            SceneFile.model_validate_json(options.scene.read_bytes()),
-            options.folder,
-            options.out,
-            certificate=None if path is None else Certificate.model_validate_json(path.read_bytes()),
-            allow_uncertified=options.allow_uncertified,
-            obj=options.obj,
-            on_frame=show,
-        )
-    except (ValueError, OSError) as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    sys.stdout.write(json.dumps(result) + "\n")
-    return 0 if result["valid"] else 1
 
 
 if __name__ == "__main__":

@@ -143,6 +143,14 @@ class TextureEntry(Document):
     bytes: int
 
 
+class FileUpload(Document):
+    """An uploaded file of a scene."""
+
+    file: ArtifactRef = Field(description="reference for the document of a scene")
+    counts: tuple[int, int] | None = Field(description="vertices and triangles of an OBJ file: `counts` of a mesh")
+    bytes: int
+
+
 class CertificateEntry(Document):
     """A certificate on the coordinator."""
 

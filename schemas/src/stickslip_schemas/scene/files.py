@@ -5,18 +5,20 @@ What a file is for follows from its place in the document: a flat pattern, a sta
 
 import io
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path as LocalPath
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from stickslip_schemas.base.keys import ARTIFACT, sha256
+from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import MAX_VERTICES, Scene
 from stickslip_schemas.scene.parameters import Path, at, with_values
 
-MAX_FILE_BYTES = 32 * 2**20
+MAX_FILE_BYTES = 16 * 2**20
 """Of a file of a scene, and of the arrays of an NPZ file."""
 MAX_TRIANGLES = 2 * MAX_VERTICES
 """Of one mesh."""
@@ -61,6 +63,25 @@ def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str
     return Scene.model_validate(with_values(scene.model_dump(mode="json"), values)), found
 
 
+def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
+    """Return a folder of OBJ files, one a frame of the body that names it, as one NPZ file.
+
+    Raises:
+        UnfitFileError: They are not frames of one mesh.
+    """
+    rates = [body.frame_rate for body in scene.bodies.values() if isinstance(body, MeshBody) and body.file == name]
+    if not files or not rates or rates[0] is None:
+        raise UnfitFileError("must hold OBJ files, one a frame, of a body with a frame_rate [1/s]")
+    frames = [read_obj(file.read_bytes()) for file in files]
+    for file, (vertices, triangles, _) in zip(files, frames, strict=True):
+        if vertices.shape != frames[0][0].shape or not np.array_equal(triangles, frames[0][1]):
+            raise UnfitFileError(f"{file.name} must have the vertices and faces of {files[0].name}, in the same order")
+    packed = io.BytesIO()
+    times = np.arange(len(files)) / rates[0]
+    np.savez(packed, positions=np.stack([vertices for vertices, _, _ in frames]), triangles=frames[0][1], times=times)
+    return packed.getvalue()
+
+
 def check_scene_file(scene: Scene, place: Path, data: bytes) -> None:
     """Check a file that is in the store: it is what the scene needs, and has the counts that the scene gives.
 
@@ -95,6 +116,24 @@ def check_file(place: Path, data: bytes) -> tuple[int, int] | None:
         _start(data)
     else:
         return _pattern(data)
+    return None
+
+
+def counts_of(data: bytes) -> tuple[int, int] | None:
+    """Return the numbers of vertices and triangles of an OBJ file; None of an NPZ or CSV file.
+
+    Raises:
+        UnfitFileError: It is none of these.
+    """
+    if len(data) > MAX_FILE_BYTES:
+        raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes, and has {len(data)}")
+    if data.startswith(b"PK"):
+        _names(data)
+    elif data.startswith(b"time"):
+        _path(data)
+    else:
+        vertices, triangles, _ = read_obj(data)
+        return len(vertices), len(triangles)
     return None
 
 

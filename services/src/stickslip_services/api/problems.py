@@ -24,7 +24,7 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
     errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),
     errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
-    errors.UnknownTextureError: (422, ProblemCode.validation_failed),
+    errors.UnknownFileError: (422, ProblemCode.validation_failed),
     errors.MissingArtifactError: (500, ProblemCode.storage_error),
 }
 

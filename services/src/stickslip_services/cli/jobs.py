@@ -1,5 +1,6 @@
 """Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise and cancel."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 from stickslip_schemas.base.states import TaskState
-from stickslip_schemas.documents.responses import JobDetail
+from stickslip_schemas.documents.responses import FileUpload, JobDetail, TextureEntry
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.plan.grid import count
 from stickslip_schemas.spec.jobs import JobSpec
@@ -25,7 +26,7 @@ from stickslip_services.cli.common import (
     table,
 )
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.cli.specs import check_spec, read_spec
+from stickslip_services.cli.specs import check_spec, read_job
 from stickslip_services.cli.watch import GOOD, watch
 from stickslip_services.client.errors import ClientError, UnreachableError
 from stickslip_services.client.http import Client
@@ -40,10 +41,11 @@ PriorityOption = Annotated[int, typer.Option(min=-100, max=100, help=PRIORITY)]
 @shows_errors
 def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
     """Check a spec and count its samples, without submitting it. Works offline."""
-    document = read_spec(file)
+    document, files = read_job(file)
     spec = check_spec(document, file)
     try:
         with Client(url) as client:
+            _upload(client, spec, files)
             answer = client.validate(document)
     except UnreachableError:
         if as_json:
@@ -94,8 +96,10 @@ def submit(
     priority: PriorityOption = 0,
 ) -> None:
     """Submit a job and print its id."""
-    document = read_spec(file)
+    document, files = read_job(file)
     with Client(url) as client:
+        if files:
+            _upload(client, check_spec(document, file), files)
         job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
         typer.echo(job.id)
         if not then_watch:
@@ -230,30 +234,43 @@ def prioritise(
     console().print(f"{job.id} has priority {job.priority}")
 
 
+def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
+    """Upload the files that a scene names, by digest."""
+    for pointer, digest in spec.artifacts.items():
+        if digest in files and pointer.startswith("/scene/looks/"):
+            client.upload_texture(files[digest])
+        elif digest in files:
+            client.upload_file(files[digest])
+
+
 @shows_errors
 def upload(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="square PNG or JPEG files")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="PNG or JPEG files; files of scenes")],
     url: UrlOption = DEFAULT_URL,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload pictures as textures, and print their entries for `textures` in a spec."""
-    found = []
+    """Upload pictures as textures, and OBJ, NPZ and CSV files of scenes; print the references that specs use."""
+    found: list[TextureEntry | FileUpload] = []
     with Client(url) as client:
         for file in files:
             try:
                 data = file.read_bytes()
             except OSError as error:
                 raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
+            is_scene_file = file.suffix.lower() in (".obj", ".npz", ".csv")
             try:
-                found.append(client.upload_texture(data))
+                found.append(client.upload_file(data) if is_scene_file else client.upload_texture(data))
             except ClientError as error:
                 raise ClientError(f"{file} was refused: {error}") from error
     if as_json:
         return print_json(found)
     say("In a spec, under any names:")
-    console().print("textures:")
-    for file, entry in zip(files, found, strict=True):
-        console().print(f"  {_name(file)}: {entry.texture}")
+    pictures = [(file, entry) for file, entry in zip(files, found, strict=True) if isinstance(entry, TextureEntry)]
+    for number, (file, picture) in enumerate(pictures):
+        console().print(("" if number else "textures:\n") + f"  {_name(file)}: {picture.texture}")
+    for entry in found:
+        if isinstance(entry, FileUpload):
+            console().print(f"file: {entry.file}" + (f"  # counts: {list(entry.counts)}" if entry.counts else ""))
     return None
 
 

@@ -23,6 +23,7 @@ from stickslip_services.cli.jobs import (
     watch_job,
 )
 from stickslip_services.cli.maintenance import gc, reindex, rm
+from stickslip_services.cli.scenes import app as scenes
 from stickslip_services.cli.scenes import simulate
 from stickslip_services.cli.service import up, workers
 
@@ -75,4 +76,5 @@ app.command(name="export", context_settings=_PASSING)(export)
 app.add_typer(datasets, name="datasets")
 app.add_typer(keys, name="keys")
 app.add_typer(projects, name="projects")
+app.add_typer(scenes, name="scene")
 app.add_typer(webhooks, name="webhooks")

@@ -1,21 +1,34 @@
-"""The command that simulates a custom scene."""
+"""The commands for scenes: check one, look at it, and simulate one sample here."""
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.library import load_scene, scene_names
+from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
-from stickslip_services.cli.common import JsonOption, console, say
+from stickslip_services.cli.common import JsonOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.cli.specs import check_scene, read_spec
+from stickslip_services.cli.specs import read_scene
 from stickslip_services.local import certifying, simulating
+from stickslip_services.units import size
+
+app = typer.Typer(help="Check and preview scenes.", no_args_is_help=True)
+
+SceneArgument = Annotated[
+    str, typer.Argument(metavar="SCENE", help="a scene, YAML or JSON, or the name of a built-in one")
+]
 
 
 @shows_errors
 def simulate(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="the scene, YAML or JSON")],
+    scene: SceneArgument,
     out: Annotated[Path, typer.Argument(metavar="DIR", help="a new directory for the trajectories")],
     certificate: Annotated[
         Path | None,
@@ -27,28 +40,99 @@ def simulate(
     obj: Annotated[bool, typer.Option("--obj", help="write an OBJ file for each sheet and frame, too")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate a custom scene on this machine: sheets, bodies and motions from a file.
+    """Simulate one sample of a scene on this machine, by the stages of the queue, with its default parameters.
 
-    Writes trajectory.npz and scene.json; exits with 1 if the solver did not converge. No coordinator is needed.
+    Writes trajectory.npz and scene.json; exits with 1 if the sample is not valid. No coordinator is needed.
     """
-    scene = check_scene(read_spec(file), file)
-    usual = Path("certificates") / scene.preset.value
+    given, files = _scene(scene)
+    usual = Path("certificates") / given.preset.value
     directory = certificate or (usual if usual.is_dir() else None)
-    if directory is not None:
-        certifying.read_certificate(directory)  # refuses an invalid certificate with the reason
-    result = simulating.simulate(
-        scene,
-        file.parent,
-        out,
-        certificate=None if directory is None else directory / certifying.DOCUMENT_NAME,
-        allow_uncertified=allow_uncertified,
-        obj=obj,
-    )
+    found = None if directory is None else certifying.read_certificate(directory).certificate
+    spec = spec_of(given, allow_uncertified=allow_uncertified)
+    result = simulating.simulate(spec, files, out, certificate=found, obj=obj)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:
-        console().print(f"{result['frames']} frames of {len(scene.sheets)} sheets: {escape(str(out))}")
+        console().print(f"{spec.instants} frames of {len(given.sheets)} sheets: {escape(str(out))}")
         say("certified" if result["certified"] else f"NOT certified: {result['why_not_certified']}")
         if not result["valid"]:
             say(f"NOT valid: {result['reason']}")
     raise typer.Exit(0 if result["valid"] else 1)
+
+
+@app.command()
+@shows_errors
+def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
+    """Check a scene and the files that it names; list its axes and the arrays of a dataset of it."""
+    given, files = _scene(scene)
+    spec = spec_of(given)
+    arrays: list[dict[str, Any]] = [
+        {"name": each.name, "dtype": each.dtype, "shape": list(each.shape), "description": each.description}
+        for each in layout(spec)
+    ]
+    axes = {name: _axis(given, name) for name in given.parameters}
+    step_frames = sum(mesh.mesh.shape[0] for mesh in given.sheets.values()) * given.frames
+    said: dict[str, Any] = {
+        "scene": given.name,
+        "digest": given.digest,
+        "axes": axes,
+        "arrays": arrays,
+        "cost": {
+            "vertices": sum(sheet.mesh.shape[0] for sheet in given.sheets.values()),
+            "frames": given.frames,
+            "vertices_times_frames": step_frames,
+            "bytes_a_sample": sum(each.sample_bytes for each in layout(spec)),
+            "files_bytes": sum(map(len, files.values())),
+        },
+    }
+    if as_json:
+        return typer.echo(json.dumps(said, indent=2))
+    shown = table("axis", "default", "values")
+    for name, axis in axes.items():
+        shown.add_row(name, str(axis["default"]), axis["values"])
+    console().print(shown)
+    listed = table("array", "type", "shape", "meaning")
+    for each in arrays:
+        listed.add_row(each["name"], each["dtype"], str(tuple(each["shape"])), escape(each["description"]))
+    console().print(listed)
+    cost = said["cost"]
+    say(
+        f"{cost['vertices']} vertices, {cost['frames']} frames, {size(cost['bytes_a_sample'])} a sample before "
+        f"compression; digest {given.digest}"
+    )
+    return None
+
+
+def _axis(scene: Scene, name: str) -> dict[str, Any]:
+    parameter = scene.parameters[name]
+    return {
+        "default": scene.default(name),
+        "values": parameter.range,
+        "unit": parameter.unit,
+        "sets": list(parameter.sets),
+        "description": parameter.description,
+    }
+
+
+def _scene(name: str) -> tuple[Scene, dict[str, bytes]]:
+    """Return a built-in scene, or that of a file, and the files that it names by digest."""
+    if name in scene_names() and not Path(name).exists():
+        return load_scene(name), {}
+    return read_scene(Path(name))
+
+
+def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
+    """Return the spec of one sample of a scene: its default parameters, seen by its first camera."""
+    cameras = scene.looks.cameras
+    rig = [camera.name for camera in load_rig(cameras)] if isinstance(cameras, str) else FRAMING
+    spec = job_spec_adapter.validate_python(
+        {
+            "kind": "cloth_scene",
+            "scene": scene.model_dump(mode="json"),
+            "frames": min(30, scene.frames),
+            "allow_uncertified": allow_uncertified,
+            "axes": {"texture": "checker", "viewpoint": next(iter(cameras if isinstance(cameras, dict) else rig))},
+        }
+    )
+    assert isinstance(spec, ClothSceneSpec)
+    return spec

@@ -10,36 +10,20 @@ import yaml
 from pydantic import ValidationError
 from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.files import MAX_DOCUMENT_BYTES, UnfitFileError, frames_of, inlined
+from stickslip_schemas.scene.library import parse_yaml
+from stickslip_schemas.spec.fabrics import MATERIAL_NAME
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.scene_file import SceneFile
 
 from stickslip_services.errors import CommandError
+
+SCENE_SUFFIXES = (".yaml", ".yml", ".json")
+"""Of a `scene` that is a file; other names are those of built-in scenes."""
 
 
 class SpecFileError(CommandError):
     """The file holds no valid spec or scene."""
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML in which `1e-3` is a number and a repeated key is an error."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no word", key_node.start_mark)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is there twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
 
 
 def read_spec(path: Path) -> dict[str, Any]:
@@ -51,7 +35,7 @@ def read_spec(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise SpecFileError(f"{path} cannot be read: {error}") from error
     try:
-        document = json.loads(text) if path.suffix == ".json" else yaml.load(text, _Loader)
+        document = json.loads(text) if path.suffix == ".json" else parse_yaml(text)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise SpecFileError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
     if not isinstance(document, dict):
@@ -60,20 +44,66 @@ def read_spec(path: Path) -> dict[str, Any]:
     return document
 
 
+def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Return the document of a spec file, and the files by digest that its scene names.
+
+    A scene that is a file, or that names files, becomes a document with references by digest.
+
+    Raises:
+        SpecFileError: It is no document, or the scene breaks a rule.
+    """
+    document = read_spec(path)
+    scene = document.get("scene")
+    if isinstance(scene, dict):
+        made, files = _inlined(scene, path)
+    elif isinstance(scene, str) and Path(scene).suffix in SCENE_SUFFIXES:
+        made, files = read_scene(path.parent / scene)
+    else:
+        return document, {}
+    return document | {"scene": made.model_dump(mode="json")}, files
+
+
+def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
+    """Return the scene of a file, with references by digest, and the files by digest that it names.
+
+    Raises:
+        SpecFileError: It is no document, or breaks a rule.
+    """
+    return _inlined({"name": _name(path), **read_spec(path)}, path)
+
+
+def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
+    if (length := len(json.dumps(document))) > MAX_DOCUMENT_BYTES:
+        raise SpecFileError(f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has {length}")
+    try:
+        scene = Scene.model_validate(document)
+    except ValidationError as error:
+        raise _not_valid(error, document, Scene, path) from error
+
+    def read(name: str) -> bytes:
+        place = (path.parent / name).resolve()
+        if not place.is_relative_to(path.parent.resolve()):
+            raise UnfitFileError("must be in the folder of the scene, and a link leads out of it")
+        return frames_of(sorted(place.glob("*.obj")), scene, name) if place.is_dir() else place.read_bytes()
+
+    try:
+        return inlined(scene, read)
+    except UnfitFileError as error:
+        raise SpecFileError(f"{path} is not valid\n  {error}") from error
+    except OSError as error:
+        raise SpecFileError(f"{path} names a file that cannot be read: {error}") from error
+
+
+def _name(path: Path) -> str | None:
+    return path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
+
+
 def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
     """Return the spec of a document; raise SpecFileError with all fields that break a rule."""
     try:
         return job_spec_adapter.validate_python(document)
     except ValidationError as error:
         raise _not_valid(error, document, AnyJobSpec, path) from error
-
-
-def check_scene(document: dict[str, Any], path: Path) -> SceneFile:
-    """Return the scene of a document; raise SpecFileError with all fields that break a rule."""
-    try:
-        return SceneFile.model_validate(document)
-    except ValidationError as error:
-        raise _not_valid(error, document, SceneFile, path) from error
 
 
 def _not_valid(error: ValidationError, document: dict[str, Any], model: Any, path: Path) -> SpecFileError:

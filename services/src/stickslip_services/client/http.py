@@ -20,6 +20,7 @@ from stickslip_schemas.documents.responses import (
     DatasetPublishedEvent,
     DatasetVersion,
     EventName,
+    FileUpload,
     Job,
     JobDetail,
     JobProgressEvent,
@@ -124,6 +125,11 @@ class Client:
         """Upload a PNG or JPEG file as a texture, which specs name under `textures`."""
         media_type = "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
         return self._call(TextureEntry, "POST", "/v1/textures", content=picture, headers={"Content-Type": media_type})
+
+    def upload_file(self, data: bytes) -> FileUpload:
+        """Upload a file that the document of a scene names."""
+        octets = {"Content-Type": "application/octet-stream"}
+        return self._call(FileUpload, "POST", "/v1/files", content=data, headers=octets)
 
     def job(self, job_id: str) -> JobDetail:
         """Return a job."""

@@ -14,7 +14,7 @@ from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.access.audit_log import note
 from stickslip_services.access.projects import check_quota, this_project
-from stickslip_services.catalog.textures import check_textures
+from stickslip_services.catalog.uploads import check_files
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import dataset_versions, idempotency_keys, jobs, tasks
 from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
@@ -54,10 +54,10 @@ def submit_job(
 
     All spans of the job have one parent, which is a child of `traceparent`, the span of the request.
 
-    Raises UnknownTextureError, QuotaExceededError, KindNotAvailableError, PresetNotCertifiedError, or
+    Raises UnknownFileError, QuotaExceededError, KindNotAvailableError, PresetNotCertifiedError, or
     IdempotencyKeyReusedError.
     """
-    check_textures(context.store, spec)
+    check_files(context.store, spec)
     with collector_at_rest(), tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count):
         answer = _submit(context, spec, idempotency_key, priority, tracing.traceparent())
         tracing.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
@@ -142,9 +142,9 @@ def fingerprint(spec: JobSpec) -> str:
 def validate_spec(context: Context, spec: JobSpec) -> Validation:
     """Return counts and sizes of a job of `spec`, and why it would be refused, if so, without making one.
 
-    Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises UnknownTextureError.
+    Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises UnknownFileError.
     """
-    check_textures(context.store, spec)
+    check_files(context.store, spec)
     database = context.database
     counts = count(spec)
     raw = bytes_estimate(spec)

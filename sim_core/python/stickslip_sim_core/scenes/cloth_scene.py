@@ -224,7 +224,15 @@ def _labels(run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Fl
 
 
 def _simulate(simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None) -> list[Outcome]:
-    return [scene(one["scene"], seed=one["seed"]).outcome(on_frame) for one in simulations]
+    return [_outcome(one, on_frame) for one in simulations]
+
+
+def _outcome(one: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
+    """Return the outcome of one simulation; values that do not fit together are a reason to reject it."""
+    try:
+        return scene(one["scene"], seed=one["seed"]).outcome(on_frame)
+    except ValueError as error:
+        return Outcome(reason=str(error))
 
 
 KIND = Kind(_simulate, "stickslip_sim_core.cloth", kernel=kernel_level)

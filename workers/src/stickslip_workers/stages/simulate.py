@@ -1,9 +1,12 @@
 """Simulate: from the physics of simulations to their records, for every kind."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from stickslip_schemas.base.keys import ARTIFACT
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import RecordRef, SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.store import Store
@@ -28,7 +31,10 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
     made = kind(names[0])
     simulations = [task.simulation.model_dump(mode="json", exclude={"kind"}) for task in tasks]
-    outcomes = made.simulate(simulations, note)
+    with TemporaryDirectory(prefix="stickslip-files-") as folder:
+        named = {digest for task in tasks for digest in task.simulation.artifacts}
+        files = {f"{ARTIFACT}{digest}": _local(digest, store, Path(folder)) for digest in sorted(named)}
+        outcomes = made.simulate([_with_files(physics, files) for physics in simulations], note)
     records = _stored(outcomes, made.batch, store)
     return [
         _rejection(physics, outcome.reason)
@@ -36,6 +42,24 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
         else TaskResult(outcome="succeeded", output=SimulateOutput(record=records[number], labels=dict(outcome.labels)))
         for number, (physics, outcome) in enumerate(zip(simulations, outcomes, strict=True))
     ]
+
+
+def _local(digest: str, store: Store, folder: Path) -> str:
+    """Copy an artifact into a folder; return its path, whose suffix tells what it holds."""
+    data = store.read(digest)
+    suffix = "npz" if data.startswith(b"PK") else "csv" if data.startswith(b"time") else "obj"
+    path = folder / f"{digest}.{suffix}"
+    path.write_bytes(data)
+    return str(path)
+
+
+def _with_files(value: Any, files: Mapping[str, str]) -> Any:
+    """Return JSON in which paths stand for references to artifacts."""
+    if isinstance(value, dict):
+        return {name: _with_files(item, files) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_with_files(item, files) for item in value]
+    return files.get(value, value) if isinstance(value, str) else value
 
 
 def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:

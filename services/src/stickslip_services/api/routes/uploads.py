@@ -1,4 +1,4 @@
-"""Upload of textures."""
+"""Upload of textures, and of files of scenes."""
 
 from typing import Any
 
@@ -6,14 +6,15 @@ from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 from stickslip_schemas.documents.problems import FieldError, ProblemCode
-from stickslip_schemas.documents.responses import TextureEntry
+from stickslip_schemas.documents.responses import FileUpload, TextureEntry
 from stickslip_schemas.format.pictures import UnfitPictureError
+from stickslip_schemas.scene.files import UnfitFileError
 
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, problem_responses
-from stickslip_services.catalog.textures import store_texture
+from stickslip_services.catalog.uploads import store_file, store_texture
 
-router = APIRouter(tags=["textures"])
+router = APIRouter(tags=["uploads"])
 
 MEDIA_TYPES = {"image/png": b"\x89PNG", "image/jpeg": b"\xff\xd8\xff"}
 """Accepted media types, and the first bytes of such files."""
@@ -32,10 +33,7 @@ async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
     if media_type not in MEDIA_TYPES:
         detail = f"Content-Type must be {' or '.join(MEDIA_TYPES)}, and it is {media_type[:100]!r}"
         raise ProblemError(415, ProblemCode.malformed_body, detail)
-    try:
-        data = await request.body()
-    except ClientDisconnect as error:
-        raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+    data = await _body(request)
     try:
         if not data.startswith(MEDIA_TYPES[media_type]):
             raise UnfitPictureError(
@@ -43,5 +41,34 @@ async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
             )
         return await run_in_threadpool(store_texture, context.store, data)
     except UnfitPictureError as error:
-        field = FieldError(pointer="", rule=str(error), value=f'"{len(data)} bytes"')
-        raise ProblemError(422, ProblemCode.validation_failed, str(error), fields=[field]) from error
+        raise _refused(error, data) from error
+
+
+@router.post(
+    "/v1/files",
+    status_code=201,
+    responses=problem_responses(*BODY_PROBLEMS),
+    openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": _PICTURE}}},
+)
+async def post_file(request: Request, context: ContextDep) -> FileUpload:
+    """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ), of at most 16 MiB.
+
+    A file that no job names is deleted by `stickslip gc` after a day.
+    """
+    data = await _body(request)
+    try:
+        return await run_in_threadpool(store_file, context.store, data)
+    except UnfitFileError as error:
+        raise _refused(error, data) from error
+
+
+async def _body(request: Request) -> bytes:
+    try:
+        return await request.body()
+    except ClientDisconnect as error:
+        raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+
+
+def _refused(error: Exception, data: bytes) -> ProblemError:
+    field = FieldError(pointer="", rule=str(error), value=f'"{len(data)} bytes"')
+    return ProblemError(422, ProblemCode.validation_failed, str(error), fields=[field])
