@@ -1,0 +1,169 @@
+"""Bodies that are small against a cell: they carry cloth, nothing jumps over them, and friction on them is right."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from stickslip_sim_core import Body, Cloth, SelfContact, box, capsule, cylinder, fabric, plane, preset_named, sphere
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.solver import GRAVITY
+
+CELL = 0.01
+SHEET = meshes.grid(0.1, 0.1, 10, 10)
+FABRIC = fabric("gray-interlock")
+FLOOR = plane(0.5, origin=(0.0, 0.0, -0.2))
+
+
+def turned(angle: float) -> Floats:
+    """Return a turn about y [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def started(height: float, bodies: Sequence[Body] = (), mesh: meshes.Mesh = SHEET) -> Cloth:
+    cloth = Cloth(mesh, FABRIC, preset_named("certified"))
+    cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), height)]), bodies=bodies)
+    return cloth
+
+
+def weight(cloth: Cloth) -> float:
+    return float(cloth.masses.sum() * GRAVITY)
+
+
+@pytest.mark.physics
+class TestCarries:
+    @pytest.mark.parametrize("cells", [0.3, 0.5, 1.0, 1.8])
+    @pytest.mark.parametrize(
+        "body",
+        [
+            lambda r: cylinder(0.5, r, origin=(0.0, 0.003, 0.0), rotation=turned(np.pi / 2)),
+            lambda r: sphere(0.5, r),
+            lambda r: capsule(0.5, r, 0.2, origin=(0.001, 0.002, -0.1)),
+        ],
+        ids=["rod", "ball", "pillar"],
+    )
+    def test_what_is_small_against_a_cell(self, body: Callable[[float], Body], cells: float) -> None:
+        bodies = [FLOOR, body(cells * CELL)]
+        cloth = started(cells * CELL + 0.002, bodies)
+        force = 0.0
+        for step in range(30):
+            cloth.step(0.01, bodies=bodies, damping=5.0 if step < 29 else 0.0)
+            force += float(cloth.body_forces(2)[1, 2]) / 10.0 if step >= 20 else 0.0
+        assert force == pytest.approx(weight(cloth), rel=0.1)
+        assert cloth.contact_force() == pytest.approx(cloth.body_forces(2).sum(axis=0), abs=2e-3 * weight(cloth))
+        assert cloth.positions[:, 2].max() == pytest.approx(cells * CELL, abs=0.4 * CELL)
+        assert cloth.sharpest == pytest.approx(cells, rel=1e-3)
+        assert cloth.unconverged_steps <= 1
+
+    def test_a_blade_lifts(self) -> None:
+        blade = [box(0.5, (0.3, 0.002, 0.05), origin=(0.0, 0.0, -0.025))]
+        cloth = started(0.003, blade)
+        for step in range(1, 31):
+            up = [box(0.5, (0.3, 0.002, 0.05), origin=(0.0, 0.0, -0.025 + 0.002 * step))]
+            cloth.step(0.01, bodies=up, damping=5.0)
+        assert cloth.positions[:, 2].max() > 0.06 - 1e-4
+
+    def test_large_bodies_need_no_pairs(self) -> None:
+        cloth = started(0.052, [sphere(0.5, 0.05)])
+        for _ in range(10):
+            cloth.step(0.01, bodies=[sphere(0.5, 0.05)])
+        assert (cloth.contacts == 0).any()
+        assert cloth.sharpest == np.inf
+        assert not len(cloth.pair_forces.forces)
+
+
+@pytest.mark.physics
+class TestSweeps:
+    @pytest.mark.parametrize("speed", [1.0, 10.0])
+    def test_a_ball_takes_the_cloth_along(self, speed: float) -> None:
+        """The middle of the ball stays below the cloth that lay above it, whatever the step."""
+        radius = CELL
+
+        def ball(time: float) -> list[Body]:
+            return [sphere(0.5, radius, origin=(0.001, 0.002, -0.02 + speed * time))]
+
+        cloth, dt = started(0.0, ball(0.0)), 0.05 / speed / 3.0
+        for step in range(1, 7):
+            cloth.step(dt, bodies=ball(step * dt))
+        top = ball(6 * dt)[0].origin[2] + radius
+        middle = np.linalg.norm(SHEET.rest, axis=1).argmin()
+        assert cloth.positions[middle, 2] > top - 0.1 * CELL
+
+    def test_a_paddle(self) -> None:
+        """A plate 0.4 cells thick turns upward at 20 rad/s: all that it sweeps stays on its upper side."""
+
+        def paddle(time: float) -> list[Body]:
+            turn = turned(-20.0 * time)
+            return [box(0.5, (0.2, 0.2, 0.004), origin=turn @ [0.1, 0.0, 0.0], rotation=turn)]
+
+        cloth = started(0.004, paddle(0.0))
+        for step in range(1, 13):
+            cloth.step(0.005, bodies=paddle(0.005 * step))
+        local = (cloth.positions - paddle(0.06)[0].origin) @ paddle(0.06)[0].rotation
+        within = np.abs(local[:, 0]) < 0.1
+        assert within.any()
+        assert local[within, 2].min() > 0.0
+
+
+@pytest.mark.physics
+class TestFriction:
+    def test_a_turning_rod_drags_by_its_surface(self) -> None:
+        """A strip over a rod that turns is pulled by the capstan's forces, the other way with the other turn. Its
+        upper side goes to -y where it turns about x."""
+        mesh = meshes.grid(0.02, 0.16, 2, 16)
+        ends = np.flatnonzero(np.abs(mesh.rest[:, 1]) > 0.08 - 1e-9)
+        mu, radius = 0.2, 0.8 * CELL
+        pulls = []
+        for speed in (3.0, -3.0):
+
+            def rod(time: float, speed: float = speed) -> list[Body]:
+                return [cylinder(mu, radius, rotation=_about_x(speed * time) @ turned(np.pi / 2))]
+
+            cloth = Cloth(mesh, FABRIC, preset_named("certified"), held=ends, self_contact=SelfContact(0.3))
+            angle = np.arctan2(0.04, 0.06)
+            at = np.column_stack([mesh.rest[:, 0], mesh.rest[:, 1], np.full(len(mesh.rest), radius + 1e-4)])
+            cloth.set_state(at, bodies=rod(0.0))
+            down = at[ends].copy()
+            for step in range(1, 121):
+                share = min(1.0, step / 60.0)
+                way = share * angle
+                down[:, 1] = np.sign(at[ends, 1]) * 0.082 * np.cos(way)
+                down[:, 2] = radius - 0.082 * np.sin(way)
+                cloth.step(0.01, held=down, bodies=rod(0.01 * step), damping=2.0)
+            along = np.stack([np.cos(angle) * np.sign(at[ends, 1]), -np.sin(angle) * np.ones(len(ends))], axis=1)
+            tension = (cloth.reactions[ends][:, 1:] * along).sum(axis=1)
+            pulls.append([tension[at[ends, 1] > 0].sum(), tension[at[ends, 1] < 0].sum()])
+        first, second = np.array(pulls)
+        assert first[0] / first[1] == pytest.approx(np.exp(2.0 * mu * angle), rel=0.1)
+        assert second[0] / second[1] == pytest.approx(np.exp(-2.0 * mu * angle), rel=0.1)
+
+    def test_a_rolling_ball_does_not_slip(self) -> None:
+        """A ball that rolls under a patch at twice the speed of its middle takes it along without sliding."""
+        radius, speed = 1.5 * CELL, 0.02
+
+        def ball(time: float) -> list[Body]:
+            return [sphere(1.0, radius, origin=(speed * time, 0.0, 0.0), rotation=turned(speed * time / radius))]
+
+        mesh = meshes.grid(0.06, 0.06, 6, 6)
+        cloth = started(radius + 1e-4, ball(0.0), mesh)
+        for _ in range(30):
+            cloth.step(0.01, bodies=ball(0.0), damping=10.0)
+        before = cloth.positions.copy()
+        for step in range(1, 31):
+            cloth.step(0.01, bodies=ball(0.01 * step), damping=0.0)
+        moved = cloth.positions - before
+        middle = np.linalg.norm(mesh.rest, axis=1).argmin()
+        assert moved[middle, 0] == pytest.approx(2.0 * speed * 0.3, rel=0.1)
+
+
+def _about_x(angle: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def test_bodies_keep_their_shapes() -> None:
+    cloth = started(0.1, [sphere(0.5, 0.01)])
+    with pytest.raises(ValueError, match="bodies: must keep their shapes and friction, and body 0 does not"):
+        cloth.step(0.01, bodies=[sphere(0.5, 0.02)])
