@@ -108,9 +108,27 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
         case "enum" | "literal_error":
             known = re.findall(r"'([^']*)'", item["ctx"]["expected"])
             rule = f"must be one of {', '.join(known)}" + (did_you_mean(value, known) if isinstance(value, str) else "")
+    if item["type"] in _OF_NUMBERS:
+        rule += _unit_at(of, location)
     return FieldError(
-        pointer=_pointer(location, document, missing=is_missing), rule=rule, value="" if is_missing else _shown(value)
+        pointer=_pointer(location, document, missing=is_missing or item["type"] == "broken_rule"),
+        rule=rule,
+        value="" if is_missing else _shown(value),
     )
+
+
+_OF_NUMBERS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_type", "finite_number")
+
+
+def _unit_at(of: Any, location: Sequence[int | str]) -> str:
+    """Return ` [unit]` of the number at a place, from the description of its field; nothing where it has none."""
+    names = [place for place, part in enumerate(location) if isinstance(part, str)]
+    for place in reversed(names):
+        for model in _models_at(of, location[:place]):
+            if (field := model.model_fields.get(str(location[place]))) is not None:
+                unit = re.search(r"\[([^\]]+)\]", field.description or "")
+                return f" [{unit[1]}]" if unit else ""
+    return ""
 
 
 def _models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:

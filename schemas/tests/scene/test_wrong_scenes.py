@@ -1,0 +1,211 @@
+"""Wrong scenes: each is refused with the path, the rule, the value and, of a number, the unit."""
+
+from copy import deepcopy
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+from stickslip_schemas.documents.problems import field_errors
+from stickslip_schemas.scene.document import Scene
+
+DIGEST = f"sha256:{'a' * 64}"
+SCENE: dict[str, Any] = {
+    "format": "stickslip-scene/1",
+    "duration": 2.0,
+    "bias": {"size": 0.001, "until": 1.0},
+    "calm": {"until": 1.0, "rate": 2.0},
+    "materials": {"felt": {"density": 0.3, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}},
+    "parameters": {
+        "mu": {"low": 0, "high": 2, "sets": ["friction.ball.lower"]},
+        "fabric": {"sets": ["sheets.lower.material"]},
+        "speed": {"unit": "rad/s", "low": -5, "high": 5, "sets": ["bodies.ball.motion.spin.speed"]},
+    },
+    "sheets": {
+        "lower": {
+            "material": "gray-interlock",
+            "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [8, 4]},
+            "origin": [0, 0, 0.01],
+            "start": {"type": "stretched", "strain": [0.01, 0.02]},
+            "holders": {"rim": {"rim": True, "grasp": [0.0, 1.0]}},
+        },
+        "upper": {
+            "material": "felt",
+            "mesh": {"type": "unstructured", "size": [0.1, 0.1], "spacing": 0.02},
+            "origin": [0, 0, 0.02],
+            "holders": {
+                "hand": {
+                    "low": [-0.05, -0.05],
+                    "high": [0.0, 0.05],
+                    "motion": {"keys": [{"time": 0}, {"time": 1, "move": [0, 0, 0.1]}]},
+                }
+            },
+        },
+        "towel": {"material": "felt", "mesh": {"type": "file", "file": DIGEST, "counts": [9, 8]}},
+    },
+    "bodies": {
+        "floor": {"type": "plane"},
+        "ball": {
+            "type": "sphere",
+            "radius": 0.05,
+            "origin": [0, 0, 0.5],
+            "motion": {"spin": {"speed": 1.0, "begin": 0.5, "ramp": 0.5}},
+        },
+        "rod": {"type": "capsule", "radius": 0.01, "length": 0.2, "origin": [0, 0, 0.9]},
+        "block": {"type": "box", "size": [0.1, 0.1, 0.02], "rounding": 0.005, "origin": [1, 0, 0]},
+        "actor": {"type": "mesh", "file": "actor.npz", "strength": 1.0},
+    },
+    "friction": [{"between": ["lower", "ball"], "mu": 0.5}, {"between": ["upper", "lower"], "mu": 0.2}],
+    "default_friction": 0.4,
+    "looks": {
+        "sheets": {"upper": {"texture": "plaid"}},
+        "bodies": {"ball": {"color": [1, 0, 0], "roughness": 0.2}},
+        "cameras": {"door": {"position": [1, 1, 1], "target": [0, 0, 0], "focal_length": 50}},
+    },
+}
+
+GONE = object()
+NAN, FAR = float("nan"), 1000.0
+UPPER, LOWER, BALL = "sheets.upper", "sheets.lower", "bodies.ball"
+SPIN, KEYS = f"{BALL}.motion.spin", f"{UPPER}.holders.hand.motion.keys"
+
+# Where, what stands there, the place that the answer names (empty: the same), a part of the rule with its unit.
+WRONG: list[tuple[str, Any, str, str]] = [
+    ("format", "stickslip-scene/2", "", "must be one of stickslip-scene/1"),
+    ("format", GONE, "", "this field is required"),
+    ("sheets", GONE, "", "this field is required"),
+    ("sheets", {}, "", "must have at least 1 item"),
+    ("gravty", [0, 0, 0], "", "did you mean gravity"),
+    ("duration", -1.0, "", "greater than 0 [s]"),
+    ("duration", NAN, "", "finite number [s]"),
+    ("duration", "2 s", "", "valid number [s]"),
+    ("duration", GONE, "", "one of duration [s] and end must be given"),
+    ("end", {"when": "rest", "at_most": 3.0}, "duration", "and not both"),
+    ("duration", 9999.0, "frame_rate", "length [s] times frame_rate [1/s] must be at most 10000 frames"),
+    ("frame_rate", 0, "", "greater than 0"),
+    ("gravity", [0, 0, -FAR], "gravity.2", "greater than or equal to -100 [m/s^2]"),
+    ("gravity", [0, -9.81], "gravity.2", "this field is required"),
+    ("preset", "quick", "", "must be one of certified"),
+    ("bearing", "second", "", "must be one of all"),
+    ("bias.size", -0.1, "", "greater than or equal to 0"),
+    ("bias.until", -1.0, "", "greater than or equal to 0 [s]"),
+    ("calm.rate", 1e4, "", "less than or equal to 1000 [1/s]"),
+    ("materials.felt.density", 9.0, "", "less than or equal to 5 [kg/m^2]"),
+    ("materials.gray-interlock", {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}, "", "redefine"),
+    ("materials.Felt", {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}, "", "pattern"),
+    (f"{UPPER}.material", "fellt", "", "did you mean felt"),
+    (f"{UPPER}.origin", [0, 0, FAR], f"{UPPER}.origin.2", "less than or equal to 100 [m]"),
+    (f"{UPPER}.turn", [0, 0, 2000.0], f"{UPPER}.turn.2", "less than or equal to 1000 [rad]"),
+    (f"{UPPER}.thickness", 0.0, "", "greater than or equal to 0.00001 [m]"),
+    (f"{UPPER}.self_contact", False, "", "must be true where there are several sheets"),
+    (f"{UPPER}.factors", {"density": 0.01}, f"{UPPER}.factors.density", "greater than or equal to 0.1"),
+    (f"{UPPER}.mesh", {"type": "hexagons"}, f"{UPPER}.mesh.type", "must be one of"),
+    (f"{UPPER}.mesh.spacing", -0.02, "", "greater than 0 [m]"),
+    (f"{UPPER}.mesh.spacing", 1e-5, "sheets", "at most 100000 vertices"),
+    (f"{LOWER}.mesh.cells", [0, 4], f"{LOWER}.mesh.cells.0", "greater than or equal to 1"),
+    (f"{LOWER}.mesh.cells", [8.5, 4], f"{LOWER}.mesh.cells.0", "integer"),
+    (f"{LOWER}.mesh.size", [0.2, FAR], f"{LOWER}.mesh.size.1", "less than or equal to 100 [m]"),
+    (f"{LOWER}.start", {"type": "hung", "bias_until": -1}, f"{LOWER}.start.bias_until", "[s]"),
+    (f"{LOWER}.start.strain", [0.5, 0.0], f"{LOWER}.start.strain.0", "less than or equal to 0.2"),
+    (f"{LOWER}.start", {"type": "file"}, LOWER, "start.file must name a file"),
+    ("sheets.towel.start", {"type": "hung"}, "sheets.towel", "can be hung only from holders"),
+    ("sheets.towel.start", {"type": "file", "file": "/etc/passwd"}, "sheets.towel.start.file", "in the folder"),
+    ("sheets.towel.mesh.file", "../towel.obj", "", "in the folder of the scene"),
+    ("sheets.towel.mesh.file", "sha256:12", "", "64 hexadecimal digits"),
+    ("sheets.towel.mesh.file", "https://example.org/towel.obj", "", "in the folder of the scene"),
+    (f"{LOWER}.holders.rim.low", [0, 0], f"{LOWER}.holders.rim", "one of low and high, edge, rim and vertices"),
+    (f"{LOWER}.holders.rim.rim", GONE, f"{LOWER}.holders.rim", "and it has none"),
+    (f"{LOWER}.holders.rim.grasp", [1.0, 0.5], f"{LOWER}.holders.rim", "ascending order [s]"),
+    (f"{LOWER}.holders.rim", {"vertices": [3, 45]}, f"{LOWER}.holders.rim.vertices.1", "a vertex of the sheet"),
+    (f"{LOWER}.holders.rim", {"edge": "north"}, f"{LOWER}.holders.rim.edge", "must be one of left"),
+    (f"{UPPER}.holders.hand.high", GONE, f"{UPPER}.holders.hand", "low and high must both be given"),
+    (f"{UPPER}.holders.hand.high", [-0.06, 0.05], f"{UPPER}.holders.hand", "low must be at most high in both [m]"),
+    (f"{KEYS}.1.time", 0.0, f"{UPPER}.holders.hand.motion", "keys must ascend in time, and 0 s comes after 0 s"),
+    (f"{KEYS}.0.time", -1.0, "", "greater than or equal to 0 [s]"),
+    (f"{KEYS}.1.move", [0, 0, FAR], f"{KEYS}.1.move.2", "less than or equal to 100 [m]"),
+    (KEYS, [], "", "must have at least 1 item"),
+    (f"{UPPER}.holders.hand.motion.path", "way.csv", f"{UPPER}.holders.hand.motion", "one of keys, spin and path"),
+    (f"{UPPER}.holders.hand.motion.ramp", 0.1, f"{UPPER}.holders.hand.motion", "motion is not linear; ramp is 0.1 s"),
+    (f"{UPPER}.holders.hand.motion.interpolation", "cubic", "", "must be one of smooth"),
+    (f"{SPIN}.axis", [0, 0, 0], SPIN, "axis must not be 0"),
+    (f"{SPIN}.speed", 2000.0, "", "less than or equal to 1000 [rad/s]"),
+    (f"{SPIN}.begin", -1.0, "", "greater than or equal to 0 [s]"),
+    (f"{BALL}.radius", 0.0, "", "greater than 0 [m]"),
+    (f"{BALL}.type", "ball", "", "must be one of plane"),
+    (f"{BALL}.origin", GONE, "", "this field is required"),
+    (f"{BALL}.size", [1, 1, 1], "", "there is no such field"),
+    ("bodies.floor.normal", [0, 0, 0], "bodies.floor", "normal must not be 0"),
+    ("bodies.rod.length", -0.2, "", "greater than 0 [m]"),
+    ("bodies.block.rounding", 0.02, "bodies.block", "at most half the least of size, 0.01 m"),
+    ("bodies.actor.strength", 3.0, "", "less than or equal to 2"),
+    ("bodies.actor.file", "a\\b.obj", "", "in the folder of the scene"),
+    ("bodies.actor.frame_rate", -1.0, "", "greater than 0 [1/s]"),
+    ("bodies.upper", {"type": "plane"}, "", "names of their own"),
+    ("friction.0.mu", 11.0, "", "less than or equal to 10"),
+    ("friction.0.between", ["ball", "floor"], "", "must name two that may touch"),
+    ("friction.1.between", ["ball", "lower"], "", "must name two once"),
+    ("default_friction", GONE, "friction", "missing: actor with lower"),
+    ("looks.sheets.napkin", {"texture": "dots"}, "", "must be one of lower"),
+    ("looks.bodies.bal", {"roughness": 0.5}, "", "did you mean ball"),
+    ("looks.bodies.ball.color", [2, 0, 0], "looks.bodies.ball.color.0", "less than or equal to 1"),
+    ("looks.cameras.door.position", [9, 1, 1], "looks.cameras.door", "within 4 m of the middle"),
+    ("looks.cameras.door.focal_length", 5.0, "", "greater than or equal to 10 [mm]"),
+    ("looks.cameras.door.target", [1, 1, 0], "looks.cameras.door", "straight above or below"),
+    ("looks.cameras", "drags", "looks.cameras", "did you mean drag"),
+    ("parameters.mu.sets", ["friction.ball.uper"], "parameters.mu.sets.0", "no pair of ball and uper"),
+    ("parameters.mu.high", 20.0, "", "friction.0.mu: Input should be less than or equal to 10"),
+    ("parameters.mu.low", 3.0, "", "low below high"),
+    ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2 [1]"),
+    ("parameters.speed.low", GONE, "", "low and high [rad/s] must be given"),
+    ("parameters.speed.sets", [f"{SPIN}.sped"], "parameters.speed.sets.0", "did you mean speed"),
+    ("parameters.fabric.low", 1.0, "", "for numbers without a list of values"),
+    ("parameters.fabric.values", ["silk"], "parameters.fabric.sets.0", "default within silk"),
+    ("parameters.texture", {"sets": [f"{UPPER}.material"]}, "", "name of an axis of all scenes"),
+    ("parameters.n", {"low": 1, "high": 9, "sets": [f"{LOWER}.mesh.cells.0"]}, "parameters.n.sets.0", "shapes of"),
+    ("parameters.t", {"low": 1, "high": 9, "sets": ["duration"]}, "parameters.t.sets.0", "shapes of arrays"),
+    ("parameters.f", {"sets": ["bodies.actor.file"]}, "parameters.f.sets.0", "must lead to a number or a material"),
+    ("parameters.two", {"low": 0, "high": 1, "sets": ["friction.lower.ball"]}, "parameters.two.sets.0", "where 'mu'"),
+    (
+        "parameters.both",
+        {"low": 0, "high": 1, "sets": ["bias.size", "bias.until"]},
+        "parameters.both.sets",
+        "must find one value",
+    ),
+]
+
+
+def changed(place: str, value: Any) -> dict[str, Any]:
+    """Return the scene with another value at a place: keys and positions, with points between."""
+    scene = deepcopy(SCENE)
+    *path, last = place.split(".")
+    at: Any = scene
+    for step in path:
+        at = at[int(step)] if isinstance(at, list) else at[step]
+    if value is GONE:
+        del at[last]
+    elif isinstance(at, list):
+        at[int(last)] = value
+    else:
+        at[last] = value
+    return scene
+
+
+def test_the_scene_itself_is_right() -> None:
+    scene = Scene.model_validate(SCENE)
+    assert list(scene.sheets) == ["lower", "towel", "upper"]
+    assert Scene.model_validate_json(scene.model_dump_json()) == scene
+
+
+def test_there_are_eighty() -> None:
+    assert len(WRONG) >= 80
+
+
+@pytest.mark.parametrize(("place", "value", "said", "rule"), WRONG, ids=lambda part: str(part)[:40])
+def test_a_wrong_scene_is_refused(place: str, value: Any, said: str, rule: str) -> None:
+    document = changed(place, value)
+    with pytest.raises(ValidationError) as caught:
+        Scene.model_validate(document)
+    errors = field_errors(caught.value, document, Scene)
+    found = [error for error in errors if error.pointer == "/" + (said or place).replace(".", "/")]
+    assert found, errors
+    assert rule in found[0].rule
+    assert found[0].value or "required" in rule
