@@ -55,6 +55,12 @@ def main(arguments: list[str] | None = None) -> int:
         "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
     )
 
+    drawn = commands.add_parser("preview", help="draw a scene, as `stickslip scene preview` hands it over")
+    drawn.add_argument("scene", type=Path, help="the scene as JSON")
+    drawn.add_argument("--store", type=_store, required=True, help="directory of the store with its files")
+    drawn.add_argument("--out", type=Path, required=True, help="directory for the pictures")
+    drawn.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+
     commands.add_parser("describe", help="print the builds of this environment")
 
     options = parser.parse_args(arguments)
@@ -67,6 +73,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _replay(options)
     if options.command == "certify":
         return _certify(options)
+    if options.command == "preview":
+        return _preview(options)
     from stickslip_workers.stages.run import StageActor
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")
@@ -221,6 +229,22 @@ def _certify(options: argparse.Namespace) -> int:
         return 2
     sys.stdout.write(certificate.digest + "\n")
     return 0 if certificate.passed else 1
+
+
+def _preview(options: argparse.Namespace) -> int:
+    """Return 0 if the scene was drawn, and 2 if not."""
+    from stickslip_schemas.scene.document import Scene
+
+    from stickslip_workers.preview import preview
+
+    try:
+        scene = Scene.model_validate_json(options.scene.read_bytes())
+        names = preview(scene, open_store(options.store), options.out, options.blender_python.absolute())
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    sys.stdout.write(json.dumps({"pictures": names}) + "\n")
+    return 0
 
 
 if __name__ == "__main__":

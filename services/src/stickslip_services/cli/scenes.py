@@ -103,6 +103,24 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
     return None
 
 
+@app.command()
+@shows_errors
+def preview(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="a directory for the pictures")],
+    as_json: JsonOption = False,
+) -> None:
+    """Draw how a scene starts and what moves in it, from all its cameras. Nothing is simulated.
+
+    Writes CAMERA.png and motion.webp. No coordinator is needed, but the environment of Blender is.
+    """
+    pictures = simulating.preview(*_scene(scene), out)
+    if as_json:
+        typer.echo(json.dumps({"pictures": pictures}))
+    else:
+        say(f"{', '.join(pictures)} in {out}")
+
+
 def _axis(scene: Scene, name: str) -> dict[str, Any]:
     parameter = scene.parameters[name]
     return {

@@ -15,6 +15,7 @@ from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.tasks import SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.plan.grid import grid
+from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.store import open_store
 
@@ -89,6 +90,23 @@ def simulate(
     return said
 
 
+def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
+    """Draw the start and the motions of a scene into a directory; return the names of the pictures.
+
+    Raises:
+        SimulateError: It was not drawn.
+    """
+    with tempfile.TemporaryDirectory(prefix="stickslip-scene-") as temporary:
+        store = open_store(temporary)
+        for data in (*files.values(), *built_in_files().values()):
+            store.publish(data)
+        given = Path(temporary, "scene.json")
+        given.write_text(scene.model_dump_json(), encoding="utf-8")
+        said = _workers(["preview", str(given), "--store", temporary, "--out", str(out)])
+    pictures: list[str] = said["pictures"]
+    return pictures
+
+
 def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build: str) -> str:
     """Return why no certificate vouches for the samples of a spec with a build of the solver, or an empty text."""
     preset = spec.certified_preset
@@ -114,7 +132,7 @@ def _workers(arguments: list[str]) -> dict[str, Any]:
     except OSError as error:
         raise SimulateError(f"the workers' program does not start: {error}") from error
     if ended.returncode not in (0, 1) or not ended.stdout.strip():
-        raise SimulateError("the scene was not simulated; the workers' program says why above")
+        raise SimulateError("nothing was made of the scene; the workers' program says why above")
     answer: dict[str, Any] = json.loads(ended.stdout)
     return answer
 

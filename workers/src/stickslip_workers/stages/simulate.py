@@ -1,6 +1,6 @@
 """Simulate: from the physics of simulations to their records, for every kind."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -33,8 +33,8 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     simulations = [task.simulation.model_dump(mode="json", exclude={"kind"}) for task in tasks]
     with TemporaryDirectory(prefix="stickslip-files-") as folder:
         named = {digest for task in tasks for digest in task.simulation.artifacts}
-        files = {f"{ARTIFACT}{digest}": _local(digest, store, Path(folder)) for digest in sorted(named)}
-        outcomes = made.simulate([_with_files(physics, files) for physics in simulations], note)
+        files = local_files(named, store, Path(folder))
+        outcomes = made.simulate([with_files(physics, files) for physics in simulations], note)
     records = _stored(outcomes, made.batch, store)
     return [
         _rejection(physics, outcome.reason)
@@ -42,6 +42,11 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
         else TaskResult(outcome="succeeded", output=SimulateOutput(record=records[number], labels=dict(outcome.labels)))
         for number, (physics, outcome) in enumerate(zip(simulations, outcomes, strict=True))
     ]
+
+
+def local_files(digests: Iterable[str], store: Store, folder: Path) -> dict[str, str]:
+    """Copy artifacts into a folder; return their paths by reference."""
+    return {f"{ARTIFACT}{digest}": _local(digest, store, folder) for digest in sorted(digests)}
 
 
 def _local(digest: str, store: Store, folder: Path) -> str:
@@ -53,12 +58,12 @@ def _local(digest: str, store: Store, folder: Path) -> str:
     return str(path)
 
 
-def _with_files(value: Any, files: Mapping[str, str]) -> Any:
+def with_files(value: Any, files: Mapping[str, str]) -> Any:
     """Return JSON in which paths stand for references to artifacts."""
     if isinstance(value, dict):
-        return {name: _with_files(item, files) for name, item in value.items()}
+        return {name: with_files(item, files) for name, item in value.items()}
     if isinstance(value, list):
-        return [_with_files(item, files) for item in value]
+        return [with_files(item, files) for item in value]
     return files.get(value, value) if isinstance(value, str) else value
 
 

@@ -1,0 +1,87 @@
+"""A scene before it is simulated: its bodies and holders at all times, handed to the renderer to be drawn."""
+
+import json
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.base.keys import referred
+from stickslip_schemas.kinds.cloth.arrays import scene_segments
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.store import Store
+from stickslip_sim_core.scenes import cloth_scene
+from stickslip_sim_core.scenes.scene import ClothRun
+
+from stickslip_workers.stages.simulate import local_files, with_files
+
+FRAMES = 24
+"""Of the animation."""
+
+
+def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list[str]:
+    """Draw the start and the motions of a scene; return the names of the pictures: of each camera, and an animation.
+
+    Cloth is not simulated: it stays as it starts, but for a sheet that is held from the start, which goes along with
+    its first holder. A sheet that starts hung is drawn flat.
+
+    Args:
+        scene: What to draw.
+        store: Where the files are that it names.
+        out: Directory for the pictures; it is made where it does not exist.
+        blender_python: Interpreter that has stickslip_blender.
+
+    Raises:
+        ValueError: A value breaks its rule; the message begins with its place.
+        OSError: A file cannot be read, or the pictures cannot be written.
+        RuntimeError: The drawing failed.
+    """
+    given = scene.looks.cameras
+    views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
+    cameras = load_rig(given) if isinstance(given, str) else views
+    with TemporaryDirectory(prefix="stickslip-preview-") as folder:
+        named = {digest for _, name in scene.files() if (digest := referred(name))}
+        files = local_files(named, store, Path(folder))
+        request = {
+            "scene": with_files(scene.staged(), files),
+            "sheet": scene.textured,
+            "segments": scene_segments(scene.sheets, scene.bodies),
+            "cameras": [camera.model_dump(mode="json") for camera in cameras],
+        }
+        record, document = Path(folder, "record.npz"), Path(folder, "scene.json")
+        np.savez(record, allow_pickle=False, **_record(scene, with_files(scene.physics(), files)))
+        document.write_text(json.dumps(request), encoding="utf-8")
+        out.mkdir(parents=True, exist_ok=True)
+        command = [str(blender_python), "-m", "stickslip_blender.preview", str(record), str(document), str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"the drawing failed: {done.stderr[-2000:]}")
+    return done.stdout.split()
+
+
+def _record(scene: Scene, document: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of a scene at the times of the animation, with cloth that goes along with its holders."""
+    for sheet in document["sheets"].values():
+        if sheet["start"]["type"] == "hung":
+            sheet["start"] = {"type": "flat"}
+    made = cloth_scene.scene(document)
+    times = np.linspace(0.0, (scene.frames - 1) / scene.frame_rate, FRAMES).tolist()
+    track = np.repeat(made.start[None], FRAMES, axis=0)
+    still = made.arrays(cast(ClothRun, SimpleNamespace(positions=track)))
+    ends = np.cumsum([0, *(len(still[f"{name}.rest"]) for name in sorted(scene.sheets))])
+    for begin, end in pairwise(ends.tolist()):
+        held = [one for one in made.holders if one.grasp[0] == 0.0 and begin <= one.vertices[0] < end]
+        for instant, time in enumerate(times if held else ()):
+            pose = held[0].pose(time)
+            track[instant, begin:end] = made.start[begin:end] @ pose[:, :3].T + pose[:, 3]
+    moved = made.arrays(cast(ClothRun, SimpleNamespace(positions=track)))
+    return {
+        **moved,
+        **made.record,
+        **{name: np.stack([at(time) for time in times]) for name, at in made.tracks.items()},
+    }
