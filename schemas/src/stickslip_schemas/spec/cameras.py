@@ -122,7 +122,7 @@ def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) ->
 
     Args:
         name: One of `FRAMING`.
-        points: What is to be seen, all of the time.
+        points: All that must be in the frame.
         size: Width and height of the frame [px].
         turn: By which it goes around the points, from +x towards +y [degree].
     """

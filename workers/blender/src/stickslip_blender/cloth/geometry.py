@@ -111,7 +111,7 @@ class Geometry:
     cloth_triangles: int
     """How many of them are the cloth's."""
     uv: Array
-    """Texture coordinates of all vertices; 0 of what is no sheet."""
+    """Texture coordinates of all vertices; 0 elsewhere."""
     segments: npt.NDArray[np.uint8]
     """Code of each triangle in the segmentation, shape (T,)."""
     has_uv: npt.NDArray[np.bool_]

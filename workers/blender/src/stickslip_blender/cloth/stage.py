@@ -30,7 +30,7 @@ SUNK = -FLOOR
 """Distance of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it."""
 
 ENDLESS, TILE = 1.0, 0.1
-"""Half of what is seen of an endless cylinder, or of a plane that is no floor; side of the plane's tiles [m]."""
+"""Half the visible size of an endless cylinder, or of a plane that is no floor; side of the plane's tiles [m]."""
 
 JAWS = 0.004
 """By how much a holder is larger than what it holds, along each axis [m]."""
