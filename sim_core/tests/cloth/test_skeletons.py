@@ -107,6 +107,57 @@ class TestSweeps:
         assert local[within, 2].min() > 0.0
 
 
+EDGE = {0.02: 1.085, 0.01: 1.048, 0.005: 1.015, 0.002: 1.014}
+"""By radius of the edge [m]: the mean force that pulls a strip over it, over its weight, with cells of 1.25 mm."""
+
+
+def pulled(radius: float, cell: float) -> tuple[float, float]:
+    """Pull a strip that hangs over a table's edge by its upper end; return the mean force over its weight, and the
+    radius of the edge in cells."""
+    mu, upper, speed, dt = 0.3, 0.1, 0.03, 0.01
+    mesh = meshes.grid(0.02, 0.3, round(0.02 / cell), round(0.3 / cell))
+    along, high = mesh.rest[:, 1] + 0.15 - (upper - radius), radius + 1e-4
+    angle = np.clip(along / high, 0.0, np.pi / 2)
+    start = np.column_stack(
+        [
+            mesh.rest[:, 0],
+            -radius + np.where(along < 0.0, along, high * np.sin(angle)),
+            -radius + high * np.cos(angle) - np.maximum(along - high * np.pi / 2, 0.0),
+        ]
+    )
+    held = np.flatnonzero(mesh.rest[:, 1] < -0.15 + 1e-9)
+    cloth = Cloth(mesh, FABRIC, preset_named("certified"), held=held, self_contact=SelfContact(mu))
+    table = [box(mu, (1.0, 1.0, 0.5), rounding=radius, origin=(0.0, -0.5, -0.25))]
+    cloth.set_state(start, bodies=table)
+    forces = []
+    for step in range(1, 151):
+        way = speed * max(dt * step - 0.2, 0.0)
+        ends = start[held] - np.array([0.0, way, 0.0])
+        cloth.step(dt, held=ends, bodies=table, damping=5.0 if way == 0.0 else 1.0)
+        if step > 50:
+            forces.append(-cloth.reactions[held, 1].sum())
+    return float(np.mean(forces)) / weight(cloth), cloth.sharpest
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize(
+    ("radius", "cell"),
+    [
+        (0.02, 0.01),
+        (0.01, 0.01),
+        (0.005, 0.01),
+        pytest.param(0.01, 0.005, marks=pytest.mark.slow),
+        pytest.param(0.005, 0.005, marks=pytest.mark.slow),
+        pytest.param(0.005, 0.0025, marks=pytest.mark.slow),
+        pytest.param(0.002, 0.0025, marks=pytest.mark.slow),
+    ],
+)
+def test_strip_over_an_edge(radius: float, cell: float) -> None:
+    force, sharpest = pulled(radius, cell)
+    assert force == pytest.approx(EDGE[radius], rel=0.05)
+    assert sharpest == np.inf or sharpest == pytest.approx(radius / cell, rel=1e-3)
+
+
 @pytest.mark.physics
 class TestFriction:
     def test_a_turning_rod_drags_by_its_surface(self) -> None:
