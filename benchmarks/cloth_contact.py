@@ -74,8 +74,7 @@ def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tupl
         return motion(at)
 
     begin = time.process_time()
-    for frame in range(1, frames):
-        cloth.advance(frame / cloth_drag.FRAME_RATE, watched)
+    cloth.advance((frames - 1) / cloth_drag.FRAME_RATE, watched)
     return time.process_time() - begin - looking, cloth, int(crossed)
 
 

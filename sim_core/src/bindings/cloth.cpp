@@ -31,7 +31,7 @@ using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, 
 using FabricTuple = std::tuple<double, Table, Eigen::Matrix3d, double>;
 
 using MotionCallback =
-    std::function<std::tuple<Points3, Points3, Points3, Points3, std::vector<BodyTuple>>(double time)>;
+    std::function<std::tuple<Points3, Points3, Points3, Points3, std::vector<BodyTuple>, double>(double time)>;
 
 struct DriveNow {
   Points3 gravity, held, slopes, surfaces;
@@ -71,6 +71,7 @@ void bind_cloth(nb::module_& m) {
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
       .def_ro("steps", &StepReport::steps)
       .def_ro("unconverged", &StepReport::unconverged)
+      .def_ro("missed", &StepReport::missed, "Steps of the controller that are further off than it allows.")
       .def_ro("substeps", &StepReport::substeps)
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
@@ -89,7 +90,7 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, const Edges& clamped,
              double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
-             int patience, int halvings_max, double step_error, int coarsest, int finest, const std::string& kernel,
+             int patience, int halvings_max, double step_error, double longest_step, int finest, const std::string& kernel,
              const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_share,
              double second_share, const Triangles& surface_triangles,
              const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
@@ -102,14 +103,14 @@ void bind_cloth(nb::module_& m) {
             new (self) ClothSolver(
                 rest, triangles, list, held, clamped,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                {step_error, coarsest, finest}, kernel,
+                {step_error, longest_step, finest}, kernel,
                 {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share,
                  constants.contact.surface_share},
                 {surface_triangles, surface_of_vertex, surface_positions, crease}, constants);
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
           "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
-          "coarsest"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a,
+          "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a,
           "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a,
           "constants"_a = std::map<std::string, double>())
       .def(
@@ -130,17 +131,18 @@ void bind_cloth(nb::module_& m) {
           "dt"_a, "gravity"_a, "held"_a, "slopes"_a, "surfaces"_a, "bodies"_a, "damping"_a)
       .def(
           "advance",
-          [](ClothSolver& self, double begin, double end, const MotionCallback& motion, double damping) {
+          [](ClothSolver& self, double time, double event, const MotionCallback& motion) {
             DriveNow now;
             nb::gil_scoped_release release;
-            return self.advance(begin, end, [&](double time) -> Drive {
+            const StepReport report = self.advance(time, event, [&](double at) -> Drive {
               nb::gil_scoped_acquire acquire;
-              auto [gravity, held, slopes, surfaces, bodies] = motion(time);
+              auto [gravity, held, slopes, surfaces, bodies, damping] = motion(at);
               now = {gravity, held, slopes, surfaces, bodies_of(bodies)};
               return {now.gravity, now.held, now.slopes, now.surfaces, now.bodies, damping};
             });
+            return std::make_tuple(time, report);
           },
-          "begin"_a, "end"_a, "motion"_a, "damping"_a)
+          "time"_a, "event"_a, "motion"_a)
       .def("last_dt", &ClothSolver::last_dt)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)

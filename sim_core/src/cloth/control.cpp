@@ -8,6 +8,9 @@
 namespace sim_core {
 namespace {
 
+// Share of an interval by which instants differ that rounding has parted.
+constexpr double same_instant = 1e-9;
+
 int level_of(int steps, const char* name) {
   int level = 0;
   while ((1 << level) < steps && level < 20) ++level;
@@ -21,17 +24,18 @@ StepController::StepController(Stepper& stepper, const StepControl& control, con
     : stepper_(stepper),
       control_(control),
       constants_(constants),
-      coarsest_(level_of(control.coarsest, "coarsest")),
       finest_(level_of(control.finest, "finest")),
       last_(finest_ + constants.halvings_near),
       level_(finest_),
+      tick_(ticks(0)),
       cost_(last_ + 1, 0.0) {
   if (!(control.error > 0.0) || !std::isfinite(control.error)) refuse("error: must be finite and > 0");
-  if (coarsest_ > finest_) refuse("finest: must be at least coarsest");
+  if (!(control.longest > 0.0) || !std::isfinite(control.longest)) refuse("longest: must be finite and > 0");
 }
 
 void StepController::restart() {
   level_ = finest_;
+  tick_ = ticks(0);
   std::fill(cost_.begin(), cost_.end(), 0.0);
 }
 
@@ -44,22 +48,36 @@ int StepController::ticks(int level) const { return 1 << (last_ - level); }
 void StepController::learn(int level, double work, double progress) {
   const double rate = work / progress;
   cost_[level] = cost_[level] > 0.0 ? (1.0 - constants_.novelty) * cost_[level] + constants_.novelty * rate : rate;
-  for (int coarser = coarsest_; coarser < level; ++coarser) cost_[coarser] *= 1.0 - constants_.forgiven;
+  for (int coarser = 0; coarser < level; ++coarser) cost_[coarser] *= 1.0 - constants_.forgiven;
 }
 
 bool StepController::worth_growing(int level) const {
-  return level > coarsest_ && !(cost_[level - 1] > constants_.dearer * cost_[level]);
+  return level > 0 && !(cost_[level - 1] > constants_.dearer * cost_[level]);
 }
 
-StepReport StepController::advance(double begin, double end, const Motion& motion) {
-  if (!(end > begin) || !std::isfinite(end)) refuse("end: must be finite and beyond begin");
+// As long as the longest step, or as many as it takes to the event, equally long.
+void StepController::begin_interval(double time, double event) {
+  const double count = std::ceil((event - time) / control_.longest * (1.0 - same_instant));
+  begin_ = time;
+  length_ = std::isfinite(event) ? (event - time) / count : control_.longest;
+  tick_ = 0;
+}
+
+StepReport StepController::advance(double& time, double event, const Motion& motion) {
+  if (!(event > time)) refuse(text("event: must be after ", time, " s, got ", event));
   const int all = ticks(0);
+  const auto instant = [&](int tick) {
+    const double at = begin_ + length_ * tick / all;
+    return std::abs(event - at) <= same_instant * length_ ? event : at;
+  };
+  const bool ended = tick_ == all || time != instant(tick_), cut = event < instant(all);
+  if (ended || cut) begin_interval(time, event);
   StepReport total;
-  for (int tick = 0; tick < all;) {
-    while (tick % ticks(level_) != 0) ++level_;
+  for (bool taken = false; !taken;) {
+    while (tick_ % ticks(level_) != 0) ++level_;
     const int size = ticks(level_);
-    const double share = static_cast<double>(size) / all, dt = share * (end - begin);
-    const Drive drive = motion(begin + (end - begin) * (tick + size) / all);
+    const double share = static_cast<double>(size) / all, dt = share * length_;
+    const Drive drive = motion(instant(tick_ + size));
     StepReport report;
     const bool solved = stepper_.attempt(dt, drive, report);
     const bool near = stepper_.near();
@@ -80,13 +98,16 @@ StepReport StepController::advance(double begin, double end, const Motion& motio
       total.add_work(report);
       report = stepper_.step(dt, drive);
     }
+    report.missed = stepper_.missed() > constants_.reject_at * control_.error;
     learn(level_, work_of(report), share);
     total.add(report);
-    tick += size;
+    tick_ += size;
+    taken = true;
     const bool grows =
         level_ > finest_ ? stepper_.easy(report.newton, near) : missed < constants_.grow_at && worth_growing(level_);
-    if (grows && tick % ticks(level_ - 1) == 0) --level_;
+    if (grows && tick_ % ticks(level_ - 1) == 0) --level_;
   }
+  time = instant(tick_);
   return total;
 }
 

@@ -1,4 +1,7 @@
-// Step sizes by the error of prediction and by cost: an interval of time is cut into a power of two of steps.
+// Step sizes by the error of prediction and by cost: the longest step is cut into a power of two of steps.
+//
+// The clock knows no frames: intervals of the length of the longest step follow each other from the start on, so that a
+// run takes the same steps however it is watched. Only before an event, at which a step has to end, they are shorter.
 //
 // Implicit Euler is wrong by dt^2 a/2 in a step, and the prediction x + dt v by dt^2 a: their distance is the estimate
 // of the error. A step that misses it, or that Newton's method does not solve within its patience, is taken back and
@@ -14,8 +17,9 @@
 namespace sim_core {
 
 struct StepControl {
-  double error;          // m: largest distance of a node from where it was predicted
-  int coarsest, finest;  // steps that an interval takes at least, and at most for the error's sake: powers of two
+  double error;    // m: largest distance of a node from where it was predicted
+  double longest;  // s: length of a step
+  int finest;      // steps that one of this length is cut into at most for the error's sake: a power of two
 };
 
 // What drives the cloth at a time, kept by the caller.
@@ -25,8 +29,8 @@ class StepController {
  public:
   StepController(Stepper& stepper, const StepControl& control, const ControlSettings& constants);
 
-  // From `begin` to `end` [s], an interval that is as long as all others.
-  StepReport advance(double begin, double end, const Motion& motion);
+  // Takes one step from `time` [s], and sets that to its end. A step ends at `event`, which may be infinite.
+  StepReport advance(double& time, double event, const Motion& motion);
   void restart();
 
  private:
@@ -34,12 +38,15 @@ class StepController {
   double work_of(const StepReport& report) const;
   void learn(int level, double work, double progress);
   bool worth_growing(int level) const;
+  void begin_interval(double time, double event);
 
   Stepper& stepper_;
   StepControl control_;
   ControlSettings constants_;
-  int coarsest_, finest_, last_, level_;  // log2 of steps in an interval; `last_`: of the shortest
-  std::vector<double> cost_;              // by level: work per interval of late, 0 where unknown
+  int finest_, last_, level_;              // log2 of steps in an interval; `last_`: of the shortest
+  int tick_;                               // in the interval, of the shortest steps
+  double begin_ = 0.0, length_ = 0.0;      // of the interval, s
+  std::vector<double> cost_;               // by level: work per interval of late, 0 where unknown
 };
 
 }  // namespace sim_core

@@ -150,9 +150,9 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
   return impl_->stepper.step(dt, {gravity, held, slopes, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double begin, double end, const Motion& motion) {
-  if (!impl_->stepper.started()) meet(motion(end).bodies);
-  return impl_->controller.advance(begin, end, motion);
+StepReport ClothSolver::advance(double& time, double event, const Motion& motion) {
+  if (!impl_->stepper.started()) meet(motion(time).bodies);
+  return impl_->controller.advance(time, event, motion);
 }
 
 double ClothSolver::last_dt() const { return impl_->stepper.last_dt(); }

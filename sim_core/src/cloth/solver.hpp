@@ -41,8 +41,8 @@ class ClothSolver {
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
                   const Points3& surfaces, const std::vector<Body>& bodies, double damping);
 
-  // From `begin` to `end` by steps of the controller's choice; all intervals are equally long.
-  StepReport advance(double begin, double end, const Motion& motion);
+  // A step of the controller's choice: see StepController::advance.
+  StepReport advance(double& time, double event, const Motion& motion);
   // Of the last step: its length [s], and the change of the cloth's momentum over it [N].
   double last_dt() const;
   Eigen::Vector3d momentum_rate() const;

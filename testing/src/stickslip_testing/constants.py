@@ -170,16 +170,14 @@ def strip(preset: SolverSettings) -> Cloth:
         down = 0.002 * min(time / 0.1, 1.0)
         return gravity, start[held] - np.array([0.0, along, down]), [plane(0.6)]
 
-    for frame in range(1, 25):
-        cloth.advance(frame * 0.104, motion)
+    cloth.advance(2.5, motion, event=2.5)
     return cloth
 
 
-def controlled(tumble: Tumble, interval: float, intervals: int) -> Cloth:
-    """A tumble, by steps of the controller's choice in intervals [s] that are equally long."""
+def controlled(tumble: Tumble, end: float) -> Cloth:
+    """A tumble until a time [s], by steps of the controller's choice."""
     gravity = np.tile([0.0, 0.0, -GRAVITY], (len(tumble.cloth.positions), 1))
-    for k in range(1, intervals + 1):
-        tumble.cloth.advance(k * interval, lambda time: (gravity, tumble.held(time), tumble.bodies))
+    tumble.cloth.advance(end, lambda time: (gravity, tumble.held(time), tumble.bodies), event=end)
     return tumble.cloth
 
 
@@ -192,8 +190,8 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
         "ball": ball,
         "strip": strip,
         "edges": edges,
-        "push": lambda preset: controlled(crumple(1, preset), 0.05, 3),
-        "let down": lambda preset: controlled(folding(1, preset), 0.1, 10),
+        "push": lambda preset: controlled(crumple(1, preset), 0.15),
+        "let down": lambda preset: controlled(folding(1, preset), 1.0),
     }
 )
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed

@@ -100,7 +100,7 @@ class Cloth:
             patience=preset.patience,
             halvings_max=preset.halvings_max,
             step_error=preset.step_error or 1.0,
-            coarsest=preset.coarsest,
+            longest_step=preset.longest_step,
             finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
             thickness=thickness.tolist(),
@@ -116,11 +116,14 @@ class Cloth:
             constants=dict(preset.constants),
         )
         self._solver = self._make(held=self.held.tolist())
+        self._before = (np.inf, np.empty((0, 3)), np.empty((0, 3)))
         self.least_distance = np.inf
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
         self.sharpest = np.inf
         """Least radius over the side of a cell of a body that cloth touched by more than its vertices."""
         self.steps = self.unconverged_steps = 0
+        self.missed_steps = 0
+        """Steps of `advance` that are further off than the preset's `step_error` allows: the shortest there are."""
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
         self.newton = self.krylov = self.flips = self.halvings = 0
@@ -261,32 +264,67 @@ class Cloth:
         self.time += dt
         return self._count(report)
 
-    def advance(self, end: float, motion: Motion, *, damping: float = 0.0) -> StepReport:
-        """Advance to `end` [s] by steps of the controller, or by steps of the preset's length.
+    def advance(
+        self,
+        end: float,
+        motion: Motion,
+        *,
+        event: float = np.inf,
+        damping: Callable[[float], float] = lambda _time: 0.0,
+    ) -> None:
+        """Take steps until one ends at `end` [s] or later: those of the controller, or of the preset's length.
 
-        All intervals must be equally long.
+        Steps depend on where the cloth is, not on how often this is called: `positions_at` has it at any time of the
+        last step. `motion` and `damping`, which is proportional to mass [1/s], are asked at the ends of steps.
+
+        Args:
+            end: [s]
+            motion: What drives the cloth.
+            event: Time [s] of the next sudden change of the motion, which a step must end at.
+            damping: Of all fabrics, on top of their own.
+
+        Raises:
+            ValueError: `event` has passed.
         """
 
-        def drive(time: float) -> tuple[Floats, Floats, Floats, Floats, list[BodyTuple]]:
-            gravity, held, bodies = motion(time)
-            ends = np.asarray(held, float).reshape(-1, 3)
-            return gravity, ends, self.slopes, self._surfaces_at(time), [body.as_tuple() for body in bodies]
+        def drive(time: float) -> tuple[Floats, Floats, Floats, Floats, list[BodyTuple], float]:
+            self.gravity, held, bodies = motion(time)
+            ends, tuples = np.asarray(held, float).reshape(-1, 3), [body.as_tuple() for body in bodies]
+            return self.gravity, ends, self.slopes, self._surfaces_at(time), tuples, damping(time)
 
-        if self.preset.step_error is None:
-            report = self._advance_evenly(end, motion, damping)
-        else:
-            report = self._count(self._solver.advance(self.time, end, drive, damping))
-            self.gravity = motion(end)[0]
-        self.time = end
-        return report
+        while self.time < end:
+            self._before = self.time, self.positions, self.velocities
+            if self.preset.step_error is not None:
+                self.time, report = self._solver.advance(self.time, event, drive)
+                self._count(report)
+                continue
+            if not event > self.time:
+                raise ValueError(f"event: must be after {self.time:g} s, got {event:g}")
+            dt = self.preset.time_step
+            if np.isfinite(event):
+                dt = (event - self.time) / np.ceil((event - self.time) / dt * (1.0 - 1e-9))
+            self.gravity, held, bodies = motion(self.time + dt)
+            self.step(dt, held=held, bodies=bodies, damping=damping(self.time + dt))
+            if abs(event - self.time) < 1e-9 * dt:
+                self.time = event
 
-    def _advance_evenly(self, end: float, motion: Motion, damping: float) -> StepReport:
-        begin = self.time
-        steps = max(1, int(np.ceil((end - begin) / self.preset.time_step * (1.0 - 1e-9))))
-        for step in range(1, steps + 1):
-            self.gravity, held, bodies = motion(begin + (end - begin) * step / steps)
-            report = self.step((end - begin) / steps, held=held, bodies=bodies, damping=damping)
-        return report
+    def positions_at(self, time: float) -> Floats:
+        """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
+
+        They are cubic in time between both ends of the step, with the velocities there.
+
+        Raises:
+            ValueError: The time is not in the last step.
+        """
+        if time == self.time:
+            return self.positions
+        begin, x, v = self._before
+        if not begin <= time < self.time:
+            raise ValueError(f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}")
+        h, s = self.time - begin, (time - begin) / (self.time - begin)
+        way = self.positions - x
+        found: Floats = x + s * s * (3.0 - 2.0 * s) * way + h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
+        return found
 
     def body_forces(self, count: int) -> Floats:
         """Return the forces of the first `count` bodies on the cloth in the last step (count, 3) [N]."""
@@ -315,6 +353,7 @@ class Cloth:
     def _count(self, report: StepReport) -> StepReport:
         self.steps += report.steps
         self.unconverged_steps += report.unconverged
+        self.missed_steps += report.missed
         residual = report.residual / self.force_scale
         if not residual <= self.worst_residual:  # a NaN stays
             self.worst_residual = residual

@@ -61,6 +61,9 @@ class ClothRun:
 
     steps: int
     unconverged_steps: int
+    missed_steps: int
+    """Steps that miss the preset's `step_error` although they are the shortest."""
+
     worst_residual: float
     """Largest residual force of a node in any step, in weights of 25 mm^2 of the lightest fabric."""
 
@@ -114,13 +117,13 @@ class Scene:
     surfaces: Sequence[Surface] = ()
 
     damping: Callable[[float], float] = lambda _time: 0.0
-    """From the time at the end of a frame [s] to a damping [1/s]."""
+    """From a time [s] to a damping [1/s]."""
 
     sheet: Mesh | None = None
     """The first sheet, if the run reports only that; None: all."""
 
     forces: Callable[[Cloth], Record] = lambda cloth: {"contact_force": cloth.contact_force()}
-    """Arrays recorded at each frame; the first frame is before the first step."""
+    """Arrays recorded at each frame, of the step in which it lies; the first frame is before the first step."""
 
     tracks: Mapping[str, Callable[[float], ArrayLike]] = field(default_factory=dict)
     """Poses and other functions of the time, recorded at each frame. A pose is (3, 4): x -> A x + b."""
@@ -147,7 +150,9 @@ class Scene:
     """Reason why no run of the scene is valid, or empty."""
 
     def run(self, on_frame: OnFrame | None = None) -> ClothRun:
-        """Simulate the scene frame by frame, until it ends or a position is not finite.
+        """Simulate the scene, until it ends or a position is not finite.
+
+        The solver's steps do not depend on the frames, whose positions are interpolated within steps.
 
         Args:
             on_frame: Called with (frames done, frames) after every frame.
@@ -171,7 +176,7 @@ class Scene:
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
             self._advance(cloth, hands, time)
-            paths.append(cloth.positions)
+            paths.append(cloth.positions_at(time))
             forces.append(self.forces(cloth))
             if on_frame is not None:
                 on_frame(frame + 1, self.frames)
@@ -204,6 +209,7 @@ class Scene:
             kernel=cloth.kernel,
             steps=cloth.steps,
             unconverged_steps=cloth.unconverged_steps,
+            missed_steps=cloth.missed_steps,
             worst_residual=cloth.worst_residual,
             rest_time=rest_time,
             reason=self.reason or cloth.why_invalid(everything),
@@ -217,18 +223,17 @@ class Scene:
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
 
     def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
-        """Advance to `end` [s], and grasp and release on the way."""
+        """Take steps until one ends at `end` [s] or later, and grasp and release on the way."""
 
         def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
             gravity, bodies = self.motion(time)
             return gravity, hands.at(time), bodies
 
-        damping = self.damping(end)
-        for event in [event for event in hands.events if cloth.time <= event < end]:
-            if cloth.time < event:
-                cloth.advance(event, motion, damping=damping)
-            cloth.hold(hands.take(event, cloth.positions), self.motion(event)[1])
-        cloth.advance(end, motion, damping=damping)
+        while cloth.time < end:
+            if cloth.time in hands.events:
+                cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
+            event = min((event for event in hands.events if event > cloth.time), default=np.inf)
+            cloth.advance(min(end, event), motion, event=event, damping=self.damping)
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
         """Run the scene and return the arrays and labels to store."""
@@ -245,6 +250,7 @@ class Scene:
             "kernel": run.kernel,
             "steps": run.steps,
             "unconverged_steps": run.unconverged_steps,
+            "missed_steps": run.missed_steps,
             "worst_residual": run.worst_residual,
             **run.labels,
         }
