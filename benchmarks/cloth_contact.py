@@ -40,6 +40,7 @@ from stickslip_sim_core.protocols import capstan
 from stickslip_sim_core.reference import master_curves
 from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere
 from stickslip_sim_core.scenes.cloth_sphere import SETTLING
+from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_testing import tumbles
 from stickslip_testing.spheres import of_triangles
 
@@ -63,7 +64,8 @@ def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tupl
     feels = None if mu is None else SelfContact(mu)
     cloth = Cloth(mesh, fabric(material), preset_named("certified"), held=held, self_contact=feels)
     cloth.set_state(hung.positions)
-    motion = cloth_drag.motion_of(hung, len(mesh.rest), [plane(0.5)])
+    hands = Hands([Holder(hung.held, cloth_drag.holder_pose)], hung.positions)
+    motion = hands.driving(cloth_drag.motion_of(hung, len(mesh.rest), [plane(0.5)]))
     crossed = looking = 0.0
 
     def watched(at: float) -> tuple[Floats, ArrayLike, Sequence[Body]]:

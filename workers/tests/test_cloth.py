@@ -95,6 +95,7 @@ class Core:
             kernel="baseline",
             steps=1200,
             unconverged_steps=3,
+            missed_steps=2,
             worst_residual=2e-4,
             reason="",
         )
@@ -138,6 +139,7 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
         "bias": 1e-5,
         "steps": 1200,
         "unconverged_steps": 3,
+        "missed_steps": 2,
         "worst_residual": 2e-4,
     }
     with np.load(io.BytesIO(store.read(result.output.record.digest))) as arrays:

@@ -60,18 +60,18 @@ class TestClothRun:
         assert dragged.self_intersections.shape == (110,)
 
     def test_frames_are_at_their_times(self, dragged: ClothRun) -> None:
-        """Held corners are where the holders are at k/2.4 s."""
+        """Held corners are where the holders are at k/2.4 s, to 0.02 mm: between steps they are on a cubic."""
         assert dragged.times == pytest.approx(np.arange(110) / 2.4)
         corner = int(np.argmax(dragged.rest.sum(axis=1)))
         came = dragged.positions[:, corner] - dragged.positions[0, corner]
         path = np.stack([cloth_drag.holder_path(t) for t in dragged.times])
-        assert came[:, [0, 2]] == pytest.approx(path, abs=1e-12)
+        assert came[:, [0, 2]] == pytest.approx(path, abs=2e-5)
         assert dragged.record["holder_pose"][:, [0, 2], 3] == pytest.approx(path, abs=1e-12)
         assert np.abs(came[:, 1]).max() == 0.0
 
     def test_starts_at_rest_over_the_floor(self, dragged: ClothRun) -> None:
         assert dragged.positions[0, :, 2].min() == pytest.approx(cloth_drag.CLEARANCE, abs=2e-3)  # it sags
-        assert dragged.positions[:, :, 2].min() > -1e-9
+        assert dragged.positions[:, :, 2].min() > -1e-5  # between steps, on a cubic
         assert dragged.positions[60, :, 2].min() < 1e-9
 
     def test_friction_in_the_steady_drag(self, dragged: ClothRun) -> None:
@@ -219,9 +219,9 @@ class TestRotatingSphere:
         assert corner[-1] - corner[0] == pytest.approx(scene.record["angle"][-1], abs=0.4)
         assert scene.record["floor_force"][-1, 2] > 0.0  # its hem on the floor
         assert scene.record["sphere_force"][-1, 2] > 0.0
-        assert scene.positions[:, :, 2].min() > -1e-9
+        assert scene.positions[:, :, 2].min() > -1e-5  # between steps, on a cubic
         centre = np.array([0.0, 0.0, RADIUS])
-        assert np.linalg.norm(scene.positions - centre, axis=2).min() > RADIUS - 1e-9
+        assert np.linalg.norm(scene.positions - centre, axis=2).min() > RADIUS - 1e-5
         assert np.hypot(*scene.labels["bias"]) > 0.0
         weight = fabric("gray-interlock").density * 0.04 * GRAVITY
         assert scene.contact_force[-1] == pytest.approx([0.0, 0.0, weight], abs=0.05 * weight)

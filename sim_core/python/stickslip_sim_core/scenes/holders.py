@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.bodies import Body
+from stickslip_sim_core.cloth.solver import Motion
 
 ALWAYS = (0.0, np.inf)
 
@@ -77,3 +79,12 @@ class Hands:
         """Return the positions of the held vertices at a time [s]: (K, 3) [m]."""
         poses = [(points, self.holders[number].pose(time)) for number, points in self._taken.items()]
         return np.concatenate([np.empty((0, 3)), *(points @ pose[:, :3].T + pose[:, 3] for points, pose in poses)])
+
+    def driving(self, motion: Callable[[float], tuple[Floats, Sequence[Body]]]) -> Motion:
+        """Return gravity, the held vertices and bodies, where `motion` returns gravity and bodies."""
+
+        def drive(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
+            gravity, bodies = motion(time)
+            return gravity, self.at(time), bodies
+
+        return drive

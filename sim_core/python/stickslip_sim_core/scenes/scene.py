@@ -170,7 +170,7 @@ class Scene:
             surfaces=self.surfaces,
             kernel=self.kernel,
         )
-        cloth.set_state(self.start)
+        cloth.set_state(self.start, bodies=self.motion(0.0)[1])
         paths, forces = [cloth.positions], [self.forces(cloth)]
         calm, rest_time = 0, np.nan
         for frame in range(1, self.frames):
@@ -224,16 +224,11 @@ class Scene:
 
     def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way."""
-
-        def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
-            gravity, bodies = self.motion(time)
-            return gravity, hands.at(time), bodies
-
         while cloth.time < end:
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
-            cloth.advance(min(end, event), motion, event=event, damping=self.damping)
+            cloth.advance(min(end, event), hands.driving(self.motion), event=event, damping=self.damping)
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
         """Run the scene and return the arrays and labels to store."""

@@ -118,6 +118,7 @@ def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         codes("kernel", KERNELS),
         array("steps", "time steps of the solver", "int32"),
         array("unconverged_steps", "steps that stopped short of the tolerance", "int32"),
+        array("missed_steps", "shortest steps that are further off than the preset's step error allows", "int32"),
         array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
         over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
     )

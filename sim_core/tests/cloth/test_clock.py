@@ -1,0 +1,171 @@
+"""Steps of the controller's choice: they depend on the scene, and not on how often it is filmed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stickslip_sim_core import Body, Cloth, SolverSettings, box, fabric, plane, preset_named
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.solver import GRAVITY
+from stickslip_sim_core.scenes.custom import Sheet, scene
+from stickslip_sim_core.scenes.holders import Holder
+from stickslip_sim_core.scenes.scene import ClothRun
+
+CERTIFIED = preset_named("certified")
+MATERIAL = fabric("gray-interlock")
+PATCH = meshes.grid(0.06, 0.06, 4, 4)
+STRIP = meshes.grid(0.02, 0.2, 2, 12)
+TOP = np.flatnonzero(STRIP.rest[:, 1] > 0.1 - 1e-9)
+
+
+def swing(
+    frame_rate: float, preset: SolverSettings = CERTIFIED, grasp: tuple[float, float] = (0.0, np.inf)
+) -> ClothRun:
+    """A strip swings about its upper edge for 1 s, and is let go at the end of the grasp."""
+    down = 0.1 - STRIP.rest[:, 1]
+    start = np.column_stack([0.5 * down, STRIP.rest[:, 0], -np.sqrt(0.75) * down])
+    sheet = Sheet(STRIP, MATERIAL, start, holders=[Holder(TOP, lambda _: np.eye(3, 4), [grasp])])
+    return scene([sheet], [[0.5]], duration=1.0, frame_rate=frame_rate, preset=preset, kernel="baseline").run()
+
+
+def shaken(frame_rate: float) -> ClothRun:
+    """A patch lies on a floor that shakes at 32 Hz, with its frames at the same place of each period."""
+
+    def bodies(time: float) -> list[Body]:
+        return [plane(1.0, origin=(2e-3 * (1.0 - np.cos(64.0 * np.pi * time)), 0.0, 0.0))]
+
+    sheet = Sheet(PATCH, MATERIAL, np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))]))
+    return scene([sheet], [[0.5]], duration=1.0, frame_rate=frame_rate, bodies=bodies, kernel="baseline").run()
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("run", [swing, shaken, lambda rate: swing(rate, replace(CERTIFIED, step_error=None))])
+def test_every_frame_rate_films_the_same_run(run: Callable[[float], ClothRun]) -> None:
+    reference = run(100)
+    for rate in (1, 2, 10, 50):
+        filmed = run(rate)
+        assert filmed.steps == reference.steps
+        assert filmed.positions.tobytes() == reference.positions[:: 100 // rate].tobytes()
+        assert filmed.contact_force.tobytes() == reference.contact_force[:: 100 // rate].tobytes()
+
+
+@pytest.mark.physics
+def test_a_floor_that_shakes_between_frames_moves_the_cloth() -> None:
+    """It throws the patch by 3 mm to and fro; with one step a frame nothing would move."""
+    path = shaken(100).positions
+    assert np.ptp(path[:, :, 0].mean(axis=1)) > 2e-3
+    assert np.abs(path[1:, :, 2]).max() < 1e-6
+
+
+@pytest.mark.physics
+def test_between_steps_frames_are_cubic() -> None:
+    """A falling cloth is at rest in its own frame: -g t^2/2, less what implicit Euler adds in steps of dt: -g t dt/2.
+
+    The cubic with the velocities at both ends is off by 0.1 g dt^2/2 at most [Hermite].
+    """
+    dt = 0.02
+    cloth = Cloth(PATCH, MATERIAL, replace(CERTIFIED, step_error=None, time_step=dt))
+    cloth.set_state(np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))]))
+    gravity = cloth.gravity.copy()
+    for time in np.linspace(0.001, 0.1, 34):
+        cloth.advance(time, lambda _: (gravity, np.empty((0, 3)), []))
+        fallen = -0.5 * GRAVITY * (time * time + time * dt)
+        assert cloth.positions_at(time)[:, 2] == pytest.approx(
+            np.full(len(PATCH.rest), fallen), abs=0.05 * GRAVITY * dt**2
+        )
+    for time in (0.0, cloth.time + 1e-6):
+        with pytest.raises(ValueError, match=r"time: must be in the last step, .* s, got"):
+            cloth.positions_at(time)
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("step_error", [1e-4, None])
+def test_steps_end_at_events(step_error: float | None) -> None:
+    """What is let go at 0.437 s falls freely from then on, at any frame rate."""
+    preset = replace(CERTIFIED, step_error=step_error)
+    filmed, reference = swing(10, preset, (0.0, 0.437)), swing(100, preset, (0.0, 0.437))
+    assert filmed.positions.tobytes() == reference.positions[::10].tobytes()
+    held = reference.positions[:, TOP]
+    assert (held[:44] == held[0]).all()
+    assert held[44, :, 2].max() < held[0, :, 2].min()
+    instants: list[float] = []
+    cloth = Cloth(PATCH, MATERIAL, preset)
+    cloth.set_state(np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))]))
+    still = np.zeros((len(PATCH.rest), 3))
+
+    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+        instants.append(time)
+        return still, np.empty((0, 3)), []
+
+    cloth.advance(0.437, motion, event=0.437)
+    assert cloth.time == instants[-1] == 0.437
+    with pytest.raises(ValueError, match=r"event: must be after 0\.437 s, got 0\.437"):
+        cloth.advance(1.0, motion, event=0.437)
+
+
+@pytest.mark.physics
+def test_steps_that_miss_their_error_are_counted() -> None:
+    assert swing(1).missed_steps == 0
+    coarse = swing(1, replace(CERTIFIED, finest=1))
+    assert coarse.missed_steps == coarse.steps
+    assert swing(1, replace(CERTIFIED, step_error=None)).missed_steps == 0
+
+
+@pytest.mark.physics
+class TestController:
+    @staticmethod
+    def sliding(end: float, **change: object) -> Cloth:
+        """A patch falls on a floor that begins to shake it."""
+        cloth = Cloth(PATCH, MATERIAL, replace(CERTIFIED, **change), kernel="baseline")  # type: ignore[arg-type]
+        cloth.set_state(np.column_stack([PATCH.rest, np.full(len(PATCH.rest), 0.01)]))
+        gravity = np.tile([0.0, 0.0, -GRAVITY], (len(PATCH.rest), 1))
+
+        def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+            x = 0.05 * (1.0 - np.cos(6.0 * max(time - 0.8, 0.0)))
+            return gravity, np.empty((0, 3)), [box(0.3, (1, 1, 1), origin=(x, 0.0, -0.5))]
+
+        cloth.advance(end, motion, event=end)
+        return cloth
+
+    def test_reruns_equal(self) -> None:
+        first, second = self.sliding(2.0), self.sliding(2.0)
+        assert first.positions.tobytes() == second.positions.tobytes()
+        assert first.steps == second.steps
+        assert first.unconverged_steps == 0
+
+    def test_smaller_error_takes_more_steps_and_is_nearer(self) -> None:
+        fine = self.sliding(1.6, step_error=1e-6, longest_step=2**-9, finest=2)
+        loose, tight = self.sliding(1.6, step_error=1e-3), self.sliding(1.6, step_error=1e-5)
+        assert 16 <= loose.steps < tight.steps < fine.steps
+        wrong = [float(np.abs(cloth.positions - fine.positions).max()) for cloth in (loose, tight)]
+        assert wrong[1] < 0.7 * wrong[0]
+
+    def test_fixed_steps(self) -> None:
+        assert self.sliding(0.8, step_error=None, time_step=0.02).steps == 40
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"finest": 3}, r"finest: must be a power of two, 1 \.\.\. 4096, got 3"),
+        ({"longest_step": 2.0}, "longest_step: must be above 0 and at most 1, got 2.0"),
+        ({"step_error": 0.0}, "step_error: must be above 0 and at most 1, got 0.0"),
+    ],
+)
+def test_refusals(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(CERTIFIED, **change)  # type: ignore[arg-type]
+
+
+def test_errors_of_the_motion_come_through() -> None:
+    cloth = Cloth(PATCH, MATERIAL, CERTIFIED)
+    cloth.set_state(np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))]))
+
+    def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+        raise KeyError(f"no motion at {time}")
+
+    with pytest.raises(KeyError, match="no motion at"):
+        cloth.advance(0.1, motion)
