@@ -47,12 +47,12 @@ def of_triangles(scene: Scene, mu: float, subdivisions: int) -> Scene:
     corners *= RADIUS - 0.5 * THICKNESS
 
     def at(time: float) -> NDArray[np.float64]:
-        pose = scene.motion(time)[2][1].pose
+        pose = scene.motion(time)[1][1].pose
         placed: NDArray[np.float64] = corners @ pose[:, :3].T + pose[:, 3]
         return placed
 
     def floor_only(time: float):  # type: ignore[no-untyped-def]
-        gravity, held, bodies = scene.motion(time)
-        return gravity, held, bodies[:1]
+        gravity, bodies = scene.motion(time)
+        return gravity, bodies[:1]
 
     return replace(scene, surfaces=[Surface(triangles, at, mu, thickness=0.0)], motion=floor_only)
