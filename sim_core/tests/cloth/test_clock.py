@@ -27,7 +27,7 @@ def swing(
     """A strip swings about its upper edge for 1 s, and is let go at the end of the grasp."""
     down = 0.1 - STRIP.rest[:, 1]
     start = np.column_stack([0.5 * down, STRIP.rest[:, 0], -np.sqrt(0.75) * down])
-    sheet = Sheet(STRIP, MATERIAL, start, holders=[Holder(TOP, lambda _: np.eye(3, 4), [grasp])])
+    sheet = Sheet(STRIP, MATERIAL, start, holders=[Holder(TOP, lambda _: np.eye(3, 4), grasp)])
     return scene([sheet], [[0.5]], duration=1.0, frame_rate=frame_rate, preset=preset, kernel="baseline").run()
 
 
