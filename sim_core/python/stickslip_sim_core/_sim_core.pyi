@@ -121,6 +121,10 @@ class StepReport:
     def unconverged(self) -> int: ...
 
     @property
+    def missed(self) -> int:
+        """Steps of the controller that are further off than it allows."""
+
+    @property
     def substeps(self) -> int: ...
 
     @property
