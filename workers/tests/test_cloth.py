@@ -97,6 +97,7 @@ class Core:
             unconverged_steps=3,
             missed_steps=2,
             worst_residual=2e-4,
+            rest_time=np.nan,
             reason="",
         )
         return replace(run, **self.changes)
