@@ -167,4 +167,6 @@ def refuse(model: BaseModel, place: Path, rule: str, value: Any) -> Never:
 def refuse_as(error: ValidationError, model: BaseModel, place: Path, value: Any) -> Never:
     """Raise a ValidationError for a value that another part of a document makes wrong."""
     first = error.errors(include_url=False)[0]
-    refuse(model, place, f"sets {'.'.join(map(str, first['loc']))}: {first['msg']}", value)
+    refuse(
+        model, place, f"sets {'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}", value
+    )

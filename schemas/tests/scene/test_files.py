@@ -1,0 +1,116 @@
+"""Files of scenes: what is read, and what is refused with the rule and what was found."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.scene import files
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.files import UnfitFileError, check_file, check_scene_file, counts_of, inlined
+from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+
+BODY, PATH = ("bodies", "block", "file"), ("bodies", "block", "motion", "path")
+MESH, START = ("sheets", "towel", "mesh", "file"), ("sheets", "towel", "start", "file")
+FLAT = b"v 0 0 1\nv 1 0 1\nv 0 1 1\nvt 0 0\nvt 0.1 0\nvt 0 0.1\nf 1/1 2/2 3/3\n"
+
+
+def npz(**arrays: Any) -> bytes:
+    """Return an NPZ file."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def test_flat_patterns_have_counts() -> None:
+    assert check_file(MESH, FLAT) == (3, 1)
+    assert counts_of(FLAT) == (3, 1)
+    assert check_file(BODY, b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n") is None
+    assert counts_of(b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0,0\n1,0,0,1,0,0,0\n") is None
+
+
+@pytest.mark.parametrize(
+    ("place", "data", "rule"),
+    [
+        (BODY, b"", "must have faces"),
+        (BODY, b"v 0 0 0\nv 1 0\n", "line 2 must be a vertex within 100 m"),
+        (BODY, b"v 0 0 nan\n", "line 1 must be a vertex"),
+        (BODY, b"v 0 0 1e9\n", "line 1 must be a vertex within 100 m"),
+        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "line 4 must be a vertex within 100 m or a face"),
+        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 2\n", "triangle 0 names one twice"),
+        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", "must be a manifold"),
+        (BODY, b"\xff\xfe\x00", "must be text in UTF-8"),
+        (BODY, b"PK\x03\x04 no archive", "must be an NPZ file"),
+        (BODY, npz(positions=np.zeros((1, 3, 3))), "triangles, times is missing"),
+        (BODY, npz(positions=np.zeros((2, 3, 3)), triangles=np.array([[0, 1, 2]]), times=np.zeros(2)), "that ascend"),
+        (BODY, npz(positions=np.zeros((1, 3, 3)), triangles=np.array([[0, 1, 3]]), times=np.zeros(1)), "below 3"),
+        (BODY, npz(positions=np.full((1, 3, 3), np.inf), triangles=np.zeros((1, 3)), times=np.zeros(1)), "finite"),
+        (BODY, npz(positions=np.array([None]), triangles=np.zeros((1, 3)), times=np.zeros(1)), "plain arrays"),
+        (MESH, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "must have texture coordinates"),
+        (MESH, FLAT.replace(b"1/1 2/2 3/3", b"1/1 3/3 2/2"), "must have areas above 0 m"),
+        (MESH, FLAT + b"f 1/1 3/2 2/3\n", "a vertex must have one texture coordinate"),
+        (START, npz(positions=np.zeros((3, 2))), r"positions must be \(vertex, 3\)"),
+        (PATH, b"t,x,y,z\n", "must begin with the line time,x,y,z,rx,ry,rz"),
+        (PATH, b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0\n", "line 2 must be seven finite numbers"),
+        (PATH, b"time,x,y,z,rx,ry,rz\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", "instants that ascend"),
+        (PATH, npz(time=np.arange(2.0), move=np.zeros((2, 3)), turn=np.zeros((2, 2))), "move and turn must be"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(place: tuple[str, ...], data: bytes, rule: str) -> None:
+    with pytest.raises(UnfitFileError, match=rule):
+        check_file(place, data)
+
+
+def test_a_small_file_cannot_ask_for_much_memory() -> None:
+    data = npz(positions=np.zeros((1000, 1000, 3)), triangles=np.array([[0, 1, 2]]), times=np.arange(1000.0))
+    assert len(data) < 2**20
+    with pytest.raises(UnfitFileError, match="bytes when unpacked"):
+        check_file(BODY, data)
+
+
+def test_meshes_have_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "MAX_VERTICES", 2)
+    with pytest.raises(UnfitFileError, match="at most 2 vertices"):
+        check_file(BODY, FLAT)
+    monkeypatch.setattr(files, "MAX_FILE_BYTES", 10)
+    with pytest.raises(UnfitFileError, match="at most 10 bytes, and has"):
+        counts_of(FLAT)
+
+
+def scene(file: str) -> Scene:
+    """Return a scene with a sheet from a file."""
+    return Scene.model_validate(
+        {
+            "format": "stickslip-scene/1",
+            "duration": 1.0,
+            "sheets": {"towel": {"material": "gray-interlock", "mesh": {"type": "file", "file": file}}},
+            "default_friction": 0.3,
+        }
+    )
+
+
+def test_files_become_references_with_their_counts(tmp_path: Path) -> None:
+    (tmp_path / "towel.obj").write_bytes(FLAT)
+    made, found = inlined(scene("towel.obj"), lambda name: (tmp_path / name).read_bytes())
+    assert found == {sha256(FLAT): FLAT}
+    assert made.sheets["towel"].mesh.shape == (3, 1)
+    ((place, name),) = made.files()
+    assert name == f"sha256:{sha256(FLAT)}"
+    check_scene_file(made, place, FLAT)
+    more = FLAT.replace(b"f 1", b"v 1 1 1\nvt 0.1 0.1\nf 2/2 4/4 3/3\nf 1")
+    with pytest.raises(UnfitFileError, match=r"counts must be .* \[4, 2\], and are \[3, 1\]"):
+        check_scene_file(made, place, more)
+    with pytest.raises(UnfitFileError, match=r"sheets.towel.mesh.file: must have faces, and has none, in towel.obj"):
+        inlined(scene("towel.obj"), lambda _name: b"")
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_built_in_scenes_are_whole(name: str) -> None:
+    made = load_scene(name)
+    assert made.name == name
+    assert made.description
+    assert made.parameters
+    for place, file in made.files():
+        check_scene_file(made, place, built_in_files()[file.removeprefix("sha256:")])
