@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from itertools import islice
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -93,9 +94,11 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         dimensions = array.dimensions
         if dimensions[-3:] == ("y", "x", "rgb"):
             pictures.append({"name": name, "count": array.shape[0], "is_clip": dimensions[0] == "frame"})
-        elif dimensions[-1:] == ("xyz",) and len(array.shape) in (2, 3) and dimensions[-2] in ("point", "vertex"):
+        elif dimensions[-1:] == ("xyz",) and len(array.shape) in (2, 3) and _is_place(dimensions[-2]):
             shapes.append({"name": name, "steps": array.shape[0] if len(array.shape) == 3 else 1})
-        elif dimensions[:1] in (("point",), ("instant",)) and len(array.shape) == 2 and array.shape[1] <= 4:
+        elif dimensions[:1] in (("point",), ("instant",)) and len(array.shape) == 2 and array.shape[1] <= _CURVES:
+            plots.append(_plot(data, name, slot))
+        elif dimensions[:1] == ("instant",) and dimensions[-1] == "xyz" and prod(array.shape[1:-1]) <= 2 * _CURVES:
             plots.append(_plot(data, name, slot))
         elif len(array.shape) <= 1 and name != "sample_key" and (not array.shape or array.shape[0] <= 8):
             labels[name] = (data.named(array, data.read(name, slot)), array.description)
@@ -107,10 +110,24 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
 _COMPONENTS = {"strain": ("twist", "bend 1", "bend 2"), "xyz": ("x", "y", "z")}
 
 
+_CURVES = 4
+"""In one plot; of vectors, of which there is a curve of each length, twice as many."""
+
+
+def _is_place(dimension: str) -> bool:
+    """Return whether a dimension runs over points in space: of a curve, a mesh or a sheet of a scene."""
+    return dimension.split(".")[-1] in ("point", "vertex")
+
+
 def _plot(data: SampleData, name: str, slot: int) -> str:
     array = data.arrays[name]
     values = np.asarray(data.read(name, slot), dtype=float)
-    parts = _COMPONENTS.get(array.dimensions[1], tuple(str(i) for i in range(array.shape[1])))
+    if values.ndim > 2:
+        values = np.linalg.norm(values, axis=-1).reshape(len(values), -1)
+    said = array.attributes
+    pairs = [f"{one}, {other}" for one in said.get("sheets", ()) for other in said.get("others", ())]
+    known = said.get("names") or pairs or _COMPONENTS.get(array.dimensions[1], ())
+    parts = known if len(known) == values.shape[1] else tuple(map(str, range(values.shape[1])))
     rate = array.attributes.get("instants_per_second")
     x, x_name = np.linspace(0, 1, len(values)), "arc length over L"
     if rate is not None:

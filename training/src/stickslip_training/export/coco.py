@@ -11,16 +11,15 @@ import numpy.typing as npt
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
 
-THINGS = ("cloth", "prop")
-"""Names of the codes of `segmentation` that are exported; the floor and what is behind are no things."""
-_LABELS = ("material", "texture", "viewpoint")
+NO_THINGS = ("background", "floor")
+"""Names of the codes of `segmentation` that are not exported."""
 
 
 def export_coco(reader: DatasetReader, out: Path, *, every: int = 1, split: Split | None = None) -> tuple[int, int]:
     """Write frames as PNG and their segments as annotations.json; return how many images and segments.
 
     A segment is all that is seen of a thing in a frame, as run lengths of a mask. Images also have the slot and frame
-    of the sample, its material, texture and viewpoint, and mu.
+    of the sample, and its parameters.
 
     Raises:
         ValueError: The dataset has no segmentation.
@@ -30,20 +29,22 @@ def export_coco(reader: DatasetReader, out: Path, *, every: int = 1, split: Spli
     if "segmentation" not in reader.arrays or "video" not in reader.arrays:
         raise ValueError("the dataset has no segmentation: its spec must say `ground_truth: [segmentation]`")
     names = reader.arrays["segmentation"].attributes["categories"]
-    codes = {names.index(name): name for name in THINGS}
+    codes = {code: name for code, name in enumerate(names) if name not in NO_THINGS}
+    axes = [name for name in reader.spec.named_axes if name in reader.arrays]
     folder = out / "images"
     folder.mkdir(parents=True, exist_ok=True)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for slot in reader.slots(split).tolist():
         video, segments = (reader.read(name, [slot])[0] for name in ("video", "segmentation"))
-        labels = {name: reader.categories(name)[reader.label(name)[slot]] for name in _LABELS}
+        values = {name: reader.label(name)[slot].item() for name in axes}
+        labels = {name: known[v] if (known := reader.categories(name)) else v for name, v in values.items()}
         for frame in range(0, len(video), every):
             height, width = segments[frame].shape
             name = f"{slot:06d}-{frame:03d}.png"
             Image.fromarray(video[frame]).save(folder / name)
             image = {"id": len(images) + 1, "file_name": name, "width": width, "height": height}
-            images.append(image | {"slot": slot, "frame": frame, "mu": float(reader.label("mu")[slot]), **labels})
+            images.append(image | {"slot": slot, "frame": frame, **labels})
             for code, segment in _segments(segments[frame], codes):
                 annotations.append(
                     {"id": len(annotations) + 1, "image_id": image["id"], "category_id": code, "iscrowd": 0, **segment}

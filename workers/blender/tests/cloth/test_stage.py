@@ -1,20 +1,25 @@
 """The stage of a scene: bodies as they are simulated, sheets with pictures, cameras that frame what moves."""
 
+import io
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from stickslip_blender.actor import RenderActor
 from stickslip_blender.cloth.geometry import FLOOR, Geometry
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.shading import Composer
 from stickslip_blender.cloth.shapes import gores, rounded
 from stickslip_blender.cloth.stage import SUNK, Stage
 from stickslip_blender.cloth.textures import texture_image
+from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
+from stickslip_schemas.format.codecs import decode_chunk
 from stickslip_schemas.kinds.cloth.arrays import scene_segments
 from stickslip_schemas.scene.document import Staged
 from stickslip_schemas.spec.cameras import FRAMING, framed
 from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.store import DirectoryStore
 
 INSTANTS = 3
 
@@ -172,3 +177,35 @@ def test_a_scene_without_a_plane_has_no_floor() -> None:
     assert stage.floor is None
     assert np.isinf(truth.depth[truth.segmentation == 0]).all()
     assert (truth.segmentation == 0).any()
+
+
+def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
+    """The clip, the ground truth and the label of the camera that framed it."""
+    scene, record = made()
+    store = DirectoryStore(tmp_path / "store")
+    file = io.BytesIO()
+    np.savez(file, **{name: values[None] for name, values in record.items()})
+    look = {
+        "kind": "cloth_scene",
+        "scene": scene,
+        "quality": "preview",
+        "texture": "plaid",
+        "viewpoint": "high",
+        "instants": (0, 2),
+        "ground_truth": ["segmentation"],
+        "light_seed": 1,
+        "crease_seed": 2,
+    }
+    actor = RenderActor(str(store.root))
+    task = {"stage": "render", "render": look, "record": {"digest": store.publish(file.getvalue()), "row": 0}}
+    result = TaskResult.model_validate(actor.render(task))
+    actor.close()
+    assert isinstance(result.output, RenderOutput), result.message
+    assert set(result.output.chunks) == {"video", "segmentation"}
+    camera = staged()[0].camera("high", staged()[1], 224)
+    np.testing.assert_allclose(result.output.labels["camera"], camera.numbers)
+    assert result.output.labels["composed"]
+    chunk = result.output.chunks["segmentation"]
+    codes = np.frombuffer(decode_chunk(store.read(chunk.digest, offset=0, length=chunk.length)), dtype=np.uint8)
+    names = scene_segments(scene["sheets"], scene["bodies"])
+    assert {names[code] for code in np.unique(codes)} >= {"towel", "rug", "floor", "holders"}

@@ -144,8 +144,8 @@ def get_values(
     steps = values if values.ndim == 3 else values[None]
     chosen = np.linspace(0, len(steps) - 1, min(len(steps), 60)).astype(int)
     document: dict[str, Any] = {"points": np.round(steps[chosen], 4).tolist(), "steps": chosen.tolist()}
-    triangles = next((name for name, other in data.arrays.items() if "triangle" in other.dimensions), None)
-    if triangles is not None and data.arrays[array].dimensions[-2] == "vertex":
+    triangles = f"{array.removesuffix('positions')}triangles"
+    if triangles in data.arrays:
         document["triangles"] = data.read(triangles, slot).tolist()
     return Response(json.dumps(document), media_type="application/json")
 
