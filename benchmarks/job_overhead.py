@@ -25,11 +25,13 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 PARTS = (
     ("-m stickslip_services.app", "coordinator"),
+    ("-m stickslip_workers head", "Ray: other"),
     ("-m stickslip_workers", "dispatcher"),
-    ("ray::Host", "stage and render processes"),
+    ("ray::DashboardAgent", "Ray: agents"),
+    ("ray::RuntimeEnvAgent", "Ray: agents"),
     ("raylet/raylet", "Ray: raylet"),
     ("gcs/gcs_server", "Ray: gcs"),
-    ("ray::", "Ray: agents"),
+    ("ray::", "stage and render processes"),
     ("ray/", "Ray: other"),
     ("stickslip up", "supervisor"),
 )

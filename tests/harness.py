@@ -13,6 +13,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import zarr
+from stickslip_workers.ray_head import own_directory
 from zarr.abc.store import Store as ZarrStore
 
 T = TypeVar("T")
@@ -123,7 +124,12 @@ class Service:
 
     def all_processes(self) -> list[int]:
         """Return all processes that hold a file below the data directory open, or name it: ours, alive or orphaned."""
-        return [pid for pid in pids() if pid != os.getpid() and str(self.data) in command_line(pid) + log_of(pid)]
+        places = (str(self.data), str(own_directory(self.data)))
+        return [
+            pid
+            for pid in pids()
+            if pid != os.getpid() and any(place in command_line(pid) + log_of(pid) for place in places)
+        ]
 
     def get(self, path: str) -> Any:
         """Return the JSON of a GET."""

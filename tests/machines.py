@@ -115,7 +115,18 @@ class Machine:
 
 def dispatch(name: str, place: Path) -> list[str]:
     """Return the command of a worker; the coordinator has its key in a file of `place`."""
-    words = ["--url", URL, "--store", BUCKET, "--name", name, "--slots", "1", "--key-file", str(place / "worker-key")]
+    words = [
+        "--url",
+        URL,
+        "--store",
+        BUCKET,
+        "--name",
+        name,
+        "--max-cpus",
+        "1",
+        "--key-file",
+        str(place / "worker-key"),
+    ]
     return [sys.executable, "-m", "stickslip_workers", "dispatch", *words]
 
 

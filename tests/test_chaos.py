@@ -52,7 +52,7 @@ def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
     wait_for_renders(service, job, 4)
     kill(service.child("stickslip_services.app"))
     wait_for_renders(service, job, 10)
-    kill(service.child("stickslip_workers"))
+    kill(service.child("stickslip_workers dispatch"))
     wait_for_renders(service, job, 16)
     kill(render_process(service))
     wait_for_renders(service, job, 22)
@@ -95,7 +95,8 @@ def render_process(service: Service) -> int:
     """Return a process that has Blender in it and is at work."""
 
     def probe() -> int | None:
-        for pid in descendants(service.child("stickslip_workers")):
+        assert service.process is not None
+        for pid in descendants(service.process.pid):
             try:
                 if "/bpy/" in Path(f"/proc/{pid}/maps").read_text():
                     return pid
@@ -186,8 +187,9 @@ LONGEST_GAP = 30.0
 
 VICTIMS = {
     "coordinator": "-m stickslip_services.app",
-    "dispatcher": "-m stickslip_workers",
-    "stage or render process": "ray::Host",
+    "dispatcher": "-m stickslip_workers dispatch",
+    "ray start": "-m stickslip_workers head",
+    "stage or render process": "ray::IDLE",
     "raylet": "raylet/raylet",
     "gcs": "gcs/gcs_server",
     "dashboard agent": "ray::DashboardAgent",

@@ -222,7 +222,7 @@ _GENTLE = "trap 'touch gave-back; exit 0' TERM\ntouch up\nwhile true; do sleep 0
 def test_slurm_job_comes_back_after_term_but_not_after_scancel(tmp_path: Path, state: str, is_requeued: bool) -> None:
     job = start_job(tmp_path, state=state, worker=f"{_GENTLE.replace('touch up', 'echo up > up')}")
     wait_for(tmp_path / "up")
-    assert "--name slurm-7 --slots 3" in (tmp_path / "worker").read_text()
+    assert "--name slurm-7 --max-cpus 3" in (tmp_path / "worker").read_text()
     assert "--tls-certificate" not in (tmp_path / "worker").read_text()
     job.send_signal(signal.SIGTERM)
     assert job.wait(60) == 0

@@ -93,6 +93,8 @@ CRDS = {
         "workerGroupSpecs",
         rayVersion=_STRING,
         authOptions=_object("mode", mode={"enum": ["token"]}),
+        enableInTreeAutoscaling={"const": True},
+        autoscalerOptions=_object("version", version={"const": "v2"}, idleTimeoutSeconds=_NUMBER),
         headGroupSpec=_object(*_GROUP, **_GROUP),
         workerGroupSpecs=_list(
             _object(
@@ -245,7 +247,7 @@ def test_pods_may_do_little(name: str) -> None:
 
 def test_pods_have_the_time_that_a_drain_takes() -> None:
     found = pods(rendered(CI["minimal"])) | pods(rendered(CI["ray"]))
-    drain = WorkerSettings(url="", store="", name="").stop_seconds
+    drain = WorkerSettings(urls=(), store="", name="").stop_seconds
     for name in ("demo-worker", "demo-ray-dispatcher"):
         assert found[name]["terminationGracePeriodSeconds"] >= 2 * drain
     assert found["demo-coordinator"]["terminationGracePeriodSeconds"] >= 2 * GRACE_SECONDS

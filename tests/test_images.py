@@ -223,7 +223,7 @@ def test_both_make_a_dataset(images: Images, data: Path) -> None:
     with started(images, "coordinator", data, f"--port={PORT}") as coordinator:
         wait_for("the coordinator", lambda: job_when("/readyz"), 60)
         assert coordinator.poll() is None
-        with started(images, "worker", data, *words, "--slots=1"):
+        with started(images, "worker", data, *words, "--max-cpus=1"):
             job = httpx.post(f"{url}/v1/jobs", json=spec, trust_env=False).json()["id"]
 
             def over() -> Any:

@@ -74,7 +74,7 @@ def test_the_ray_cluster_of_the_chart_works(
 ) -> None:
     """What KubeRay would start: a head, two nodes that work, and the dispatcher, which joins them."""
     helm = pytest.importorskip("helm_python", reason="Helm is not installed: pip install helm-python-sdk")
-    values = {"store": {"url": BUCKET}, "ray": {"enabled": True, "replicas": 2, "slots": 1}}
+    values = {"store": {"url": BUCKET}, "ray": {"enabled": True, "maxReplicas": 2, "slots": 1}}
     with helm.Chart.load(CHART) as chart:
         text = chart.render(values, name="demo", namespace="lab")["stickslip/templates/ray.yaml"]
     cluster, dispatcher = (item for item in yaml.safe_load_all(text) if item is not None)

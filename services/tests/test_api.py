@@ -389,7 +389,9 @@ def test_workers_show_what_they_run_and_how_far_it_is(client: httpx.Client, work
     job = client.post("/v1/jobs", json=rods()).json()["id"]
     running, _ = worker.lease(simulate=2)
     state = {"task_id": running.task_id, "token": running.token, "started": True, "frames": [40, 300]}
-    client.post("/v1/worker/heartbeat", json={"worker_id": worker.id, "leases": [state]}).raise_for_status()
+    client.post(
+        "/v1/worker/heartbeat", json={"worker_id": worker.id, "leases": [state], "condition": {"slots": 2}}
+    ).raise_for_status()
     (shown,) = client.get("/v1/workers").json()
     assert shown["leased"] == 2
     (task,) = shown["running"]

@@ -288,7 +288,7 @@ def test_frames_of_running_simulations_are_shown(context: Context, worker: Prete
         states = [
             LeaseState(task_id=lease.task_id, token=lease.token, started=True, frames=told) for lease, told in frames
         ]
-        heartbeat(context, Heartbeat(worker_id=worker.id, leases=tuple(states)))
+        heartbeat(context, Heartbeat(worker_id=worker.id, leases=tuple(states), condition=worker.condition))
 
     def told() -> tuple[int, int] | None:
         return show_job(context, job_id).progress.stages[Stage.simulate].frames
@@ -337,7 +337,7 @@ def test_frames_shorten_the_time_left(context: Context, worker: PretendWorker) -
     worker.start(last)
     before = show_job(context, job).progress.eta
     state = LeaseState(task_id=last.task_id, token=last.token, started=True, frames=(90, 100))
-    heartbeat(context, Heartbeat(worker_id=worker.id, leases=(state,)))
+    heartbeat(context, Heartbeat(worker_id=worker.id, leases=(state,), condition=worker.condition))
     after = show_job(context, job).progress.eta
     assert before is not None
     assert after is not None

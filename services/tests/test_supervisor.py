@@ -35,7 +35,7 @@ class Up:
         program = directory / "stub.py"
         program.write_text(STUB.format(log=str(self.log)) if stub is None else stub)
         command = [sys.executable, "-m", "stickslip_services.cli", "up", "--data", str(self.data), "--port", port]
-        command += ["--slots", "3", "--dispatcher", f"{sys.executable} {program}"]
+        command += ["--slots", "3", "--workers", f"{sys.executable} {program}"]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     @property
@@ -49,7 +49,11 @@ class Up:
             return False
 
     def dispatchers(self) -> list[int]:
-        return [int(line.split()[0]) for line in self.log.read_text().splitlines()] if self.log.exists() else []
+        return self.started("dispatch")
+
+    def started(self, command: str) -> list[int]:
+        lines = [line.split() for line in self.log.read_text().splitlines()] if self.log.exists() else []
+        return [int(words[0]) for words in lines if words[1] == command]
 
     def coordinator(self) -> int:
         needle = f"stickslip_services.app\0--data\0{self.data}\0".encode()
@@ -81,15 +85,14 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def test_up_starts_both_and_stops_both(up: Up) -> None:
-    wait_until(lambda: bool(up.dispatchers()) and up.answers())
+def test_up_starts_all_and_stops_all(up: Up) -> None:
+    wait_until(lambda: bool(up.dispatchers() and up.started("head")) and up.answers())
     port = up.url.rsplit(":", 1)[1]
     assert port != "0"
-    words = up.log.read_text().split()[1:]
-    expected = ["dispatch", "--url", up.url, "--store", str(up.data / "store"), "--name", "local"]
-    expected += ["--key-file", str(up.data / "worker-key"), "--slots", "3"]
-    assert words == expected
-    pids = [*up.dispatchers(), up.coordinator()]
+    words = sorted(line.partition(" ")[2] for line in up.log.read_text().splitlines())
+    expected = f"dispatch --once --ray-data {up.data} --url {up.url} --store {up.data / 'store'} --name local"
+    assert words == [f"{expected} --key-file {up.data / 'worker-key'}", f"head --ray-data {up.data} --cpus 3"]
+    pids = [*up.dispatchers(), *up.started("head"), up.coordinator()]
     second = Up(up.data.parent)
     assert "in use by another" in second.process.communicate(timeout=20)[0]
     assert second.process.returncode == 1
@@ -125,7 +128,7 @@ def test_a_child_that_keeps_dying_ends_the_whole(tmp_path: Path) -> None:
     output = failing.process.communicate(timeout=60)[0]
     assert failing.process.returncode == 1
     assert "no blender here" in output
-    assert "the dispatcher exited with status 1" in output
+    assert "exited with status 1" in output
     assert failing.coordinator() == 0
 
 

@@ -1,7 +1,7 @@
 """A made-up dataset of rods: its tasks, and what its arrays must hold."""
 
-import gc
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -21,12 +21,14 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import DirectoryStore
 from stickslip_testing.samples import samples
-from stickslip_workers.cluster import Cluster
+from stickslip_workers.cluster import Place
+from stickslip_workers.ray_head import own_directory
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
 from stickslip_workers.stages.records import encode_records
 
-os.environ["RAY_AUTH_MODE"] = "token"  # Ray looks once, when it is first imported, and test_failures imports it
+# Ray looks once, when it is first imported, and test_results imports it.
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 HERE = str(Path(__file__).parent)
 sys.path.append(HERE)  # coordinator_double, fake_renderer, publishing
 
@@ -142,21 +144,28 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
     return make
 
 
+class Connected(Place):
+    """A place of which this process is a driver already."""
+
+    def connect(self) -> None:
+        """Do nothing."""
+
+
 @pytest.fixture(scope="session")
-def cluster() -> Iterator[Cluster]:
-    """A Ray cluster for all tests, with `fake_renderer` in reach of its processes."""
-    from stickslip_workers.cluster import ray_cluster
-
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    """A Ray of two CPUs for all tests, with `fake_renderer` in reach of its processes."""
+    directory = own_directory(tmp_path_factory.mktemp("ray"))
+    command = f"from pathlib import Path; from stickslip_workers.ray_head import main; main(Path('{directory}'), 2)"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([HERE, *filter(None, [os.environ.get("PYTHONPATH")])]))
-        others = _running()
-        with ray_cluster(name="tests", address=None, cpus=2) as cluster:
-            processes = [process for process in _running() if process not in others]
-            yield cluster
-        for process in processes:
-            process.wait(timeout=30)  # Ray ends its processes and does not wait, of which Python warns
+        patch.setenv("PYTHONPATH", HERE, prepend=os.pathsep)
+        with subprocess.Popen([sys.executable, "-c", command], stdout=subprocess.DEVNULL) as head:
+            try:
+                place = Connected(None, directory)
+                Place.connect(place)
+                yield place
+            finally:
+                import ray
 
-
-def _running() -> list["subprocess.Popen[Any]"]:
-    """Return the processes that this one has started, and holds."""
-    return [thing for thing in gc.get_objects() if type(thing) is subprocess.Popen]
+                ray.shutdown()
+                head.terminate()
+    shutil.rmtree(directory)

@@ -17,6 +17,7 @@ from stickslip_schemas.documents.worker_api import (
     ReportAnswer,
     ReportBatch,
     ReportVerdict,
+    WorkerCondition,
     WorkerRegistration,
     WorkerSession,
 )
@@ -44,6 +45,7 @@ class CoordinatorDouble:
         self.limits: dict[str, float] = {}
         self.long: set[str] = set()
         self.frames: dict[str, tuple[int, int]] = {}
+        self.condition = WorkerCondition(slots=0)
         self._token = 0
         self._server: ThreadingHTTPServer | None = None
         self.port = 0
@@ -94,7 +96,7 @@ class CoordinatorDouble:
             self.registrations.clear()
             self.leased.clear()
 
-    def until(self, condition: Callable[[], bool], timeout: float = 240) -> None:
+    def until(self, condition: Callable[[], bool], timeout: float = 30) -> None:
         """Wait for a condition, which is looked at after every request."""
         with self.changed:
             assert self.changed.wait_for(condition, timeout), (self.results, self.leased, self.released)
@@ -135,6 +137,7 @@ class CoordinatorDouble:
 
     def _beat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         self.beats += 1
+        self.condition = heartbeat.condition
         self.frames |= {lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None}
         self.started |= {lease.task_id for lease in heartbeat.leases if lease.started}
         return HeartbeatAnswer(drop=tuple(lease.task_id for lease in heartbeat.leases if lease.task_id in self.drop))

@@ -1,6 +1,7 @@
 """The command line against the real coordinator and the real renderer, each in its own process."""
 
 import contextlib
+import os
 import re
 import signal
 import subprocess
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 import httpx
 import pytest
 import zarr
-from stickslip_workers.cluster import OWNER
+from stickslip_workers.ray_head import own_directory
 from stickslip_workers.settings import default_blender_python
 
 pytest.importorskip("stickslip_services")
@@ -24,6 +25,7 @@ pytestmark = [
 ]
 
 T = TypeVar("T")
+NAME = f"end-to-end-{os.getpid()}"
 
 
 def _wait_for(what: str, probe: Callable[[], T | None], timeout: float = 120) -> T:
@@ -58,7 +60,6 @@ class Services:
         return _wait_for(f"{pattern!r} in {log}.log", lambda: re.search(pattern, path.read_text()))
 
     def dispatch(self, log: str) -> subprocess.Popen[bytes]:
-        name = "end-to-end"
         process = self._start(
             log,
             "stickslip_workers",
@@ -68,7 +69,7 @@ class Services:
             "--store",
             self.store,
             "--name",
-            name,
+            NAME,
             "--key-file",
             self.store.parent / "worker-key",
         )
@@ -106,13 +107,12 @@ def services(tmp_path: Path) -> Iterator[Services]:
     running.close()
 
 
-def _processes_of(dispatcher: int) -> list[int]:
-    """Return the Ray processes that a dispatcher, dead or alive, has started."""
-    found = []
+def _processes() -> list[int]:
+    """Return the processes of the Ray of the dispatchers."""
+    place, found = str(own_directory(Path(NAME))), []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
-            mine = re.search(rf"{OWNER}=[^\0]*:{dispatcher}\0", (entry / "environ").read_text(errors="replace"))
-            if entry.name.isdigit() and int(entry.name) != dispatcher and mine:
+            if entry.name.isdigit() and place in (entry / "cmdline").read_text(errors="replace"):
                 found.append(int(entry.name))
     return found
 
@@ -126,12 +126,11 @@ def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> 
         return True if 1 < counts.get("succeeded", 0) < 12 else None
 
     _wait_for("some renders", some_rendered)
-    assert _processes_of(first.pid)
+    assert _processes()
     first.send_signal(signal.SIGKILL)
     first.wait()
 
     second = services.dispatch("second")
-    assert _processes_of(first.pid) == []
     done = _wait_for("the end of the job", lambda: (now := services.job(job))["finished_at"] and now)
     assert done["state"] == "succeeded"
     version = services.store / "datasets" / done["dataset"]["dataset"] / f"v{done['dataset']['version']}"
@@ -141,4 +140,4 @@ def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> 
 
     second.send_signal(signal.SIGTERM)
     assert second.wait(timeout=20) == 0
-    _wait_for("the end of Ray's processes", lambda: True if _processes_of(second.pid) == [] else None)
+    _wait_for("the end of Ray's processes", lambda: True if not _processes() else None, 5)

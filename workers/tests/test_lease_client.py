@@ -8,7 +8,7 @@ import pytest
 from stickslip_schemas.documents.tasks import SimulateTask
 from stickslip_schemas.documents.worker_api import Heartbeat, HeartbeatAnswer, Lease, WorkerSession
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
-from stickslip_workers.lease_client import Backoff, HeartbeatThread, LeaseBook
+from stickslip_workers.lease_client import Backoff, HeartbeatThread, LeaseBook, Status
 
 
 def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,7 +38,7 @@ class SlowCoordinator:
 def test_a_heartbeat_in_progress_ends_before_its_connection_is_closed() -> None:
     coordinator = SlowCoordinator()
     session = WorkerSession(worker_id="worker-1", lease_seconds=0.03)
-    heartbeat = HeartbeatThread(cast(Any, coordinator), session, LeaseBook())
+    heartbeat = HeartbeatThread(cast(Any, coordinator), session, LeaseBook(), Status(lambda: ""))
     heartbeat.start()
     assert coordinator.asked.wait(timeout=10)
     threading.Timer(0.2, coordinator.may_answer.set).start()

@@ -2,15 +2,12 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
-from stickslip_workers import cluster
 from stickslip_workers.lease_client import Backoff
 
 PROGRAM = """
@@ -56,41 +53,6 @@ def test_a_signal_is_passed_on(tmp_path: Path) -> None:
     assert process.wait(60) == -signal.SIGTERM % 256
     with pytest.raises(ProcessLookupError):
         os.kill(int(pids.read_text()), 0)
-
-
-def test_a_cluster_that_does_not_answer_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "ASK_SECONDS", 0.05)
-    lost: list[str] = []
-    monkeypatch.setattr(cluster, "_lose", lambda _cluster, what: lost.append(what))
-    closing = cluster.Cluster(1)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        gcs = f"127.0.0.1:{server.getsockname()[1]}"
-        closing.closing = True
-        cluster._ask(closing, gcs)
-        assert lost == []  # it answers, and the dispatcher ends by itself
-    cluster._ask(cluster.Cluster(1), gcs)
-    assert lost == [f"the Ray cluster at {gcs}"]
-
-
-@pytest.mark.parametrize("is_up", [False, True])
-def test_a_cluster_is_lost_with_one_of_its_processes(monkeypatch: pytest.MonkeyPatch, is_up: bool) -> None:
-    class EndedError(Exception): ...
-
-    def end() -> None:
-        raise EndedError
-
-    monkeypatch.setattr(cluster, "START_WATCH_SECONDS", 0.01)
-    monkeypatch.setattr(cluster, "LAST_SECONDS", 0.0)
-    monkeypatch.setattr(cluster, "_end", end)
-    with subprocess.Popen(["sleep", "60"]) as process:
-        monkeypatch.setattr(cluster, "_processes", lambda _parts: {process.pid: "raylet"})
-        threading.Timer(0.2, process.kill).start()
-        watched = cluster.Cluster(1)
-        if is_up:
-            watched.is_up.set()
-        with pytest.raises(EndedError):
-            cluster._watch(watched)
-    assert watched.lost == ("raylet" if is_up else "")  # who starts has nothing to report
 
 
 def test_waits_grow() -> None:

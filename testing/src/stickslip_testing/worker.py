@@ -31,6 +31,7 @@ from stickslip_schemas.documents.worker_api import (
     LeaseState,
     Report,
     ReportBatch,
+    WorkerCondition,
     WorkerRegistration,
 )
 from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, encode_sample, encode_shard
@@ -96,10 +97,15 @@ class PretendWorker:
     whole: bool = False
     """Whether its datasets have all arrays of their kind, or only `views` and `sample_key`."""
 
+    @property
+    def condition(self) -> WorkerCondition:
+        """How it says that it is."""
+        return WorkerCondition(slots=self.slots)
+
     def register(self) -> "PretendWorker":
         """Register with the coordinator."""
         registration = WorkerRegistration(
-            name=self.name, builds=dict.fromkeys(self.kinds, self.builds), slots=self.slots, versions={}
+            name=self.name, builds=dict.fromkeys(self.kinds, self.builds), condition=self.condition, versions={}
         )
         self.id = self.api.register(registration).worker_id
         return self
@@ -117,7 +123,9 @@ class PretendWorker:
     def beat(self, *leases: Lease, started: bool = False) -> tuple[str, ...]:
         """Renew leases; return the ids of tasks to drop."""
         states = tuple(LeaseState(task_id=lease.task_id, token=lease.token, started=started) for lease in leases)
-        drop: tuple[str, ...] = self.api.heartbeat(Heartbeat(worker_id=self.id, leases=states)).drop
+        drop: tuple[str, ...] = self.api.heartbeat(
+            Heartbeat(worker_id=self.id, leases=states, condition=self.condition)
+        ).drop
         return drop
 
     def report(self, *ended: tuple[Lease, TaskResult | None]) -> list[str]:

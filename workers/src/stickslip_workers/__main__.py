@@ -1,4 +1,4 @@
-"""Command line: `python -m stickslip_workers dispatch | replay | certify | describe`."""
+"""Command line: `python -m stickslip_workers dispatch | head | replay | certify | describe`."""
 
 import argparse
 import ctypes
@@ -33,15 +33,27 @@ def main(arguments: list[str] | None = None) -> int:
     blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
 
     dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray")
-    dispatch.add_argument("--url", required=True, help="base URL of the coordinator")
+    dispatch.add_argument(
+        "--url",
+        required=True,
+        action="append",
+        help="base URL of the coordinator; repeatable, the next where one is away",
+    )
     dispatch.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
     dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
-    dispatch.add_argument("--slots", type=int, help="tasks that run at once (default: the CPUs of the cluster)")
-    dispatch.add_argument("--ray-address", help="an existing Ray cluster (default: a cluster of its own)")
-    dispatch.add_argument("--once", action="store_true", help="end when the cluster at --ray-address is gone")
+    dispatch.add_argument("--max-cpus", type=int, help="the most CPUs of the cluster to use (default: all)")
+    dispatch.add_argument("--render-gpus", type=float, default=1.0, help="GPUs for a render (default: %(default)s)")
+    where = dispatch.add_mutually_exclusive_group()
+    where.add_argument("--ray-address", help="the Ray cluster (default: RAY_ADDRESS, else one for this machine alone)")
+    where.add_argument("--ray-data", type=Path, help="use the head that `head` runs for this data directory")
+    dispatch.add_argument("--once", action="store_true", help="end when the cluster is gone")
     dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+
+    head = commands.add_parser("head", help="run a Ray of one machine, on loopback, for `dispatch --ray-data`")
+    head.add_argument("--ray-data", type=Path, required=True, help="data directory that it is for")
+    head.add_argument("--cpus", type=int, help="CPUs to use (default: all)")
 
     replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator")
     replay.add_argument("task", type=Path, help="the task as JSON")
@@ -64,7 +76,12 @@ def main(arguments: list[str] | None = None) -> int:
     commands.add_parser("describe", help="print the builds of this environment")
 
     options = parser.parse_args(arguments)
-    if options.command == "dispatch" and options.ray_address is not None and not options.once:
+    if options.command == "head":
+        from stickslip_workers import ray_head
+
+        ray_head.main(ray_head.own_directory(options.ray_data), options.cpus)
+        return 0
+    if options.command == "dispatch" and not options.once:
         command = [sys.executable, "-m", "stickslip_workers", *(sys.argv[1:] if arguments is None else arguments)]
         return run_for_ever([*command, "--once"], Backoff(first=1.0, most=30.0))
     if options.command == "dispatch":
@@ -100,20 +117,30 @@ def _dispatch(options: argparse.Namespace) -> int:
         logging.error("key-file must be a file with the coordinator's worker key; %s does not exist", options.key_file)
         return 2
     settings = Settings(
-        url=options.url,
+        urls=tuple(options.url),
         store=options.store,
         name=options.name,
         key=None if options.key_file is None else options.key_file.read_text(encoding="ascii").strip(),
         tls_certificate=options.tls_certificate,
-        slots=options.slots,
-        ray_address=options.ray_address,
+        max_cpus=options.max_cpus,
+        render_gpus=options.render_gpus,
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
-    from stickslip_workers.cluster import ClusterLostError, ray_cluster
+    from stickslip_workers.calls import NoNodeError
+    from stickslip_workers.cluster import Place
     from stickslip_workers.dispatcher import Dispatcher
-    from stickslip_workers.processes import StartError
+    from stickslip_workers.ray_head import own_directory
+    from stickslip_workers.starting import StartError
 
+    address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
+    head: subprocess.Popen[bytes] | None = None
+    if address is None and data is None:
+        data = Path(settings.name)
+        command = [sys.executable, "-m", "stickslip_workers", "head", "--ray-data", str(data)]
+        command += [] if settings.max_cpus is None else ["--cpus", str(settings.max_cpus)]
+        head = subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
+    place = Place(address, None if data is None else own_directory(data))
     stopped_early = False
     dispatcher: Dispatcher | None = None
 
@@ -130,21 +157,22 @@ def _dispatch(options: argparse.Namespace) -> int:
         logging.error("%s", error)
         return 2
     try:
-        with ray_cluster(name=settings.name, address=settings.ray_address, cpus=settings.slots) as cluster:
-            dispatcher = Dispatcher(settings, cluster)
-            for number in (signal.SIGTERM, signal.SIGINT):
-                signal.signal(number, stop)  # after Ray has set its own
-            dispatcher.run()
-    except (ClusterLostError, StartError, CoordinatorError) as error:
+        dispatcher = Dispatcher(settings, place)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, stop)
+        dispatcher.run()
+    except (NoNodeError, StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
     finally:
         tracing.stop()
+        if head is not None:
+            head.terminate()
     return 0
 
 
 def run_for_ever(command: list[str], backoff: Backoff) -> int:
-    """Run a dispatcher on somebody else's cluster, again where it fails; return its status when it was stopped.
+    """Run a dispatcher, again where it fails; return its status when it was stopped.
 
     A driver of Ray may die with its cluster, whatever it does, and cannot connect to another one.
     """

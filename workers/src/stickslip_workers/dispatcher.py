@@ -1,4 +1,4 @@
-"""The dispatcher: leases tasks from the coordinator, keeps the processes of a Ray cluster busy, reports results.
+"""The dispatcher: leases tasks from the coordinator, gives them to Ray, and reports results.
 
 One thread does everything but heartbeats. It sleeps in `ray.wait` and never blocks on the coordinator for longer than
 one request, so running work goes on while the coordinator is away, and its results wait.
@@ -8,168 +8,70 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
-from itertools import chain, islice
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Reason, Stage
-from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, Task, TaskResult
-from stickslip_schemas.documents.worker_api import (
-    Lease,
-    LeaseRequest,
-    Report,
-    ReportBatch,
-    WorkerRegistration,
-    WorkerSession,
-)
-from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.documents.tasks import RenderTask, TaskResult
+from stickslip_schemas.documents.worker_api import Lease, LeaseRequest, WorkerRegistration
 from stickslip_schemas.store import open_store
 
-from stickslip_workers.cluster import Cluster, ClusterLostError
-from stickslip_workers.kinds import kind, kind_names
+from stickslip_workers.batches import LARGEST_BATCH, Pace, results_of
+from stickslip_workers.calls import Call, Calls, ForeignError
+from stickslip_workers.cluster import Place
 from stickslip_workers.lease_client import (
     Backoff,
     CoordinatorClient,
     CoordinatorError,
     HeartbeatThread,
     LeaseBook,
+    Outbox,
+    Status,
     UnknownWorkerError,
     UnreachableError,
 )
-from stickslip_workers.processes import Pool, PoolSettings, Process
-from stickslip_workers.results import failed, failure, merged, process_failure, shading_of, split
-from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
-from stickslip_workers.stages.run import AnyTask, with_damaged_inputs
+from stickslip_workers.results import failed, process_failure, shading_of
+from stickslip_workers.settings import Settings
+from stickslip_workers.stages.run import with_damaged_inputs
+from stickslip_workers.starting import common_builds, find_builds, in_thread
 
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT = 1.0
 """The loop looks at time limits and dropped leases at least so often [s]."""
 
-REPORTS_A_REQUEST = 512
-
-EXPRESS_SLOTS = 1
-"""Calls beyond `slots` that may run while all of these have been taken for long: short tasks do not wait for hours."""
-
 EXPRESS_POLL_SECONDS = 1.0
 """Time between two questions for short tasks [s]."""
 
-FRAMES_SECONDS = 2.0
-"""Time between two questions to a simulation how far it is [s]."""
-
 WARM_UP_SECONDS = 10.0
-"""The first call of a process is gone by only where it took longer [s]."""
-
-REPORT_SECONDS = 1.0
-"""How long a result waits for others to be reported with, while there is other work to go on with."""
-
-AHEAD_SECONDS = 2.0
-MOST_AHEAD = 16
-"""Calls that wait here, for each slot: enough for so long, but one at least and not more than so many. A request costs
-the coordinator about 10 ms whatever it asks for."""
-
-RENDERS_TOGETHER = 12
-"""Renders of one shading that one call makes at most; so many are leased ahead, for they cost little more than one."""
-
-SHORT_SECONDS = 0.5
-"""Renders that share no shading are given to a process several at once, if they take so long together [s]: a call costs
-the dispatcher, Ray and the process some milliseconds."""
-
-LARGEST_BATCH = max(kind(name).batch for name in kind_names())
-"""How many simulations to ask for at once: one call takes them all."""
-
-_PRECEDENCE = (Stage.publish, Stage.pack, Stage.simulate, Stage.render)
-"""What goes first: the end of a job before its beginning, and simulations, while they are short, before renders."""
-
-LONG_SIMULATION = 2.0
-"""Simulations that take longer [s] go after renders: clips come out while others are simulated, and the time left
-is known for both. Of such no more are leased than run soon, for another dispatcher may have nothing to do."""
-
-_tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
-_results = TypeAdapter(list[TaskResult])
-
-
-@dataclass(eq=False)
-class Assignment:
-    """Work that a process is at: one task, a batch of simulations, or renders."""
-
-    parts: list[list[Lease]]
-    """Tasks that have one answer together: all simulations, or renders of one shading."""
-    stage: Stage
-    process: Process
-    started_at: float
-    limit: float
-    """It is ended after this time [s]."""
-    asked: Any = None
-    """Ray's reference to the frames that are done, while the process has not answered."""
-    asked_at: float = 0.0
-    unwanted_since: float | None = None
-
-    @property
-    def leases(self) -> list[Lease]:
-        """All tasks."""
-        return list(chain.from_iterable(self.parts))
+"""The first call of a process says how long others take only where it took longer [s]."""
 
 
 class Dispatcher:
-    """See the module. `run` returns when `stop` is called; Ray must be connected."""
+    """See the module. `run` returns when `stop` is called."""
 
-    def __init__(self, settings: Settings, cluster: Cluster) -> None:
+    def __init__(self, settings: Settings, place: Place) -> None:
         self._settings = settings
-        self._cluster = cluster
-        self._slots = settings.slots or cluster.cpus
-        most = self._slots + EXPRESS_SLOTS
-        # Both pools full take all CPUs of the cluster, so that neither can keep the other from starting.
-        share = int(0.5 * max(cluster.cpus, 1) / most * 1000) / 1000
-        common: dict[str, Any] = {
-            "store": settings.store,
-            "size": most,
-            "num_cpus": share,
-            "start_seconds": settings.start_seconds,
-            "process_bytes": settings.process_bytes,
-            "environment": {RENDER_DEVICE: settings.render_device},
-        }
-        self._stage_pool = Pool(
-            PoolSettings(
-                sort="stage",
-                factory="stickslip_workers.stages.run:StageActor",
-                tasks_per_process=10_000,
-                tells_frames=True,
-                **common,
-            )
-        )
-        self._render_pool = Pool(
-            PoolSettings(
-                sort="render",
-                factory=settings.render_actor,
-                tasks_per_process=settings.renders_per_process,
-                python=str(settings.blender_python),
-                num_gpus=0 if settings.render_device == CPU else 1,
-                **common,
-            )
-        )
+        self._place = place
         self._store = open_store(settings.store)
-        self._coordinator = CoordinatorClient(settings.url, settings.key, settings.tls_certificate)
+        self._coordinator = CoordinatorClient(settings.urls, settings.key, settings.tls_certificate)
+        self._status = Status(lambda: "it looks for its builds")
+        self._described: dict[bool, dict[str, Any]] = {}
+        """What the stages and the renderer say about themselves, with their builds."""
         self._backoff = Backoff()
-        self._session: WorkerSession | None = None
         self._heartbeat: HeartbeatThread | None = None
+        """Of the session, if one is open."""
         self._book = LeaseBook()
-        self._queues: dict[Stage, deque[Lease]] = {stage: deque() for stage in _PRECEDENCE}
-        self._running: dict[Any, Assignment] = {}
-        self._reports: deque[Report] = deque()
-        self._reports_due = 0.0
-        self._part_seconds: dict[Stage, float] = {}
-        """How long one part of a call takes, lately."""
-        self._simulation_seconds: float | None = None
+        self._queues: dict[Stage, deque[Lease]] = {stage: deque() for stage in Stage}
+        self._short: deque[Lease] = deque()
+        """What was leased because it is short, while all CPUs have been taken for long."""
+        self._calls: Calls | None = None
+        self._pace = Pace()
+        self._outbox = Outbox(self._coordinator, self._book)
         self._alone: set[str] = set()
         """Tasks that were in a call that failed: they are not put together with others again."""
-        self._renders_share = False
-        """Whether the last renders that were leased share shadings."""
         self._next_lease = 0.0
-        self._was_clogged = False
         self._stopping = False
 
     def stop(self) -> None:
@@ -179,386 +81,259 @@ class Dispatcher:
     def run(self) -> None:
         """Work until stopped."""
         try:
-            self._find_builds()
-            # Blender takes seconds to start: the first job should not have to wait for it.
-            self._render_pool.grow(self._slots)
+            self._described = self._await(lambda: find_builds(self._settings)) or {}
+            if self._heartbeat is not None:
+                self._heartbeat.session_lost.set()  # now it can say what it makes
+            begin = time.monotonic()
+            self._status.reason = lambda: f"waiting for Ray: {time.monotonic() - begin:.0f} s, {self._place.trouble()}"
+            self._await(self._place.connect)
+            if not self._stopping:
+                calls = self._calls = Calls(
+                    self._settings, {who: said["builds"] for who, said in self._described.items()}
+                )
+                self._status.state, self._status.reason = "ready", calls.trouble
+                self._status.slots = int(calls.cpus)
+                self._tell()
             while not self._stopping:
-                self._turn()
+                self._turn(calls)
             self._finish_running()
+        except Exception as error:
+            why = f"it has ended: {type(error).__name__}: {error}"
+            self._status.state, self._status.slots, self._status.reason = "starting", 0, lambda: why
+            self._tell()
+            raise
         finally:
             self._give_back()
 
+    # --- the start ------------------------------------------------------------------------------------------
+
+    def _await(self, work: Callable[[], Any]) -> Any:
+        """Do something in another thread while this one keeps the session; return what it returns."""
+        done = in_thread(work)
+        while not (self._stopping or done.done()):
+            self._keep_session()
+            time.sleep(0.05)
+        return done.result() if done.done() else None
+
+    def _keep_session(self) -> bool:
+        """Register where there is no session; return whether there is one now."""
+        if time.monotonic() < self._backoff.next_try:
+            return False
+        try:
+            if self._heartbeat is None or self._heartbeat.session_lost.is_set():
+                self._open_session()
+        except UnreachableError as error:
+            self._go_on_without(error)
+        return self._heartbeat is not None
+
+    def _tell(self) -> None:
+        """Tell the coordinator at once how this dispatcher is."""
+        if self._heartbeat is not None:
+            with contextlib.suppress(CoordinatorError):
+                self._heartbeat.beat()
+
     # --- one turn of the loop -------------------------------------------------------------------------------
 
-    def _turn(self) -> None:
-        self._collect(self._wait_seconds())
-        if self._cluster.lost:
-            raise ClusterLostError(f"{self._cluster.lost} is gone")
-        self._stage_pool.check_starts()
-        self._render_pool.check_starts()
-        self._enforce_limits()
-        self._ask_for_frames()
-        if self._is_clogged():
-            self._hand_back()
-        self._start_work()
-        if time.monotonic() < self._backoff.next_try:
+    def _turn(self, calls: Calls) -> None:
+        self._collect(calls, self._wait_seconds(calls))
+        self._status.slots = int(calls.cpus)
+        self._enforce_limits(calls)
+        self._give_work(calls)
+        if not self._keep_session():
             return
         try:
-            if self._session is None or (self._heartbeat is not None and self._heartbeat.session_lost.is_set()):
-                self._open_session()
-            if time.monotonic() >= self._report_time() and self._report():
+            if time.monotonic() >= self._report_time() and self._outbox.send(self._worker_id()):
                 self._next_lease = 0.0  # what has ended may have made new tasks possible
-            if self._lease():
-                self._start_work()
+            if self._lease(calls):
+                self._give_work(calls)
             if self._backoff.failures:
                 log.info("the coordinator is back")
             self._backoff.succeeded()
         except UnknownWorkerError:
-            if self._heartbeat is not None:
-                self._heartbeat.session_lost.set()
+            assert self._heartbeat is not None
+            self._heartbeat.session_lost.set()
         except UnreachableError as error:
-            if self._backoff.failures == 0:
-                log.warning("the coordinator is away: %s", error)
-            self._backoff.failed()
+            self._go_on_without(error)
 
-    def _wait_seconds(self) -> float:
-        """Return how long there is nothing to do unless work ends or a process starts."""
+    def _go_on_without(self, error: UnreachableError) -> None:
+        if self._backoff.failures == 0:
+            log.warning("the coordinator is away: %s", error)
+        self._backoff.failed()
+
+    def _wait_seconds(self, calls: Calls) -> float:
+        """Return how long there is nothing to do unless Ray has news."""
         due = [time.monotonic() + LONGEST_WAIT]
-        if self._session is None:
-            due.append(self._backoff.next_try)
-        if self._reports:
+        if self._outbox:
             due.append(max(self._report_time(), self._backoff.next_try))
-        if self._wanted():
+        if self._wanted(calls):
             due.append(max(self._next_lease, self._backoff.next_try))
         return max(min(due) - time.monotonic(), 0.0)
 
     def _report_time(self) -> float:
         """Return when to report: at once where the coordinator's next tasks may hang on it."""
-        return self._reports_due if any(self._queues.values()) else 0.0
+        return self._outbox.due if any(self._queues.values()) else 0.0
 
-    def _collect(self, timeout: float) -> None:
-        """Wait until something ends, and take in what has."""
-        import ray
-
-        refs = list(self._running)
-        if not self._stopping:
-            refs += [*self._stage_pool.waiting_refs(), *self._render_pool.waiting_refs()]
-        if not refs:
-            time.sleep(timeout)
-            return
-        ray.wait(refs, num_returns=1, timeout=timeout)
-        if not self._running:
-            return
-        ended, _ = ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
-        for ref in ended:
-            self._take_in(ref, self._running.pop(ref))
-
-    def _take_in(self, ref: Any, assignment: Assignment) -> None:
-        import ray
-
-        pool = self._pool(assignment.stage)
-        seconds = time.monotonic() - assignment.started_at
-        # The first call of a process warms it up: how long it took says little of the others, unless it was long.
-        each = seconds / len(assignment.parts)
-        call_seconds = each if assignment.process.tasks or seconds > WARM_UP_SECONDS else None
-        try:
-            answers, resident = ray.get(ref)
-        except ray.exceptions.RayError as error:
-            if isinstance(error, ray.exceptions.RayTaskError):
-                pool.give_back(assignment.process, 0, len(assignment.parts))
+    def _collect(self, calls: Calls, timeout: float) -> None:
+        """Take in what Ray says until nothing is left to take."""
+        for one, said in calls.collect(timeout):
+            if said is None:
+                self._book.start(one.leases)
+            elif isinstance(said, tuple):
+                self._book.note_frames(one.leases[0], said)
+            elif isinstance(said, list):
+                self._take_in(one, said)
+            elif isinstance(said, ForeignError):
+                self._queues[one.stage].extendleft(reversed(one.leases))
             else:
-                log.warning("process %d died at %s", assignment.process.pid, _names(assignment.leases))
-                pool.note_death(assignment.process)
-            if self._has_queued_alone(assignment):
-                return
-            result = process_failure(error, renders=assignment.stage is Stage.render)
-            results = [with_damaged_inputs(result, lease.task, self._store) for lease in assignment.leases]
-        else:
-            pool.give_back(assignment.process, resident, len(assignment.parts))
-            parts = zip(answers, assignment.parts, strict=True)
-            results = [result for answer, leases in parts for result in _read_results(answer, leases)]
-        results = [result.model_copy(update={"call_seconds": call_seconds}) for result in results]
-        self._part_seconds[assignment.stage] = 0.8 * self._part_seconds.get(assignment.stage, each) + 0.2 * each
-        if assignment.stage is Stage.simulate:
-            each = seconds / len(assignment.leases)
-            self._simulation_seconds = 0.8 * (self._simulation_seconds or each) + 0.2 * each
-        self._settle(assignment, results)
+                self._take_failure(one, said)
 
-    def _settle(self, assignment: Assignment, results: list[TaskResult]) -> None:
-        seconds = time.monotonic() - assignment.started_at
-        for lease, result in zip(assignment.leases, results, strict=True):
+    def _take_in(self, one: Call, answers: list[Any]) -> None:
+        seconds = time.monotonic() - (one.started_at or time.monotonic())
+        self._pace.note(one.stage, one.parts, seconds)
+        each = seconds / len(one.parts) if not one.is_first or seconds > WARM_UP_SECONDS else None
+        results = [r for answer, part in zip(answers, one.parts, strict=True) for r in results_of(answer, part)]
+        self._settle(one, [result.model_copy(update={"call_seconds": each}) for result in results])
+
+    def _take_failure(self, one: Call, error: Exception) -> None:
+        """Report a failure, but do the parts of a call again, one by one, to see which of them failed."""
+        if len(one.parts) > 1:
+            log.warning("a call for %s failed (%s); each is done again by itself", _names(one), one.cancelled or error)
+            self._alone.update(lease.task_id for lease in one.leases)
+            self._queues[one.stage].extendleft(lease for lease in reversed(one.leases) if self._book.holds(lease))
+            return None
+        if one.cancelled:
+            return self._settle(one, [failed(Reason.exec_timeout, one.cancelled)] * len(one.leases))
+        result = process_failure(error, renders=one.stage is Stage.render)
+        return self._settle(one, [with_damaged_inputs(result, lease.task, self._store) for lease in one.leases])
+
+    def _settle(self, one: Call, results: list[TaskResult]) -> None:
+        seconds = time.monotonic() - (one.started_at or time.monotonic())
+        for lease, result in zip(one.leases, results, strict=True):
             tracing.record_task(lease, result, seconds, worker=self._settings.name)
             if result.outcome == "failed":
                 log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
             self._alone.discard(lease.task_id)
-            if self._book.holds(lease):
-                if not self._reports:
-                    self._reports_due = time.monotonic() + REPORT_SECONDS
-                self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
+            self._outbox.add(lease, result)
 
-    def _has_queued_alone(self, assignment: Assignment) -> bool:
-        """Queue the parts of a call that failed, to be done one by one; return False where there was only one.
-
-        A render that ends its process must not count as a failure of renders in the same process.
-        """
-        if len(assignment.parts) == 1:
-            return False
-        log.warning("a call for %s failed; each is done again by itself", _names(assignment.leases))
-        for lease in reversed(assignment.leases):
-            if self._book.holds(lease):
-                self._alone.add(lease.task_id)
-                self._queues[assignment.stage].appendleft(lease)
-        return True
-
-    def _enforce_limits(self) -> None:
-        """Kill what has run too long, and what nobody wants any more."""
+    def _enforce_limits(self, calls: Calls) -> None:
+        """End what has run too long, and what nobody wants any more."""
         now = time.monotonic()
-        for ref, assignment in list(self._running.items()):
-            if not any(self._book.holds(lease) for lease in assignment.leases):
+        for one in calls:
+            if one.cancelled or not one.parts:
+                continue
+            if not any(self._book.holds(lease) for lease in one.leases):
                 # Most work ends by itself sooner than a new process would start.
-                assignment.unwanted_since = assignment.unwanted_since or now
-                if now < assignment.unwanted_since + self._settings.drop_seconds:
-                    continue
-            elif now < assignment.started_at + assignment.limit:
-                continue
-            del self._running[ref]
-            self._pool(assignment.stage).end(assignment.process)
-            if self._has_queued_alone(assignment):
-                continue
-            result = failed(
-                Reason.exec_timeout,
-                f"not done within {assignment.limit:.3g} s; process {assignment.process.pid} killed",
-            )
-            self._settle(assignment, [result] * len(assignment.leases))
+                one.unwanted_since = one.unwanted_since or now
+                if one.started_at is None or now > one.unwanted_since + self._settings.drop_seconds:
+                    calls.cancel(one, "nobody wants it any more")
+            elif one.runs_longer_than(one.limit):
+                calls.cancel(one, f"not done within {one.limit:.3g} s; its process on node {one.node[:8]} was ended")
 
     # --- work -----------------------------------------------------------------------------------------------
 
-    def _pool(self, stage: Stage) -> Pool:
-        return self._render_pool if stage is Stage.render else self._stage_pool
-
-    def _start_work(self) -> None:
-        """Give processes what is queued, as far as slots and processes are free."""
-        for queue in self._queues.values():
+    def _give_work(self, calls: Calls) -> None:
+        """Give Ray what is queued, as far as there is room; one short call goes beside long ones."""
+        for queue in (self._short, *self._queues.values()):
             wanted = [lease for lease in queue if self._book.holds(lease)]
             if len(wanted) < len(queue):
                 queue.clear()
                 queue.extend(wanted)
-        long = (self._simulation_seconds or 0.0) > LONG_SIMULATION
-        waiting = {self._stage_pool: 0, self._render_pool: 0}
-        for stage in reversed(Stage) if long else _PRECEDENCE:
-            queue = self._queues[stage]
-            pool = self._pool(stage)
-            while queue and len(self._running) < self._open_slots():
-                process = pool.take()
-                if process is None:
-                    waiting[pool] += self._calls(stage)
-                    break
-                self._assign(self._next_parts(queue), stage, process)
-        for pool, count in waiting.items():
-            pool.grow_if_worth(min(count, self._open_slots() - len(self._running)))
+        for stage in self._pace.order():
+            while self._queues[stage] and calls.room(is_long=self._pace.is_long()) > 0:
+                calls.give(self._pace.next_parts(self._queues[stage], self._alone), stage)
+        if (short := self._express(calls)) and not any(one.is_express for one in calls):
+            stage = Stage(short[0].task.stage)
+            calls.give(self._pace.next_parts(short, self._alone), stage, is_express=True)
 
-    def _next_parts(self, queue: deque[Lease]) -> list[list[Lease]]:
-        """Take what one call does from `queue`."""
-        parts = [_next_batch(queue)]
-        if self._may_share_a_call(parts[0][0]):
-            while queue and len(parts) < self._renders_at_once() and self._may_share_a_call(queue[0]):
-                parts.append([queue.popleft()])
-        return parts
-
-    def _may_share_a_call(self, lease: Lease) -> bool:
-        """Return whether a task is a render that shares no shading, and has not been in a call that failed."""
-        return (
-            isinstance(lease.task, RenderTask) and shading_of(lease.task) is None and lease.task_id not in self._alone
-        )
-
-    def _renders_at_once(self) -> int:
-        """Return how many renders that share no shading are short enough to be one call."""
-        each = max(self._part_seconds.get(Stage.render, SHORT_SECONDS), 1e-3)
-        return min(max(int(SHORT_SECONDS / each), 1), MOST_AHEAD)
-
-    def _calls(self, stage: Stage) -> int:
-        """Return about how many calls the queued tasks of a stage take."""
-        queue = self._queues[stage]
-        if stage is Stage.simulate:
-            return -(-len(queue) // LARGEST_BATCH)
-        if stage is Stage.render:
-            shadings = [shading_of(task) for task in _renders(queue)]
-            return -(-shadings.count(None) // self._renders_at_once()) + len(set(shadings) - {None})
-        return len(queue)
-
-    def _assign(self, parts: list[list[Lease]], stage: Stage, process: Process) -> None:
-        if stage is Stage.render:
-            arguments: list[Any] = [merged(_renders(leases)).model_dump(mode="json") for leases in parts]
-            ref = process.actor.call.remote("render", arguments)
-        else:
-            arguments = [_tasks.dump_json([lease.task for lease in leases]).decode() for leases in parts]
-            ref = process.actor.call.remote("run", arguments)
-        limits = [[lease.limit_seconds for lease in leases if lease.limit_seconds is not None] for leases in parts]
-        limit = self._settings.exec_seconds[stage]
-        if sum(map(len, limits)) == sum(map(len, parts)):
-            # Tasks of a part are put together because they are alike: the longest limit is that of all of them.
-            limit = min(limit, sum(map(max, limits)))
-        assignment = Assignment(parts, stage, process, time.monotonic(), limit)
-        self._running[ref] = assignment
-        self._book.start(assignment.leases)
-
-    def _open_slots(self) -> int:
-        """Return how many calls may run now."""
-        return self._slots + (EXPRESS_SLOTS if self._is_clogged() else 0)
-
-    def _is_clogged(self) -> bool:
-        """Return whether all slots have been taken for long: then short tasks have a slot of their own."""
-        since = time.monotonic() - self._settings.clog_seconds
-        return sum(assignment.started_at < since for assignment in self._running.values()) >= self._slots
-
-    def _hand_back(self) -> None:
-        """Give back what was leased before all slots were taken for long: another dispatcher may have one free."""
-        if not self._was_clogged:
-            self._release_queued()
-        self._was_clogged = True
-
-    def _ask_for_frames(self) -> None:
-        """Ask simulations that take a while how far they are; heartbeats tell the coordinator."""
-        import ray
-
-        now = time.monotonic()
-        for assignment in self._running.values():
-            if assignment.stage is not Stage.simulate or len(assignment.leases) > 1:
-                continue
-            if assignment.asked is None:
-                if now > max(assignment.asked_at, assignment.started_at) + FRAMES_SECONDS:
-                    assignment.asked, assignment.asked_at = assignment.process.actor.frames.remote(), now
-            elif ray.wait([assignment.asked], timeout=0)[0]:
-                with contextlib.suppress(ray.exceptions.RayError):  # who has died is met in `_take_in`
-                    if (frames := ray.get(assignment.asked)) is not None:
-                        self._book.note_frames(assignment.leases[0], frames)
-                assignment.asked = None
+    def _express(self, calls: Calls) -> deque[Lease] | None:
+        """Return a queue of short tasks, if all CPUs have been taken for long."""
+        if self._short or not calls.is_clogged():
+            return self._short
+        short = (stage for stage in self._pace.order() if (self._pace.part(stage) or 1e9) < self._settings.clog_seconds)
+        return next((self._queues[stage] for stage in short if self._queues[stage]), None)
 
     # --- the coordinator ------------------------------------------------------------------------------------
-
-    def _find_builds(self) -> None:
-        """Start the first process of each pool and ask it what it is."""
-        self._stage_pool.grow(1)
-        self._render_pool.grow(1)
-        while not self._stopping and None in (self._stage_pool.description, self._render_pool.description):
-            self._collect(LONGEST_WAIT)
-            self._stage_pool.check_starts()
-            self._render_pool.check_starts()
-            self._stage_pool.grow(1)
-            self._render_pool.grow(1)
 
     def _open_session(self) -> None:
         """Register. What was leased in an earlier session is lost; the coordinator gives it out again."""
         if self._heartbeat is not None:
             self._heartbeat.stop()
             self._heartbeat = None
-        if self._session is not None:
-            log.warning("session %s is lost", self._session.worker_id)
-            self._session = None
         self._book.clear()
-        self._reports.clear()
-        stage, render = self._stage_pool.description, self._render_pool.description
-        assert stage is not None
-        assert render is not None
+        self._outbox.clear()
         registration = WorkerRegistration(
             name=self._settings.name,
-            builds={
-                name: Builds(**own, render=render["builds"][name])
-                for name, own in stage["builds"].items()
-                if name in render["builds"]
-            },
-            slots=self._slots,
-            versions={**stage["versions"], **render.get("versions", {})},
+            builds=common_builds(self._described),
+            versions={name: value for said in self._described.values() for name, value in said["versions"].items()},
+            condition=self._status.condition(),
         )
-        self._session = self._coordinator.register(registration)
+        session = self._coordinator.register(registration)
         self._next_lease = 0.0
-        self._heartbeat = HeartbeatThread(self._coordinator, self._session, self._book)
+        self._heartbeat = HeartbeatThread(self._coordinator, session, self._book, self._status)
         self._heartbeat.start()
-        log.info("registered as %s with %d slots", self._session.worker_id, self._slots)
+        log.info("registered as %s", session.worker_id)
 
-    def _report(self) -> bool:
-        """Send all reports; return whether there were any."""
-        assert self._session is not None
-        there_were = bool(self._reports)
-        while self._reports:
-            batch = tuple(islice(self._reports, REPORTS_A_REQUEST))
-            answer = self._coordinator.report(ReportBatch(worker_id=self._session.worker_id, reports=batch))
-            for report, verdict in zip(batch, answer.verdicts, strict=True):
-                self._reports.popleft()
-                self._book.remove(report.task_id, report.token)
-                if verdict.verdict == "stale":
-                    log.warning("the report of task %s came too late and was refused", report.task_id)
-        return there_were
+    def _worker_id(self) -> str:
+        assert self._heartbeat is not None
+        return self._heartbeat.worker_id
 
-    def _lease(self) -> bool:
+    def _lease(self, calls: Calls) -> bool:
         """Ask for work if some is wanted and it is time; return whether there was any."""
-        assert self._session is not None
-        wanted = self._wanted()
+        wanted = self._wanted(calls)
         if not wanted or time.monotonic() < self._next_lease:
             return False
-        clogged = self._is_clogged()
+        clogged = calls.is_clogged()
         at_most = self._settings.clog_seconds if clogged else None
-        request = LeaseRequest(worker_id=self._session.worker_id, wanted=wanted, at_most_seconds=at_most)
+        request = LeaseRequest(worker_id=self._worker_id(), wanted=wanted, at_most_seconds=at_most)
         batch = self._coordinator.lease(request)
         self._next_lease = time.monotonic() + max(batch.retry_after_seconds, EXPRESS_POLL_SECONDS if clogged else 0.0)
         self._book.add(batch.leases)
         for lease in batch.leases:
-            self._queues[Stage(lease.task.stage)].append(lease)
+            (self._short if clogged else self._queues[Stage(lease.task.stage)]).append(lease)
             if isinstance(lease.task, RenderTask):
-                self._renders_share = shading_of(lease.task) is not None
+                self._pace.renders_share = shading_of(lease.task) is not None
         return bool(batch.leases)
 
-    def _wanted(self) -> dict[Stage, int]:
+    def _wanted(self, calls: Calls) -> dict[Stage, int]:
         """Return how many tasks to ask for: little more than what can run, so that a kill gives little back."""
-        queued = sum(self._calls(stage) for stage in self._queues)
-        if self._is_clogged():
-            free = queued == 0 and len(self._running) < self._open_slots()
-            return {stage: LARGEST_BATCH if stage is Stage.simulate else 1 for stage in Stage} if free else {}
-        self._was_clogged = False
-        idle = self._slots - len(self._running) - queued
+        pace = self._pace
+        if calls.is_clogged():
+            is_free = not (self._express(calls) or any(one.is_express for one in calls))
+            return {stage: LARGEST_BATCH if stage is Stage.simulate else 1 for stage in Stage} if is_free else {}
+        queued = sum(pace.calls(stage, queue) for stage, queue in self._queues.items())
+        room = max(calls.room(is_long=pace.is_long()), 0)
         wanted = {}
-        for stage in (Stage.publish, Stage.pack, Stage.render):
-            ahead = self._ahead(stage)
-            if idle > 0 or queued <= ahead // 2:  # not for one at a time
-                wanted[stage] = ahead + idle
-        if wanted.get(Stage.render, 0) > 0:
-            wanted[Stage.render] *= RENDERS_TOGETHER if self._renders_share else self._renders_at_once()
-        if wanted and not self._queues[Stage.simulate]:
-            short = self._simulation_seconds is not None and self._simulation_seconds <= LONG_SIMULATION
-            wanted[Stage.simulate] = LARGEST_BATCH if short else self._slots
-        return {stage: count for stage, count in wanted.items() if count > 0}
-
-    def _ahead(self, stage: Stage) -> int:
-        """Return how many calls of a stage to keep waiting."""
-        seconds = self._part_seconds.get(stage, AHEAD_SECONDS)
-        if stage is Stage.render:
-            seconds *= self._renders_at_once()
-        return self._slots * round(min(max(AHEAD_SECONDS / max(seconds, 1e-3), 1), MOST_AHEAD))
+        for stage in Stage:
+            ahead = int(calls.cpus * pace.ahead(stage))
+            many = ahead + room if room > queued or queued <= ahead // 2 else 0  # not for one at a time
+            if many > 0 and not (stage is Stage.simulate and self._queues[stage]):
+                wanted[stage] = pace.wanted(stage, many)
+        return wanted
 
     # --- the end --------------------------------------------------------------------------------------------
 
     def _finish_running(self) -> None:
-        """Give running work a moment to end; what is queued goes back at once."""
+        """Give running work a moment to end; the rest goes back at once."""
         deadline = time.monotonic() + self._settings.stop_seconds
+        if self._calls is None:
+            return
+        for one in self._calls:
+            if one.started_at is None:
+                self._calls.forget(one)
+                self._release(one.leases)
         self._release_queued()
-        while self._running and time.monotonic() < deadline:
-            self._collect(min(LONGEST_WAIT, deadline - time.monotonic()))
+        while any(one.parts for one in self._calls) and time.monotonic() < deadline:
+            self._collect(self._calls, min(LONGEST_WAIT, deadline - time.monotonic()))
             self._try_to_report()
 
     def _give_back(self) -> None:
-        """End all processes and give all leases back, if the coordinator listens; it finds out by itself otherwise."""
+        """Give all leases back, if the coordinator listens. Ray ends what runs when this process is gone."""
+        calls = self._calls
+        for one in calls or ():
+            with contextlib.suppress(Exception):  # Ray may be gone
+                calls.forget(one)  # type: ignore[union-attr]
+            self._release(one.leases)
         self._release_queued()
-        if self._cluster.lost:
-            result = failed(Reason.worker_lost, f"{self._cluster.lost} of the Ray cluster died")
-            for assignment in self._running.values():
-                self._settle(assignment, [result] * len(assignment.leases))
-        else:
-            self._stage_pool.close()
-            self._render_pool.close()
-            for assignment in self._running.values():
-                for lease in assignment.leases:
-                    self._release(lease)
-        self._running.clear()
         for _ in range(3):
             if self._try_to_report():
                 break
@@ -568,58 +343,22 @@ class Dispatcher:
         self._coordinator.close()
 
     def _release_queued(self) -> None:
-        for queue in self._queues.values():
-            while queue:
-                self._release(queue.popleft())
+        for queue in (self._short, *self._queues.values()):
+            self._release(queue)
+            queue.clear()
 
-    def _release(self, lease: Lease) -> None:
-        if self._book.holds(lease):
-            self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=None))
+    def _release(self, leases: Iterable[Lease]) -> None:
+        for lease in leases:
+            self._outbox.add(lease, None)
 
     def _try_to_report(self) -> bool:
-        if self._session is None:
-            return True
         try:
-            self._report()
+            return self._heartbeat is None or self._outbox.send(self._worker_id()) in (True, False)
         except CoordinatorError as error:
             log.warning("could not report: %s", error)
             return False
-        return True
 
 
-def _next_batch(queue: deque[Lease]) -> list[Lease]:
-    """Take what one process can do together from `queue`: simulations of a kind, renders of a shading, or one task."""
-    batch = [queue.popleft()]
-    if isinstance(batch[0].task, RenderTask) and (shading := shading_of(batch[0].task)) is not None:
-        others = [lease for lease in queue if isinstance(lease.task, RenderTask) and shading_of(lease.task) == shading]
-        batch += others[: RENDERS_TOGETHER - 1]
-        for lease in batch[1:]:
-            queue.remove(lease)
-        return batch
-    simulated = _simulated_kind(batch[0])
-    limit = 1 if simulated is None else kind(simulated).batch
-    while queue and len(batch) < limit and _simulated_kind(queue[0]) == simulated:
-        batch.append(queue.popleft())
-    return batch
-
-
-def _read_results(answer: Any, leases: list[Lease]) -> list[TaskResult]:
-    """Return the result of each lease: the renderer answers with a dict, the stages with JSON."""
-    try:
-        if isinstance(answer, dict):
-            return split(_renders(leases), TaskResult.model_validate(answer))
-        return _results.validate_json(answer)
-    except ValidationError as error:
-        return [failure(error)] * len(leases)
-
-
-def _renders(leases: Iterable[Lease]) -> list[RenderTask]:
-    return [lease.task for lease in leases if isinstance(lease.task, RenderTask)]
-
-
-def _simulated_kind(lease: Lease) -> str | None:
-    return lease.task.simulation.kind if isinstance(lease.task, SimulateTask) else None
-
-
-def _names(leases: list[Lease]) -> str:
+def _names(one: Call) -> str:
+    leases = one.leases
     return leases[0].task_id if len(leases) == 1 else f"{leases[0].task_id} and {len(leases) - 1} more"

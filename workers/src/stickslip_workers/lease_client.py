@@ -5,13 +5,16 @@ import random
 import ssl
 import threading
 import time
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import httpx
 from pydantic import BaseModel
 from stickslip_schemas.documents.problems import ProblemCode
+from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -19,8 +22,10 @@ from stickslip_schemas.documents.worker_api import (
     LeaseBatch,
     LeaseRequest,
     LeaseState,
+    Report,
     ReportAnswer,
     ReportBatch,
+    WorkerCondition,
     WorkerRegistration,
     WorkerSession,
 )
@@ -32,6 +37,17 @@ Answer = TypeVar("Answer", bound=BaseModel)
 PROMPT = httpx.Timeout(30, connect=5)
 PATIENT = httpx.Timeout(300, connect=5)
 """Timeout of a lease and a report: for a version of a million samples, the coordinator lists or checks all files."""
+
+REPORTS_A_REQUEST = 512
+
+REPORT_SECONDS = 1.0
+"""How long a result waits for others to be reported with, while there is other work to go on with."""
+
+START_BEAT_SECONDS = 2.0
+"""Time between two heartbeats of a dispatcher that starts, which tell how far it is [s]."""
+
+REASON_LENGTH = 1000
+"""Limit of the reason of a state [characters]."""
 
 LAST_BEAT_SECONDS = 5.0
 """Time limit of a heartbeat in progress when the thread is stopped."""
@@ -68,11 +84,13 @@ def pinned(certificate: Path) -> ssl.SSLContext:
 class CoordinatorClient:
     """Client of the worker API. Thread-safe."""
 
-    def __init__(self, url: str, key: str | None = None, tls_certificate: Path | None = None) -> None:
+    def __init__(self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None) -> None:
         # trust_env=False: the coordinator is not reached through a proxy of the environment.
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         verify = True if tls_certificate is None else pinned(tls_certificate)
-        self._http = httpx.Client(base_url=url.rstrip("/"), headers=headers, verify=verify, trust_env=False)
+        self._http = httpx.Client(headers=headers, verify=verify, trust_env=False)
+        self._urls = deque(url.rstrip("/") for url in urls)
+        """Of coordinators with one database; the first one is asked."""
 
     def register(self, registration: WorkerRegistration) -> WorkerSession:
         """Register the dispatcher."""
@@ -95,21 +113,28 @@ class CoordinatorClient:
         self._http.close()
 
     def _post(self, path: str, document: BaseModel, answer: type[Answer], *, timeout: httpx.Timeout = PROMPT) -> Answer:
+        url = self._urls[0]
         try:
             response = self._http.post(
-                path,
+                url + path,
                 content=document.model_dump_json(),
                 headers={"Content-Type": "application/json"},
                 timeout=timeout,
             )
         except httpx.TransportError as error:
-            raise UnreachableError(f"{path}: {type(error).__name__}: {error}") from error
+            self._turn_from(url)
+            raise UnreachableError(f"{url}{path}: {type(error).__name__}: {error}") from error
         if response.status_code >= 500 or response.status_code == 429:
             raise UnreachableError(f"{path}: {response.status_code} {response.text[:500]}")
         if response.is_success:
             return answer.model_validate_json(response.content)
         kind = _ERRORS.get(_problem_code(response), RefusedError)
         raise kind(f"{path}: {response.status_code} {response.text[:500]}")
+
+    def _turn_from(self, url: str) -> None:
+        """Ask the next coordinator from now on, unless another thread has turned from this one already."""
+        if self._urls[0] == url:
+            self._urls.rotate(-1)
 
 
 _ERRORS: dict[str | None, type[CoordinatorError]] = {
@@ -209,20 +234,84 @@ class LeaseBook:
             return tuple(self._states.values())
 
 
+class Outbox:
+    """Results that wait to be reported."""
+
+    def __init__(self, coordinator: CoordinatorClient, book: LeaseBook) -> None:
+        self._coordinator = coordinator
+        self._book = book
+        self._reports: deque[Report] = deque()
+        self.due = 0.0
+        """When to report them at the latest."""
+
+    def __len__(self) -> int:
+        return len(self._reports)
+
+    def add(self, lease: Lease, result: TaskResult | None) -> None:
+        """Add a result, or the return of a lease, unless it is not held any more."""
+        if self._book.holds(lease):
+            if not self._reports:
+                self.due = time.monotonic() + REPORT_SECONDS
+            self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
+
+    def clear(self) -> None:
+        """Forget all, at the end of a session."""
+        self._reports.clear()
+
+    def send(self, worker_id: str) -> bool:
+        """Send all; return whether there were any."""
+        there_were = bool(self._reports)
+        while self._reports:
+            batch = tuple(islice(self._reports, REPORTS_A_REQUEST))
+            answer = self._coordinator.report(ReportBatch(worker_id=worker_id, reports=batch))
+            for report, verdict in zip(batch, answer.verdicts, strict=True):
+                self._reports.popleft()
+                self._book.remove(report.task_id, report.token)
+                if verdict.verdict == "stale":
+                    log.warning("the report of task %s came too late and was refused", report.task_id)
+        return there_were
+
+
+class Status:
+    """How the dispatcher is, which its heartbeats tell. It starts as `starting`."""
+
+    def __init__(self, reason: Callable[[], str]) -> None:
+        self.state: Literal["starting", "ready"] = "starting"
+        self.slots = 0
+        self.reason = reason
+        """Returns why it is not ready, or what is wrong with its cluster."""
+
+    def condition(self) -> WorkerCondition:
+        """Return what to tell the coordinator."""
+        return WorkerCondition(state=self.state, slots=self.slots, reason=self.reason()[:REASON_LENGTH])
+
+
 class HeartbeatThread(threading.Thread):
-    """Renews leases from a thread of its own, three times in the duration of a lease.
+    """Renews leases from a thread of its own, three times in the duration of a lease, and more often at the start.
 
     It is a daemon and never keeps the process alive.
     """
 
-    def __init__(self, coordinator: CoordinatorClient, session: WorkerSession, book: LeaseBook) -> None:
+    def __init__(self, coordinator: CoordinatorClient, session: WorkerSession, book: LeaseBook, status: Status) -> None:
         super().__init__(name="heartbeat", daemon=True)
         self._coordinator = coordinator
         self._session = session
         self._book = book
+        self._status = status
+        self.worker_id = session.worker_id
         self._ended = threading.Event()
         self.session_lost = threading.Event()
         """Set when the coordinator no longer knows the session; the thread then ends."""
+
+    def beat(self) -> None:
+        """Send one heartbeat."""
+        states = self._book.states()
+        answer = self._coordinator.heartbeat(
+            Heartbeat(worker_id=self.worker_id, leases=states, condition=self._status.condition())
+        )
+        if answer.drop:
+            log.info("dropping %d tasks", len(answer.drop))
+            self._book.drop(answer.drop, as_of=states)
 
     def stop(self) -> None:
         """Stop; a heartbeat in progress may end first, because its connection is about to be closed."""
@@ -232,19 +321,14 @@ class HeartbeatThread(threading.Thread):
     def run(self) -> None:
         """Send heartbeats until `stop`."""
         interval = self._session.lease_seconds / 3
-        wait = interval
+        wait = min(START_BEAT_SECONDS, interval)
         while not self._ended.wait(wait):
-            states = self._book.states()
+            wait = interval if self._status.state == "ready" else min(START_BEAT_SECONDS, interval)
             try:
-                answer = self._coordinator.heartbeat(Heartbeat(worker_id=self._session.worker_id, leases=states))
+                self.beat()
             except UnknownWorkerError:
                 self.session_lost.set()
                 return
             except CoordinatorError as error:
                 log.warning("no heartbeat: %s", error)
                 wait = min(1.0, interval)  # the lease runs out: a failed heartbeat is repeated
-                continue
-            wait = interval
-            if answer.drop:
-                log.info("dropping %d tasks", len(answer.drop))
-                self._book.drop(answer.drop, as_of=states)

@@ -30,7 +30,7 @@ def failure(error: Exception) -> TaskResult:
 
 
 def process_failure(error: Exception, *, renders: bool) -> TaskResult:
-    """Return the result of a task whose process raised `error` through Ray, or died."""
+    """Return the result of a task of Ray that raised `error`, or whose process or node died."""
     from ray import exceptions as ray_errors
 
     if isinstance(error, ray_errors.RayTaskError):
@@ -38,9 +38,7 @@ def process_failure(error: Exception, *, renders: bool) -> TaskResult:
         return failure(error.cause) if isinstance(error.cause, Exception) else failed(Reason.internal_error, str(error))
     if isinstance(error, ray_errors.OutOfMemoryError):
         return failed(Reason.oom_killed, str(error))
-    # An actor that is unavailable has lost its connection; Ray does not know whether it died.
-    is_node_lost = isinstance(error, ray_errors.ActorUnavailableError) or "its node has died" in str(error)
-    if isinstance(error, ray_errors.RayActorError) and not is_node_lost:
+    if isinstance(error, ray_errors.WorkerCrashedError):
         return failed(Reason.renderer_crash if renders else Reason.process_crash, str(error))
     return failed(Reason.worker_lost, str(error))
 

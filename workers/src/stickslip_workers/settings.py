@@ -16,8 +16,8 @@ RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
 class Settings:
     """Options of a dispatcher. Times are in seconds."""
 
-    url: str
-    """Base URL of the coordinator."""
+    urls: tuple[str, ...]
+    """Base URLs of coordinators with one database: the next one is asked where one does not answer."""
     store: str
     """Place of the store, see `store_place`. A directory is the same on every node."""
     name: str
@@ -26,20 +26,16 @@ class Settings:
     """What the coordinator wants to be shown by workers; None if it wants nothing."""
     tls_certificate: Path | None = None
     """Certificate of the coordinator, trusted by itself; None: the usual check of certificates."""
-    slots: int | None = None
-    """Number of tasks that run at once; by default the CPUs of the cluster."""
-    ray_address: str | None = None
-    """An existing Ray cluster; by default one of its own on this machine, which ends with the dispatcher."""
+    max_cpus: int | None = None
+    """The most CPUs of the Ray cluster to use at once; by default as many as there are, and what it may grow by."""
 
     blender_python: Path = field(default_factory=lambda: default_blender_python())
     render_device: str = field(default_factory=lambda: os.environ.get(RENDER_DEVICE) or CPU)
-    """What Cycles computes on: `cpu`, or a sort of GPU. A render process asks Ray for a whole GPU."""
+    """What Cycles computes on: `cpu`, or a sort of GPU."""
+    render_gpus: float = 1.0
+    """GPUs that a render process takes of those of Ray, where it computes on one; fractions share a GPU."""
     render_actor: str = RENDER_ACTOR
     """Class, in the Blender interpreter, that is made with the root of the store and has `describe` and `render`."""
-    renders_per_process: int = 1000
-    """Renders after which a process gives way to a fresh one: Blender's memory grows slowly."""
-    process_bytes: int = 4 * 2**30
-    """Resident memory at which a process gives way to a fresh one [bytes]."""
 
     exec_seconds: dict[Stage, float] = field(
         default_factory=lambda: {Stage.simulate: 6 * 3600, Stage.render: 1800, Stage.pack: 600, Stage.publish: 3600}
@@ -47,9 +43,9 @@ class Settings:
     """Limit of one task, or batch of simulations, by stage; then its process is killed. Cloth takes minutes, and hours
     with the thesis's time steps."""
     clog_seconds: float = 10
-    """With all slots taken for longer than this, tasks that take less go on beside them."""
+    """With all CPUs taken for longer than this, tasks that take less go on beside them."""
     start_seconds: float = 120
-    """Limit for a process to be scheduled by Ray and to start; then the dispatcher ends with an error."""
+    """The coordinator hears of a call that Ray has not started for longer, with CPUs free."""
     drop_seconds: float = 5
     """How long work that nobody wants any more may go on before its process is killed."""
     stop_seconds: float = 8

@@ -9,6 +9,7 @@ from pydantic import Field
 from stickslip_schemas.base.document import Document, Int
 from stickslip_schemas.base.keys import ArtifactRef, Sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds
 
@@ -197,7 +198,7 @@ class WorkerEntry(Document):
 
     id: str
     name: str
-    slots: int
+    condition: WorkerCondition
     builds: dict[str, Builds] = Field(description="builds by kind")
     versions: dict[str, str]
     registered_at: datetime

@@ -14,16 +14,23 @@ MAX_SLOTS = 100_000
 """The most tasks that one dispatcher may run at once."""
 
 
+class WorkerCondition(Document):
+    """How a dispatcher is: `starting` until its Ray cluster answers."""
+
+    state: Literal["starting", "ready"] = "ready"
+    slots: Int = Field(ge=0, le=MAX_SLOTS, description="number of tasks that run at once")
+    reason: str = Field(default="", max_length=1000, description="why it is not ready, or what is wrong; for people")
+
+
 class WorkerRegistration(Document):
     """Registration of a dispatcher. A second one with the same `name` revokes the leases of the first."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
     builds: dict[str, Builds] = Field(
-        min_length=1,
-        description="builds by kind",
+        description="builds by kind; none while it looks for them",
         json_schema_extra={"propertyNames": {"enum": list(KINDS)}},
     )
-    slots: Int = Field(ge=1, le=MAX_SLOTS, description="number of tasks that run at once")
+    condition: WorkerCondition
     versions: dict[str, str] = Field(default_factory=dict, description="for people: sim_core, blender, ray, ...")
 
     @field_validator("builds")
@@ -86,10 +93,11 @@ class LeaseState(Document):
 
 
 class Heartbeat(Document):
-    """Renew the leases."""
+    """Renew the leases, and tell how the dispatcher is."""
 
     worker_id: str
     leases: tuple[LeaseState, ...]
+    condition: WorkerCondition
 
 
 class HeartbeatAnswer(Document):

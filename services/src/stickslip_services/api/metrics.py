@@ -42,7 +42,7 @@ class _QueueCollector(Collector):
         for worker in alive:
             leases.add_metric([worker.name], held.get(worker.id, 0))
         workers.add_metric([], len(alive))
-        slots.add_metric([], sum(worker.slots for worker in alive))
+        slots.add_metric([], sum(worker.condition.slots for worker in alive))
         etas = CounterMetricFamily(
             "stickslip_eta_predictions",
             "ETA intervals, recorded every 5 s, by whether the job ended within; 80 % should hold",

@@ -61,9 +61,11 @@ def up(
     ] = False,
     tls_certificate: Annotated[Path | None, typer.Option(help="file with the certificate and its chain")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="file with the private key of the certificate")] = None,
-    dispatcher: Annotated[str | None, typer.Option(hidden=True, help="another dispatcher, for tests")] = None,
+    workers: Annotated[
+        str | None, typer.Option("--workers", hidden=True, help="another program than stickslip_workers, for tests")
+    ] = None,
 ) -> None:
-    """Run a coordinator and a dispatcher with their workers on this machine, until Ctrl-C."""
+    """Run a coordinator, a Ray and a dispatcher on this machine, until Ctrl-C."""
     require_server()
     from stickslip_services.database.database import Role  # the server's packages may be missing
     from stickslip_services.database.opening import check
@@ -83,7 +85,7 @@ def up(
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
-        supervisor.LocalService(settings, name or _name(settings), slots, dispatcher),
+        supervisor.LocalService(settings, name or _name(settings), slots, workers),
         on_ready=lambda url: screen.print(
             f"stickslip is up. Dashboard: [bold]{url}[/]\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"
@@ -101,15 +103,20 @@ def workers(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
         found = client.workers()
     if as_json:
         return print_json(found)
-    shown = table("worker", "kinds", "slots", "tasks", "last seen", no_wrap=("worker",))
+    shown = table("worker", "kinds", "state", "slots", "tasks", "last seen", no_wrap=("worker",))
     now = datetime.now(UTC)
     for worker in found:
         ago = duration(max(0.0, (now - worker.last_seen_at).total_seconds()))
         shown.add_row(
             worker.name,
             ", ".join(worker.builds),
-            str(worker.slots),
+            worker.condition.state,
+            str(worker.condition.slots),
             str(worker.leased),
             f"{ago} ago" if worker.alive else f"[red]{ago} ago: not connected[/]",
         )
-    return console().print(shown)
+    console().print(shown)
+    for worker in found:
+        if worker.condition.reason:
+            console().print(f"{escape(worker.name)}: {escape(worker.condition.reason)}", soft_wrap=True)
+    return None

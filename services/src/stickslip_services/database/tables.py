@@ -47,7 +47,7 @@ workers = Table(
     Column("id", String, nullable=False, unique=True),
     Column("name", String, nullable=False, index=True),
     Column("builds", Text, nullable=False),  # JSON: by kind
-    Column("slots", Integer, nullable=False),
+    Column("condition", Text, nullable=False),  # JSON
     Column("versions", Text, nullable=False),  # JSON
     Column("registered_at", Float, nullable=False),
     Column("last_seen_at", Float, nullable=False),

@@ -1,4 +1,4 @@
-"""`stickslip up`: a coordinator and a dispatcher on this machine, restarted until the supervisor stops.
+"""`stickslip up`: a coordinator, a Ray and a dispatcher on this machine, restarted until the supervisor stops.
 
 All files are below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (the address) and `lock` (against a
 second supervisor). Children that die are restarted with growing delays. A child that dies repeatedly at its start ends
@@ -33,7 +33,7 @@ START_SECONDS = 180.0
 SOON_SECONDS = 5.0
 """A child that dies within this time of its start has failed to start [s]."""
 MAX_FAILED_STARTS = 5
-STOP_SECONDS = {"dispatcher": 6.0, "coordinator": 4.0}
+STOP_SECONDS = {"dispatcher": 6.0, "ray": 4.0, "coordinator": 4.0}
 """Time limit for each child to stop before it is killed [s]."""
 _TICK = 0.1
 _PR_SET_PDEATHSIG = 1
@@ -48,7 +48,7 @@ class LocalService:
     name: str = "local"
     """Name of the dispatcher among all that have the same database."""
     slots: int | None = None
-    dispatcher: str | None = None
+    workers: str | None = None
     """Another command than `python -m stickslip_workers`, for tests."""
 
 
@@ -157,13 +157,15 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
             (lock, listener.fileno()),
             None if settings.database is None else settings.database.get_secret_value(),
         )
+        ray = _Child("ray", _ray_command(service, data), data / "logs" / "ray.log")
         dispatcher = _Child("dispatcher", _dispatcher_command(service, settings), data / "logs" / "dispatcher.log")
-        children = [coordinator, dispatcher]
+        children = [coordinator, ray, dispatcher]
         try:
             coordinator.start()
             if not _wait_until_ready(settings, coordinator, signals):
                 return 0
             write_durably(data / "url", f"{settings.url}\n".encode())
+            ray.start()
             dispatcher.start()
             on_ready(settings.url)
             while not signals:
@@ -172,7 +174,7 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
                 time.sleep(_TICK)
             return 0
         finally:
-            for child in (dispatcher, coordinator):  # the dispatcher first, which returns its leases
+            for child in reversed(children):  # the dispatcher first, which returns its leases
                 child.stop(lambda: len(signals) > 1)
             (data / "url").unlink(missing_ok=True)
 
@@ -195,15 +197,23 @@ def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     return [sys.executable, "-m", module, *place, *auth]
 
 
+def _workers_program(service: LocalService) -> list[str]:
+    return [sys.executable, "-m", "stickslip_workers"] if service.workers is None else shlex.split(service.workers)
+
+
+def _ray_command(service: LocalService, data: Path) -> list[str]:
+    slots = [] if service.slots is None else ["--cpus", str(service.slots)]
+    return [*_workers_program(service), "head", "--ray-data", str(data), *slots]
+
+
 def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
-    program = [sys.executable, "-m", "stickslip_workers"]
-    if service.dispatcher is not None:
-        program = shlex.split(service.dispatcher)
-    slots = [] if service.slots is None else ["--slots", str(service.slots)]
     pinned = [] if settings.tls_certificate is None else ["--tls-certificate", str(settings.tls_certificate)]
     return [
-        *program,
+        *_workers_program(service),
         "dispatch",
+        "--once",
+        "--ray-data",
+        str(settings.data),
         "--url",
         settings.url,
         "--store",
@@ -213,7 +223,6 @@ def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
         "--key-file",
         str(settings.worker_key_path),
         *pinned,
-        *slots,
     ]
 
 

@@ -17,6 +17,7 @@ from stickslip_schemas.documents.worker_api import (
     LeaseBatch,
     LeaseRequest,
     LeaseState,
+    WorkerCondition,
     WorkerRegistration,
     WorkerSession,
 )
@@ -74,7 +75,7 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         due = is_sweep_due(connection, context.clock())
         ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
         waiting = ready or has_runnable_job(connection)
-    _note_seen(context, worker)
+    _note_seen(context, worker, worker.condition)
     if due:
         take_back(context)
     if context.store_watch.trouble:
@@ -95,7 +96,7 @@ def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
     """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
     with context.database.read() as connection:
         worker = find_worker(connection, message.worker_id)
-    _note_seen(context, worker)
+    _note_seen(context, worker, message.condition)
     context.frames_by_worker[worker.id] = {
         lease.task_id: lease.frames for lease in message.leases if lease.frames is not None
     }
@@ -107,11 +108,13 @@ def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
     return HeartbeatAnswer(drop=drop)
 
 
-def _note_seen(context: Context, worker: RegisteredWorker) -> None:
+def _note_seen(context: Context, worker: RegisteredWorker, condition: WorkerCondition) -> None:
     """Store that a worker is alive, unless that was done a moment ago: a poll is not worth a write."""
-    if is_silent(context, worker):
+    if is_silent(context, worker) or condition != worker.condition:
         with context.database.write() as connection:
-            note_seen(connection, worker.id, context.clock())
+            note_seen(connection, worker.id, context.clock(), condition)
+    if condition.state != worker.condition.state:
+        note_stranded(context)
 
 
 def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:

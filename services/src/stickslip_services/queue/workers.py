@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, bindparam, func, insert, select, text, update
 from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents import responses
-from stickslip_schemas.documents.worker_api import WorkerRegistration
+from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.clock import as_datetime
@@ -22,7 +22,7 @@ from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id, task_id
 from stickslip_services.queue.ledger import RUNNABLE
 
-NO_WORKER = "no worker has registered yet; the job is planned when one does"
+NO_WORKER = "no worker has told its builds yet; the job is planned when one does (see the workers page)"
 
 
 def stage_builds(builds: Builds) -> dict[Stage, str]:
@@ -43,7 +43,7 @@ class RegisteredWorker:
     name: str
     builds: Mapping[str, Builds]
     """Builds by kind."""
-    slots: int
+    condition: WorkerCondition
     versions: dict[str, str]
     registered_at: float
     last_seen_at: float
@@ -68,7 +68,7 @@ def insert_worker(connection: Connection, registration: WorkerRegistration, now:
             id=worker_id,
             name=registration.name,
             builds=json.dumps({kind: builds.model_dump() for kind, builds in registration.builds.items()}),
-            slots=registration.slots,
+            condition=registration.condition.model_dump_json(),
             versions=json.dumps(registration.versions),
             registered_at=now,
             last_seen_at=now,
@@ -105,9 +105,9 @@ def present_workers(connection: Connection, *, seen_since: float | None = None) 
 def builds_for(connection: Connection, kind: str) -> Builds | None:
     """Return the builds for new jobs of `kind`: those of the newest worker that makes it.
 
-    None if no worker has ever registered; raise KindNotAvailableError where none of those makes it.
+    None if no worker has ever told its builds; raise KindNotAvailableError where none of those makes it.
     """
-    workers = present_workers(connection)
+    workers = [worker for worker in present_workers(connection) if worker.builds]
     if not workers:
         return None
     for worker in workers:
@@ -122,9 +122,12 @@ def other_sessions(connection: Connection, name: str) -> list[str]:
     return list(connection.scalars(select(workers.c.id).where(workers.c.name == name)))
 
 
-def note_seen(connection: Connection, worker_id: str, now: float) -> None:
-    """Store the time of a worker's last message."""
-    connection.execute(update(workers).where(workers.c.id == worker_id).values(last_seen_at=now))
+def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition | None = None) -> None:
+    """Store the time of a worker's last message, and how it is where that has changed."""
+    values: dict[str, Any] = {"last_seen_at": now}
+    if condition is not None:
+        values["condition"] = condition.model_dump_json()
+    connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 
 
 def is_silent(context: Context, worker: RegisteredWorker) -> bool:
@@ -137,7 +140,7 @@ def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | 
     if builds is None:
         return 0
     needed = stage_builds(Builds.model_validate_json(builds))
-    return sum(worker.slots for worker in workers if worker.stage_builds(kind) == needed)
+    return sum(worker.condition.slots for worker in workers if worker.stage_builds(kind) == needed)
 
 
 def leased_counts(connection: Connection) -> dict[str, int]:
@@ -179,7 +182,7 @@ def show_workers(context: Context, connection: Connection) -> list[responses.Wor
         responses.WorkerEntry(
             id=worker.id,
             name=worker.name,
-            slots=worker.slots,
+            condition=worker.condition,
             builds=dict(worker.builds),
             versions=worker.versions,
             registered_at=as_datetime(worker.registered_at),
@@ -202,7 +205,7 @@ def _worker(row: Any) -> RegisteredWorker:
         id=row.id,
         name=row.name,
         builds=_builds(row.builds),
-        slots=row.slots,
+        condition=WorkerCondition.model_validate_json(row.condition),
         versions=json.loads(row.versions),
         registered_at=row.registered_at,
         last_seen_at=row.last_seen_at,
@@ -244,6 +247,9 @@ def _find_stranded(context: Context, connection: Connection) -> dict[int, str]:
 def _stranded_message(kind: str, builds: Builds, alive: list[RegisteredWorker]) -> str:
     if not alive:
         return "no worker is connected; the job goes on when one is"
+    if all(worker.condition.state == "starting" for worker in alive):
+        names = ", ".join(worker.name for worker in alive)
+        return f"the workers are not ready: {names}; `stickslip workers` says why"
     makers = [worker for worker in alive if kind in worker.kinds]
     if not makers:
         return f"no connected worker makes {kind!r}; the job goes on when one does"

@@ -1,0 +1,93 @@
+"""`ray start --head --block` for one machine, which `stickslip up` keeps alive: loopback only, with a token.
+
+The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then (ray-project/ray#65983). It
+does not wait for ports that it is told. One of them is no option of `ray start`, so a private function of Ray adds it.
+"""
+
+import os
+import secrets
+import shutil
+import socket
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+from stickslip_schemas.base.keys import sha256
+
+OBJECT_STORE_BYTES = 128 * 2**20
+"""Tasks and results are small: bulk data goes through the store."""
+
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # everything listens on loopback, as on those systems
+    "RAY_enable_pipe_based_agent_to_parent_health_check": "1",  # agents end with their raylet, at once
+    "RAY_worker_register_timeout_seconds": "600",  # Python may import slowly
+    "RAY_enable_metrics_collection": "0",
+    "RAY_event_stats": "0",
+    "RAY_task_events_report_interval_ms": "0",  # nobody reads the history of tasks
+    "RAY_prestart_worker_first_driver": "0",
+    "RAY_raylet_report_resources_period_milliseconds": "1000",  # small tasks cost less where Ray looks seldom
+    "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
+    "RAY_memory_monitor_refresh_ms": "1000",
+}
+"""Settings of a head for one machine."""
+
+
+def own_directory(data: Path) -> Path:
+    """Return the directory of the head of a data directory. Sockets below it must have paths of at most 107 bytes."""
+    root = Path(tempfile.gettempdir())
+    root = (root if len(str(root)) <= 20 else Path("/tmp")) / f"stickslip-ray-{os.getuid()}"
+    root.mkdir(mode=0o700, exist_ok=True)
+    if root.stat().st_uid != os.getuid():
+        raise PermissionError(f"{root} must belong to this user")
+    return root / sha256(str(data).encode())[:8]
+
+
+def main(directory: Path, cpus: int | None) -> None:
+    """Start, write `token` and `address` to a directory, and block."""
+    shutil.rmtree(directory, ignore_errors=True)  # of an earlier head
+    directory.mkdir(exist_ok=True)
+    (directory / "token").touch(mode=0o600)
+    (directory / "token").write_text(secrets.token_hex(32))
+    cpus = cpus or len(os.sched_getaffinity(0))
+    # Idle processes stay, one of each interpreter and CPU and some more: Blender takes seconds to start.
+    os.environ |= SETTINGS | {"RAY_num_workers_soft_limit": str(max(16, 3 * cpus))}
+    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(directory / "token")}
+    from ray._private import services
+    from ray.scripts.scripts import main as ray
+
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(5)]
+        for free in sockets:
+            free.bind(("127.0.0.1", 0))
+        port, *ports = (free.getsockname()[1] for free in sockets)
+    start = services.start_ray_process
+
+    def start_ray_process(command: list[str], *arguments: object, **options: object) -> object:
+        if command[0] == services.RAYLET_EXECUTABLE:
+            command.append(f"--dashboard_agent_listen_port={ports[0]}")
+        return start(command, *arguments, **options)
+
+    services.start_ray_process = start_ray_process
+    told = ("dashboard-agent-listen-port", "dashboard-agent-grpc-port", "runtime-env-agent-port", "metrics-export-port")
+    options = {
+        "port": port,
+        "num-cpus": cpus,
+        "node-ip-address": "127.0.0.1",
+        "temp-dir": directory,
+        "object-store-memory": OBJECT_STORE_BYTES,
+        "include-dashboard": "false",
+        "include-log-monitor": "false",
+        **dict(zip(told, ports, strict=True)),
+    }
+    (directory / "address").write_text(f"127.0.0.1:{port}")
+    sys.argv = [
+        "ray",
+        "start",
+        "--head",
+        "--block",
+        "--no-monitor",
+        *(f"--{name}={value}" for name, value in options.items()),
+    ]
+    ray()
