@@ -13,6 +13,7 @@ from fastapi import FastAPI
 from PIL import Image
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState
+from stickslip_schemas.scene.library import load_scene
 from stickslip_services.api.routes.pages.jobs import _changes
 from stickslip_services.app import make_app
 from stickslip_services.pages.plots import line_plot
@@ -191,3 +192,25 @@ def test_a_plot_escapes_names_and_leaves_out_what_is_not_finite() -> None:
     assert plot.count(",") >= 2
     assert "a&lt;b" in plot
     assert "nan" not in plot
+
+
+def test_scenes_have_pages_with_their_parameters(client: httpx.Client) -> None:
+    listed = read(client, "/scenes")
+    digest = load_scene("turning-ball").digest
+    assert f'<a href="/scenes/{digest}">turning-ball</a>' in listed
+    page = read(client, f"/scenes/{digest}")
+    assert "stickslip scene preview turning-ball" in page
+    assert all(name in page for name in ("mu", "speed", "rad/s", "bodies.ball.motion.spin.speed"))
+    assert client.get(f"/scenes/{'0' * 64}").status_code == 404
+
+
+def test_a_scene_of_a_job_is_listed(app: FastAPI, client: httpx.Client) -> None:
+    context = app.state.context
+    PretendWorker(DirectApi(context), context.store, kinds=("cloth_scene",)).register()
+    axes = {"texture": "dots", "viewpoint": "front"}
+    scene = load_scene("turning-ball").model_dump(mode="json") | {"name": "my-ball", "description": "<b>mine</b>"}
+    spec = {"kind": "cloth_scene", "scene": scene, "axes": axes, "allow_uncertified": True}
+    assert client.post("/v1/jobs", json=spec).status_code == 202
+    found = re.search(r'href="(/scenes/[0-9a-f]{64})">my-ball<', read(client, "/scenes"))
+    assert found
+    assert "&lt;b&gt;mine&lt;/b&gt;" in read(client, found[1])

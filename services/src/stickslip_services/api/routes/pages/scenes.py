@@ -1,0 +1,25 @@
+"""Pages of scenes: the list, and one scene."""
+
+from fastapi import APIRouter, Response
+
+from stickslip_services.api.routes.common import ContextDep
+from stickslip_services.api.routes.pages.common import html_page
+from stickslip_services.catalog.scenes import find_scene, known_scenes
+
+router = APIRouter()
+
+
+@router.get("/scenes")
+def get_scenes(context: ContextDep) -> Response:
+    """Show the scenes."""
+    with context.database.read() as connection:
+        scenes = known_scenes(connection)
+    return html_page("scenes.html", here="scenes", scenes=scenes)
+
+
+@router.get("/scenes/{digest}")
+def get_scene(digest: str, context: ContextDep) -> Response:
+    """Show a scene: how it looks, its parameters, and the datasets made of it."""
+    with context.database.read() as connection:
+        known = find_scene(connection, digest)
+    return html_page("scene.html", here="scenes", known=known, scene=known.scene)
