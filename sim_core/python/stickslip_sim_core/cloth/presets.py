@@ -43,13 +43,13 @@ class SolverSettings:
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
 
-    step_error: float | None = 1.2e-4
+    step_error: float | None = 2e-4
     """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: `time_step`."""
 
-    longest_step: float = 0.25
+    longest_step: float = 0.125
     """Longest step where steps are chosen by `step_error` [s], at most 1."""
 
-    finest: int = 128
+    finest: int = 64
     """Parts, a power of two, that the longest step is cut into at most for the sake of `step_error`; steps that do not
     converge are halved further."""
 
@@ -96,9 +96,9 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
         settings.name: settings
         for settings in (
             SolverSettings("certified", 0.02),
-            SolverSettings("fast", 0.04, tolerance=2e-4, step_error=3e-4, finest=32),
+            SolverSettings("fast", 0.04, tolerance=2e-4, step_error=4e-4, finest=16),
             # Where frames are compared.
-            SolverSettings("fine", 0.01, tolerance=5e-5, step_error=2e-5, longest_step=0.125),
+            SolverSettings("fine", 0.01, tolerance=5e-5, step_error=2e-5, longest_step=0.0625),
             # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
             SolverSettings("thesis-high", 0.0005, step_error=None),
             SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, **_CUT_OFF),
