@@ -1,12 +1,12 @@
 """Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its protocols.
 
-    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [facets] [sphere] [drops] [momentum] [protocols]
+    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [facets] [drops] [momentum] [protocols]
         [--only PREFIX] [--figures FOLDER]
 
 `camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
 with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
 `stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames and all 300. `facets`:
-capstan over cylinders of triangles, and over a cloth. `sphere`: a cloth on a sphere that turns, of triangles and round.
+capstan over cylinders of triangles, and over a cloth.
 `drops`: sheets fall, fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see
 what crosses.
 `momentum`: what forces of pairs and their moments add up to. `protocols`: those of contact, with their settings; the
@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from stickslip_schemas.scene.library import load_scene
 from stickslip_sim_core import (
     Body,
     Cloth,
     SelfContact,
     fabric,
-    isotropic,
     plane,
     preset_named,
     protocols,
@@ -38,11 +38,9 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import THICKNESS
 from stickslip_sim_core.protocols import capstan
 from stickslip_sim_core.reference import master_curves
-from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere
-from stickslip_sim_core.scenes.cloth_sphere import SETTLING
+from stickslip_sim_core.scenes import cloth_drag, cloth_scene
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_testing import tumbles
-from stickslip_testing.spheres import of_triangles
 
 PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "capstan": {},
@@ -99,7 +97,11 @@ def stretched(vertices: int, frames: int) -> None:
     begin = time.process_time()
     cloth_drag.scene("gray-interlock", 0.5, mesh=vertices, frames=frames, self_friction=None).run()
     between = time.process_time()
-    cloth = cloth_on_cloth.scene("gray-interlock", "11oz-black-denim", 0.5, mesh=vertices, frames=frames).run()
+    document = load_scene("on-cloth").physics()
+    document["duration"] = (frames - 1) / document["frame_rate"]
+    for sheet in document["sheets"].values():
+        sheet["mesh"]["cells"] = [vertices - 1] * 2
+    cloth = cloth_scene.scene(document).run()
     seconds = between - begin, time.process_time() - between
     print(
         f"{vertices} x {vertices}, {frames} frames, over a floor {seconds[0]:.1f} CPU s, over a stretched cloth "
@@ -174,25 +176,6 @@ def over_facets() -> None:
             )
 
 
-def turned_spheres() -> None:
-    """Turn a sphere of ever finer triangles below a stiff cloth, and compare with a round one."""
-    felt = isotropic(0.3, 500.0, 2e-4)
-    found = []
-    for subdivisions in (None, 2, 3, 4):
-        begin = time.process_time()
-        of_bodies = cloth_sphere.scene(felt, 0.3, mesh=41, frames=75)
-        scene = (of_bodies if subdivisions is None else of_triangles(of_bodies, 0.3, subdivisions)).run()
-        found.append(scene)
-        settled, off = scene.times > 0.75 * SETTLING, np.abs(scene.positions - found[0].positions).max(axis=(1, 2))
-        print(
-            f"sphere of {'no triangles' if subdivisions is None else 20 * 4**subdivisions}: "
-            f"{time.process_time() - begin:.1f} CPU s, {scene.unconverged_steps} of {scene.steps} steps unconverged, "
-            f"bears {scene.record['sphere_force'][settled, 2].mean():.6f} N; "
-            f"off the round one by {1e3 * off[settled][0]:.2g} mm at rest, {1e3 * off[-1]:.2g} mm at the end",
-            flush=True,
-        )
-
-
 def measure_all(only: str, figures: Path | None) -> None:
     for name, settings in PROTOCOLS.items():
         if name.startswith(only):
@@ -219,7 +202,6 @@ PARTS: Mapping[str, Callable[[str], None]] = {
     "drops": tumble_all,
     "momentum": lambda _: momentum_all(),
     "facets": lambda _: over_facets(),
-    "sphere": lambda _: turned_spheres(),
 }
 
 

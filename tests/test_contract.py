@@ -7,16 +7,14 @@ from typing import Any
 import pytest
 import stickslip_sim_core
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import KINDS, UnknownKindError, job_spec_adapter
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION, ClothSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
-from stickslip_schemas.kinds.cloth_sphere import ClothSphereSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
-from stickslip_schemas.kinds.shawl import BONES, SKIN_TRIANGLES, SKIN_VERTICES, ShawlSpec, Swing
 from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
@@ -25,7 +23,7 @@ from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth.bodies import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
-from stickslip_sim_core.scenes import character, cloth_drag, cloth_sphere, shawl
+from stickslip_sim_core.scenes import cloth_drag
 from stickslip_testing.samples import samples
 from stickslip_testing.worker import BUILDS
 from stickslip_training.benchmark.sets import load_set
@@ -44,21 +42,6 @@ def test_materials_presets_and_kernels_have_one_name() -> None:
 
 def test_instants_are_those_of_the_scenes() -> None:
     assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (cloth_drag.FRAMES, cloth_drag.FRAME_RATE)
-    assert (ClothSphereSpec.instants, ClothSphereSpec.instants_per_second) == (
-        cloth_sphere.FRAMES,
-        cloth_sphere.FRAME_RATE,
-    )
-
-
-def test_the_figure_of_the_shawl_is_the_cores() -> None:
-    assert (ShawlSpec.instants, ShawlSpec.instants_per_second) == (shawl.FRAMES, shawl.FRAME_RATE)
-    assert character.figure().rest.shape == (SKIN_VERTICES, 3)
-    assert character.figure().triangles.shape == (SKIN_TRIANGLES, 3)
-    assert character.bones(0.0).shape == (BONES, 3, 4) == (len(character.BONES), 3, 4)
-    assert ShawlSpec.model_json_schema()["properties"]["mesh"]["minimum"] == shawl.VERTICES_MIN
-    TypeAdapter(Swing).validate_python(shawl.SWING_MAX)
-    with pytest.raises(ValidationError, match=f"less than or equal to {shawl.SWING_MAX:g}"):
-        TypeAdapter(Swing).validate_python(shawl.SWING_MAX + 1e-9)
 
 
 def test_self_contact_has_one_default_and_certified_protocols() -> None:

@@ -20,19 +20,6 @@ SIMULATIONS = {
     "rod_hang": {"gamma": 50.0, "phi0": 1.0, "phi1": 6.0, "poisson": 0.5},
     "cloth_drag": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
     | {"seed": 1, "self_friction": None},
-    "cloth_sphere": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
-    | {"seed": 1, "angular_speed": 1.0},
-    "cloth_on_cloth": {
-        "material": "gray-interlock",
-        "fabric": None,
-        "mu": 0.5,
-        "preset": "fast",
-        "mesh": 5,
-        "frames": 2,
-    }
-    | {"seed": 1, "substrate_material": "11oz-black-denim", "substrate_fabric": None, "self_friction": 0.5},
-    "shawl": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 9, "frames": 2}
-    | {"seed": 1, "self_friction": 0.5, "swing": 1.0},
 }
 
 _RUN = """
@@ -129,8 +116,7 @@ def test_a_kinds_own_files_are_in_its_builds_and_in_no_others() -> None:
         for stage in STAGES:
             for path in _files(stage, name):
                 if path.parent.name in ("kinds", "scenes") and path.stem in KINDS:
-                    shared = (name, path.stem) == ("cloth_on_cloth", "cloth_drag")  # holders, and how cloth hangs
-                    assert path.stem == name or shared, (stage, path)
+                    assert path.stem == name, (stage, path)
         assert any(path.stem == name for path in _files("simulate", name))
         assert any(path.stem == name for path in _files("pack", name))
 

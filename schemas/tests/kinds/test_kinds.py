@@ -6,7 +6,6 @@ import pytest
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth.names import ThreeViewpoint
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.fabrics import Material, Texture
 
@@ -28,7 +27,6 @@ def test_codes_of_labels_are_pinned() -> None:
     textures = ["checker", "dots", "stripes", "plaid", "gingham", "herringbone", "houndstooth", "floral"]
     assert list(Texture)[:8] == textures
     assert list(Viewpoint)[:3] == ["calibrated", "left", "right"]
-    assert list(ThreeViewpoint) == ["front", "side", "high"]
     assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
     assert SPLITS == ("train", "validation", "test")
 

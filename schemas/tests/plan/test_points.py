@@ -253,6 +253,7 @@ def test_points_are_the_samples_of_the_models() -> None:
     """The fast way over texts and the plain way over models give the same keys, for every kind and optional axis."""
     own = {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}
     cloth = {"material": ["mine", "royal-target"], "mu": [0.3, 1.0], "texture": ["dots", "plaid"]}
+    looks = {"texture": ["dots", "plaid"], "viewpoint": "high"}
     documents = [
         {"kind": "rod_hang", "axes": {"gamma": [1, 2.5], "phi0": [-1.0, 1], "phi1": 6}},
         GRID | {"splits": {"by": "clip"}},
@@ -261,22 +262,14 @@ def test_points_are_the_samples_of_the_models() -> None:
             "materials": {"mine": own},
             "axes": cloth | {"viewpoint": "left", "bending": [0.5, 2.0], "substrate": ["matt", "ceramic"]},
         },
+        {"kind": "cloth_scene", "scene": "turning-ball", "axes": looks | {"speed": 2.0, "mu": [0.3, 1.0]}},
         {
-            "kind": "cloth_sphere",
-            "materials": {"mine": own},
-            "axes": cloth | {"viewpoint": "high", "angular_speed": 2.0},
+            "kind": "cloth_scene",
+            "scene": "on-cloth",
+            "set": {"materials": {"mine": own}},
+            "axes": looks | {"mu": 0.3, "stretched_fabric": ["mine", "camel-ponte-roma"]},
         },
-        {
-            "kind": "cloth_on_cloth",
-            "materials": {"mine": own},
-            "axes": cloth | {"viewpoint": "left", "substrate_material": ["mine", "camel-ponte-roma"]},
-        },
-        {
-            "kind": "shawl",
-            "materials": {"mine": own},
-            "axes": cloth | {"viewpoint": "front", "self_friction": [0.2, 0.4], "swing": [0.5, 1]},
-        },
-        {"kind": "shawl", "axes": cloth | {"material": "royal-target", "viewpoint": "side", "self_friction": 0.2}},
+        {"kind": "cloth_scene", "scene": "shawl", "axes": looks | {"self_friction": [0.2, 0.4], "swing": [0.5, 1.0]}},
     ]
     for document in documents:
         spec = job_spec_adapter.validate_python(document)

@@ -1,17 +1,14 @@
-"""Scenes: the path of the holders, drop-and-drag on a coarse mesh, and a sphere that turns."""
+"""Drop-and-drag: the path of the holders, and on a coarse mesh."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from stickslip_testing.spheres import of_triangles
 
 from stickslip_sim_core import ClothRun, fabric, fabric_names
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.scenes import cloth_drag, cloth_on_cloth, cloth_sphere, shawl
-from stickslip_sim_core.scenes.character import STILL, bones, distance, figure
-from stickslip_sim_core.scenes.cloth_sphere import RADIUS, SETTLING, SPEED, turned
+from stickslip_sim_core.scenes import cloth_drag
 
 pytestmark = pytest.mark.physics
 
@@ -171,135 +168,3 @@ class TestClothRun:
     def test_refusals(self, settings: dict[str, object], message: str) -> None:
         with pytest.raises(ValueError, match=message):
             cloth_drag.scene(**{"material": "gray-interlock", "mu": 0.5, **settings}).run()  # type: ignore[arg-type]
-
-
-class TestClothOnCloth:
-    @pytest.mark.parametrize("substrate", fabric_names())
-    def test_a_stretched_cloth_lies_still(self, substrate: str) -> None:
-        """Until it is touched: the first frames."""
-        others = cloth_on_cloth.scene("gray-interlock", substrate, 0.4, mesh=9, frames=2, seed=1).run().others
-        assert np.abs(others - others[0]).max() < 1e-9
-
-    def test_a_stretched_cloth_is_a_floor_of_the_same_friction(self) -> None:
-        floor = cloth_drag.scene("gray-interlock", 0.4, mesh=9, frames=80).run()
-        cloth = cloth_on_cloth.scene("gray-interlock", "11oz-black-denim", 0.4, mesh=9, frames=80).run()
-        assert cloth.valid, cloth.reason
-        assert 4.9e-4 < cloth.least_distance <= 5e-4
-        assert not cloth.self_intersections.any()
-        steady, weight = slice(60, 75), floor.holder_force[0, 2]
-        assert np.abs(cloth.contact_force - floor.contact_force)[steady].max() < 1e-5 * weight
-        assert np.abs(cloth.holder_force - floor.holder_force).max() < 0.03 * weight
-        assert np.median(np.abs(cloth.positions - floor.positions)) < 1e-6
-        assert np.abs(cloth.others - cloth.others[0]).max() < 1e-4
-
-    def test_refusals(self) -> None:
-        with pytest.raises(ValueError, match=r"mesh: must be in \[5, inf\], got 3"):
-            cloth_on_cloth.scene("gray-interlock", "gray-interlock", 0.4, mesh=3).run()
-        with pytest.raises(ValueError, match="fabric: must be one of"):
-            cloth_on_cloth.scene("gray-interlock", "silk", 0.4).run()
-        with pytest.raises(ValueError, match=r"mu: must be in \[0, 10\]"):
-            cloth_on_cloth.scene("gray-interlock", "gray-interlock", 11.0).run()
-
-
-class TestRotatingSphere:
-    def test_turn(self) -> None:
-        assert turned(SETTLING) == 0.0
-        assert turned(2.0 * SETTLING) == pytest.approx(0.5 * SPEED * SETTLING)
-        assert turned(3.0 * SETTLING) - turned(2.0 * SETTLING) == pytest.approx(SPEED * SETTLING)
-
-    def test_rough_sphere_takes_the_cloth_along(self) -> None:
-        scene = cloth_sphere.scene("gray-interlock", 0.5, mu_floor=0.2, mesh=13, frames=76).run()
-        assert scene.valid, scene.reason
-        assert scene.times[-1] == pytest.approx(5.0)
-        assert scene.record["angle"][-1] == pytest.approx(2.0)
-        c, s = np.cos(2.0), np.sin(2.0)
-        pose = scene.record["sphere_pose"][-1]
-        assert pose == pytest.approx(np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, RADIUS]]))
-        corner = np.unwrap(np.arctan2(scene.positions[:, -1, 1], scene.positions[:, -1, 0]))
-        assert corner[-1] - corner[0] == pytest.approx(scene.record["angle"][-1], abs=0.4)
-        assert scene.record["floor_force"][-1, 2] > 0.0  # its hem on the floor
-        assert scene.record["sphere_force"][-1, 2] > 0.0
-        assert scene.positions[:, :, 2].min() > -1e-5  # between steps, on a cubic
-        centre = np.array([0.0, 0.0, RADIUS])
-        assert np.linalg.norm(scene.positions - centre, axis=2).min() > RADIUS - 1e-5
-        assert np.hypot(*scene.labels["bias"]) > 0.0
-        weight = fabric("gray-interlock").density * 0.04 * GRAVITY
-        assert scene.contact_force[-1] == pytest.approx([0.0, 0.0, weight], abs=0.05 * weight)
-        assert (scene.record["floor_force"] + scene.record["sphere_force"])[30:] == pytest.approx(
-            scene.contact_force[30:], abs=1e-3 * weight
-        )
-        assert scene.self_intersections.shape == (76,)
-
-    def test_sphere_of_triangles(self) -> None:
-        """Bears what a round one does, and takes the cloth along as well; nothing pokes through."""
-        scene = cloth_sphere.scene("11oz-black-denim", 0.5, mesh=17, frames=61)
-        round_one, other = scene.run(), of_triangles(scene, 0.5, 2).run()
-        assert other.valid, other.reason
-        weight = fabric("11oz-black-denim").density * 0.04 * GRAVITY
-        assert other.record["sphere_force"][-1, 2] == pytest.approx(
-            round_one.record["sphere_force"][-1, 2], abs=0.03 * weight
-        )
-        assert (other.record["floor_force"] + other.record["sphere_force"])[30:] == pytest.approx(
-            other.contact_force[30:], abs=2e-3 * weight
-        )
-        # Of this coarse cloth vertices keep away from the sphere what its triangles sink.
-        high = np.linalg.norm(other.positions - [0.0, 0.0, RADIUS], axis=2) - RADIUS
-        assert 0.0 < high[30:].min() < 1e-3
-
-    def test_smooth_sphere_does_not(self) -> None:
-        scene = cloth_sphere.scene("gray-interlock", 0.0, mu_floor=0.2, mesh=9, frames=76).run()
-        corner = np.unwrap(np.arctan2(scene.positions[:, -1, 1], scene.positions[:, -1, 0]))
-        assert abs(corner[-1] - corner[30]) < 0.3
-
-    def test_refusals(self) -> None:
-        for settings, message in (
-            ({"mu_floor": -1.0}, r"mu: must be in \[0, 10\], got -1.0"),
-            ({"mu": float("nan")}, r"mu: must be in \[0, 10\], got nan"),
-            ({"frames": 0}, r"frames: must be in \[1, 3000\], got 0"),
-            ({"angular_speed": 21.0}, r"angular_speed: must be in \[-20, 20\], got 21.0"),
-            ({"mesh": 3}, r"mesh: must be in \[5, inf\], got 3"),
-            ({"frame_rate": 0.0}, "frame_rate: must be finite and > 0, got 0.0"),
-        ):
-            good = {"material": "gray-interlock", "mu": 0.5}
-            with pytest.raises(ValueError, match=message):
-                cloth_sphere.scene(**{**good, **settings}).run()  # type: ignore[arg-type]
-
-
-class TestShawl:
-    def test_it_starts_bent_but_not_stretched_and_clear_of_the_figure(self) -> None:
-        mesh = shawl.cut(60)
-        start = shawl.laid(mesh.rest)
-        assert 0.01 < distance(start).min() < 0.02
-        a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
-        area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-        assert area.min() > 0.0
-        assert area.sum() == pytest.approx(0.5 * shawl.ANGLE * (shawl.HEM**2 - shawl.NECKLINE**2), rel=2e-3)
-        sides = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]])
-        flat, bent = (np.linalg.norm(p[sides[:, 0]] - p[sides[:, 1]], axis=1) for p in (mesh.rest, start))
-        assert np.abs(bent / flat - 1.0).max() < 1e-3
-
-    def test_it_comes_to_lie_on_the_shoulders(self) -> None:
-        scene = shawl.scene("gray-interlock", 1.0, preset="fast", mesh=13, frames=46).run()
-        assert scene.valid, scene.reason
-        assert scene.times[-1] == pytest.approx(STILL)
-        assert not scene.self_intersections.any()
-        assert scene.least_distance > 0.0
-        assert distance(scene.positions).min() > -2e-3  # between frames of the figure at rest
-        assert scene.positions[-1, :, 2].max() > 0.5
-        weight = fabric("gray-interlock").density * 0.5 * shawl.ANGLE * (shawl.HEM**2 - shawl.NECKLINE**2) * GRAVITY
-        assert scene.contact_force[-10:, 2].mean() == pytest.approx(weight, rel=0.15)
-        assert np.array_equal(scene.record["bones"][-1], bones(STILL))
-        assert scene.record["skin_rest"].shape == figure().rest.shape
-        assert 0.0 < np.hypot(*scene.labels["bias"]) < 2.0 * shawl.BIAS
-
-    def test_refusals(self) -> None:
-        for settings, message in (
-            ({"mu": -1.0}, r"mu: must be in \[0, 10\], got -1.0"),
-            ({"self_friction": 11.0}, r"mu: must be in \[0, 10\], got 11.0"),
-            ({"frames": 151}, r"frames: must be in \[1, 150\], got 151"),
-            ({"swing": 2.5}, r"swing: must be in \[0, 2\], got 2.5"),
-            ({"mesh": 8}, r"mesh: must be in \[9, inf\], got 8"),
-        ):
-            good = {"material": "gray-interlock", "mu": 0.5}
-            with pytest.raises(ValueError, match=message):
-                shawl.scene(**{**good, **settings}).run()  # type: ignore[arg-type]

@@ -1,12 +1,7 @@
-"""Spheres of triangles, and the scene of cloth on a sphere with one of them."""
-
-from dataclasses import replace
+"""Spheres of triangles."""
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core import Scene, Surface
-from stickslip_sim_core.cloth.contact import THICKNESS
-from stickslip_sim_core.scenes.cloth_sphere import RADIUS
 
 
 def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -36,23 +31,3 @@ def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int32]
             [np.stack(corner, axis=1) for corner in ((a, z, y), (z, b, x), (y, x, c), (x, y, z))]
         )
     return vertices / np.linalg.norm(vertices, axis=1)[:, None], triangles.astype(np.int32)
-
-
-def of_triangles(scene: Scene, mu: float, subdivisions: int) -> Scene:
-    """Return a scene of `cloth_sphere` with a sphere of triangles that turns as the round one does.
-
-    Its corners lie half a thickness of the cloth inside: so the middle of the cloth touches at the sphere's radius.
-    """
-    corners, triangles = icosphere(subdivisions)
-    corners *= RADIUS - 0.5 * THICKNESS
-
-    def at(time: float) -> NDArray[np.float64]:
-        pose = scene.motion(time)[1][1].pose
-        placed: NDArray[np.float64] = corners @ pose[:, :3].T + pose[:, 3]
-        return placed
-
-    def floor_only(time: float):  # type: ignore[no-untyped-def]
-        gravity, bodies = scene.motion(time)
-        return gravity, bodies[:1]
-
-    return replace(scene, surfaces=[Surface(triangles, at, mu, thickness=0.0)], motion=floor_only)

@@ -1,7 +1,4 @@
-"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3].
-
-`cloth_on_cloth` shares the path of the holders and the cloth that hangs from them.
-"""
+"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3]."""
 
 from collections.abc import Callable, Sequence
 

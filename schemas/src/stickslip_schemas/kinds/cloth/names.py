@@ -1,7 +1,6 @@
 """Names in a spec of cloth: materials, textures, lamps and floors, the built-in ones and those that users add."""
 
 from collections.abc import Mapping
-from enum import StrEnum
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 from pydantic import Field, ValidationError, model_validator
@@ -15,22 +14,7 @@ from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
 from stickslip_schemas.spec.fabrics import CustomName, Material, Texture, did_you_mean, name_schema
 from stickslip_schemas.spec.jobs import JobSpec
 
-
-class ThreeViewpoint(StrEnum):
-    """Cameras of the rigs of three views, `sphere-3` and `shawl-3`.
-
-    Their order gives the codes of the label `viewpoint`: add new ones at the end.
-    """
-
-    front = "front"
-    side = "side"
-    high = "high"
-
-
 VIEWPOINT = Field(description="camera of the rig, or a custom one under `viewpoints`")
-ThreeViewpointAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("ThreeViewpoint"), name_schema(ThreeViewpoint)]], SHORTHAND, VIEWPOINT
-]
 MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
 TextureAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
