@@ -12,8 +12,6 @@ from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import reach, self_contact_distance
 from stickslip_sim_core.rods.multistability import OtherMinima, other_minima
 from stickslip_sim_core.rods.solve import RodSolution, solve_rods
-from stickslip_sim_core.scenes.custom import Sheet
-from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, read_moving_mesh
 from stickslip_sim_core.scenes.scene import ClothRun, Scene
 
 __all__ = [
@@ -23,8 +21,6 @@ __all__ = [
     "Cloth",
     "ClothRun",
     "Fabric",
-    "Keyframes",
-    "MovingMesh",
     "NaturalCurvature",
     "NaturalFit",
     "OtherMinima",
@@ -33,7 +29,6 @@ __all__ = [
     "RodSolution",
     "Scene",
     "SelfContact",
-    "Sheet",
     "SolverSettings",
     "Surface",
     "box",
@@ -51,7 +46,6 @@ __all__ = [
     "plane",
     "preset_named",
     "reach",
-    "read_moving_mesh",
     "self_contact_distance",
     "self_intersections",
     "solve_general_rods",

@@ -5,8 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stickslip_sim_core import Keyframes, MovingMesh, read_moving_mesh
-from stickslip_sim_core.scenes.motions import read_obj, rotation
+from stickslip_sim_core.scenes.motions import (
+    Keyframes,
+    MovingMesh,
+    Spin,
+    read_moving_mesh,
+    read_obj,
+    read_path,
+    read_pattern,
+    rotation,
+)
 
 SQUARE = """# a square of two triangles, and a corner that is named from the end
 v 0 0 0
@@ -119,3 +127,51 @@ class TestMovingMesh:
         (frames / "1.obj").write_text(SQUARE + "v 0 0 0\n")
         with pytest.raises(ValueError, match=r"1.obj: must have the vertices and faces of 0.obj"):
             read_moving_mesh(frames, frame_rate=1.0)
+
+
+class TestOtherMotions:
+    def test_a_linear_motion_has_even_speeds_and_ramps(self) -> None:
+        keys = Keyframes([0.0, 3.0], [[0, 0, 0], [3.0, 0, 0]], np.zeros((2, 3)), linear=True, ramp=1.0)
+        at = [keys.pose(time)[0, 3] for time in (0.0, 0.5, 1.0, 2.0, 3.0, 3.5, 4.0, 9.0)]
+        assert at == pytest.approx([0.0, 0.125, 0.5, 1.5, 2.5, 2.875, 3.0, 3.0])
+        assert keys.last == 4.0
+        sharp = Keyframes([0.0, 3.0], [[0, 0, 0], [3.0, 0, 0]], np.zeros((2, 3)), linear=True)
+        assert sharp.pose(1.5)[0, 3] == pytest.approx(1.5)
+
+    def test_a_spin_gains_its_speed_and_keeps_it(self) -> None:
+        spin = Spin([0, 0, 2.0], speed=0.5, begin=1.0, ramp=2.0, about=[1.0, 0.0, 0.0])
+        for time, angle in ((0.5, 0.0), (2.0, 0.125), (3.0, 0.5), (4.0, 1.0)):
+            pose = spin.pose(time)
+            assert pose[:, :3] == pytest.approx(rotation([0.0, 0.0, angle]))
+            assert pose[:, :3] @ [1.0, 0.0, 0.0] + pose[:, 3] == pytest.approx([1.0, 0.0, 0.0])
+
+    def test_a_path_is_read_from_csv_and_npz(self, tmp_path: Path) -> None:
+        (tmp_path / "p.csv").write_text("time,x,y,z,rx,ry,rz\n0,0,0,0,0,0,0\n1.5,1,2,3,0,0,0.5\n")
+        times, moves, turns = read_path(tmp_path / "p.csv")
+        np.savez(tmp_path / "p.npz", time=times, move=moves, turn=turns)
+        for again, first in zip(read_path(tmp_path / "p.npz"), (times, moves, turns), strict=True):
+            assert np.array_equal(again, first)
+        assert (times[-1], moves[-1].tolist(), turns[-1].tolist()) == (1.5, [1.0, 2.0, 3.0], [0.0, 0.0, 0.5])
+        (tmp_path / "q.csv").write_text("t,x\n0,0\n")
+        with pytest.raises(ValueError, match="must have the columns time,x,y,z,rx,ry,rz, got 't,x'"):
+            read_path(tmp_path / "q.csv")
+
+    def test_a_skin_follows_its_bones_and_its_strength(self, tmp_path: Path) -> None:
+        bones = np.tile(np.eye(3, 4), (2, 2, 1, 1))
+        bones[1, 1, 2, 3] = 1.0
+        skin = {"rest": np.eye(3), "weights": np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]]), "bones": bones}
+        np.savez(tmp_path / "s.npz", triangles=[[0, 1, 2]], times=[0.0, 1.0], **skin)
+        for strength in (1.0, 0.5):
+            moved = read_moving_mesh(tmp_path / "s.npz", strength=strength).at(1.0) - np.eye(3)
+            assert moved[:, 2] == pytest.approx(strength * np.array([0.0, 0.5, 1.0]))
+
+    def test_a_pattern_is_the_texture_coordinates(self, tmp_path: Path) -> None:
+        text = "v 0 0 1\nv 1 0 1\nv 0 1 2\nvt 0 0\nvt 1 0\nvt 0 1.2\n"
+        (tmp_path / "p.obj").write_text(text + "f 1/1 2/2 3/3\n")
+        mesh, start = read_pattern(tmp_path / "p.obj")
+        assert mesh.rest.tolist() == [[0.0, 0.0], [1.0, 0.0], [0.0, 1.2]]
+        assert start[2].tolist() == [0.0, 1.0, 2.0]
+        for face, message in (("f 1 2 3", "flat pattern, at each corner"), ("f 1/1 2/2 3/3\nf 1/2 2/2 3/3", "several")):
+            (tmp_path / "q.obj").write_text(text + face + "\n")
+            with pytest.raises(ValueError, match=message):
+                read_pattern(tmp_path / "q.obj")

@@ -1,6 +1,7 @@
 """Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3]."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.scenes.hanging import Hung, hung
 from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.kind import Record
-from stickslip_sim_core.scenes.scene import ClothRun, Scene, check_range, cloth_kind
+from stickslip_sim_core.scenes.scene import ClothRun, Scene, check_range, cloth_kind, fabric_labels
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -128,7 +129,7 @@ def scene(
         frame_rate=FRAME_RATE,
         forces=lambda solver: dragged_forces(solver, cloth, solver.contact_force()),
         tracks={"holder_pose": holder_pose},
-        labels=lambda run: drop_labels(run, cloth),
+        labels=lambda run: drop_labels(run, cloth, fabric_of(material)),
         kernel=kernel,
         reason=cloth.reason,
     )
@@ -185,14 +186,14 @@ def dragged_forces(cloth: Cloth, hung: Hung, contact: Floats) -> Record:
     return {"contact_force": np.zeros(3), "holder_force": -weight}
 
 
-def drop_labels(run: ClothRun, hung: Hung) -> dict[str, float]:
-    """Return the labels of a drop: the bias, and the side of the holders on which the cloth lay when the drop ended.
+def drop_labels(run: ClothRun, hung: Hung, fabric: Fabric) -> dict[str, Any]:
+    """Return the labels of a drop: those of the fabric, the bias, and the side of the holders on which the cloth lay.
 
-    `landed_side` is the sign of its mean x less that of the holders, in the first frame after the drop; 0 without one.
+    `landed_side` is the sign of its mean x less that of the holders in the first frame after the drop; 0 without one.
     """
     frame = int(np.ceil(duration_of(DROP) * FRAME_RATE))
     landed = 0
     if frame < len(run.positions):
         x = run.positions[frame, :, 0]
         landed = int(np.sign(x.mean() - x[hung.held].mean()))
-    return {"bias_side": hung.side, "bias": hung.bias, "landed_side": landed}
+    return {**fabric_labels(fabric), "bias_side": hung.side, "bias": hung.bias, "landed_side": landed}

@@ -16,7 +16,7 @@ from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth, kernel_level
 from stickslip_sim_core.scenes.kind import Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
-from stickslip_sim_core.scenes.scene import ClothRun, Scene
+from stickslip_sim_core.scenes.scene import ClothRun, Scene, fabric_labels
 
 UPRIGHT = 1.0
 """Time in which gravity is set upright over a hung sheet once its bias ends [s]."""
@@ -172,10 +172,13 @@ class _Forces:
         pulls = np.zeros((len(self._holders), 3))
         if cloth.steps:
             reactions, contacts, pairs = cloth.reactions, cloth.contacts, cloth.pair_forces
-            touching = np.flatnonzero(contacts >= 0)
+            held = np.isin(np.arange(vertices), cloth.held)
+            touching = np.flatnonzero((contacts >= 0) & ~held)
             np.add.at(force, (self._owner[touching], self._others[contacts[touching]]), reactions[touching])
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
-            owner = self._owner[pairs.vertices]
+            owner = np.append(self._owner, -1)[np.minimum(pairs.vertices, len(self._owner))]
+            of_body = np.append(self._others, -1)[pairs.body]
+            owner = np.where(owner < 0, of_body[:, None], owner)  # skeletons of bodies have vertices of their own
             first, last = owner[:, 0], owner[:, 3]
             for corner in range(4):
                 own = owner[:, corner]
@@ -183,7 +186,6 @@ class _Forces:
                 np.add.at(force, (own, np.where(own == first, last, first)), pull)
                 here = (pairs.vertices[:, corner] < vertices) & (pairs.weights[:, corner] != 0.0)
                 np.maximum.at(state, pairs.vertices[here, corner], np.where(pairs.sliding[here], 2, 1).astype(np.uint8))
-            held = np.isin(np.arange(vertices), cloth.held)
             for number, holder in enumerate(self._holders):
                 if held[holder.vertices].all():
                     pulls[number] = reactions[holder.vertices].sum(axis=0)
@@ -211,9 +213,7 @@ def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], end
 def _labels(run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Floats) -> dict[str, Any]:
     found: dict[str, Any] = {"least_distance": float(run.least_distance)}
     for one in sheets:
-        found[f"{one.name}.areal_density"] = one.fabric.density
-        found[f"{one.name}.bending_rigidity"] = np.diag(one.fabric.rigidity).tolist()
-        found[f"{one.name}.stretching_stiffness"] = one.fabric.stretching[0].tolist()
+        found |= fabric_labels(one.fabric, f"{one.name}.")
         if one.hung is not None:
             found[f"{one.name}.tilt"] = one.hung.side * one.hung.bias
     if document["bias"] is not None:

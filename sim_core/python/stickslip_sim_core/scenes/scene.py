@@ -42,13 +42,10 @@ class ClothRun:
     """(frames,) [s]"""
 
     record: Record
-    """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it: (frames, 3) [N]."""
+    """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it [N]."""
 
     labels: Mapping[str, Any]
     """Numbers of the scene by name, such as the bias that breaks its symmetry."""
-
-    others: Floats
-    """(frames, W, 3) [m]: vertices of the sheets that `rest` does not have."""
 
     self_intersections: NDArray[np.int32]
     """(frames,): pairs of triangles that cross."""
@@ -79,12 +76,12 @@ class ClothRun:
 
     @property
     def contact_force(self) -> Floats:
-        """(frames, 3) [N], see `record`."""
+        """[N], see `record`."""
         return self.record["contact_force"]
 
     @property
     def holder_force(self) -> Floats:
-        """(frames, 3) [N]: of the holders on the cloth, where there are holders."""
+        """[N]: of the holders on the cloth, where there are holders."""
         return self.record["holder_force"]
 
 
@@ -118,9 +115,6 @@ class Scene:
 
     damping: Callable[[float], float] = lambda _time: 0.0
     """From a time [s] to a damping [1/s]."""
-
-    sheet: Mesh | None = None
-    """The first sheet, if the run reports only that; None: all."""
 
     forces: Callable[[Cloth], Record] = lambda cloth: {"contact_force": cloth.contact_force()}
     """Arrays recorded at each frame, of the step in which it lies; the first frame is before the first step."""
@@ -188,22 +182,20 @@ class Scene:
                 break
         missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
         paths, forces = paths + missing * paths[-1:], forces + missing * forces[-1:]
-        everything, sheet = np.stack(paths), self.sheet or self.mesh
-        path, others = np.split(everything, [len(sheet.rest)], axis=1)
+        path = np.stack(paths)
         times = np.arange(len(path)) / self.frame_rate
         finite = bool(np.isfinite(path).all())
         record: dict[str, Array] = {name: np.stack([each[name] for each in forces]) for name in forces[0]}
         record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
         run = ClothRun(
             positions=path,
-            rest=sheet.rest,
-            triangles=sheet.triangles,
+            rest=self.mesh.rest,
+            triangles=self.mesh.triangles,
             times=times,
             record={**record, **self.record},
             labels={},
-            others=others,
             self_intersections=np.array(
-                [self_intersections(p, sheet.triangles) if finite else 0 for p in path], np.int32
+                [self_intersections(p, self.mesh.triangles) if finite else 0 for p in path], np.int32
             ),
             least_distance=cloth.least_distance,
             kernel=cloth.kernel,
@@ -212,7 +204,7 @@ class Scene:
             missed_steps=cloth.missed_steps,
             worst_residual=cloth.worst_residual,
             rest_time=rest_time,
-            reason=self.reason or cloth.why_invalid(everything),
+            reason=self.reason or cloth.why_invalid(path),
         )
         return replace(run, labels=self.labels(run))
 
@@ -237,11 +229,7 @@ class Scene:
             return Outcome(reason=run.reason)
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
         arrays: Record = {**self.arrays(run), **run.record}
-        made = self.fabrics[0]
         labels = {
-            "areal_density": made.density,
-            "bending_rigidity": np.diag(made.rigidity).tolist(),
-            "stretching_stiffness": made.stretching[0].tolist(),
             "kernel": run.kernel,
             "steps": run.steps,
             "unconverged_steps": run.unconverged_steps,
@@ -251,6 +239,15 @@ class Scene:
         }
         single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
         return Outcome({**single, "self_intersections": crossings}, labels)
+
+
+def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
+    """Return the labels of a fabric, whose names begin with `prefix`."""
+    return {
+        f"{prefix}areal_density": made.density,
+        f"{prefix}bending_rigidity": np.diag(made.rigidity).tolist(),
+        f"{prefix}stretching_stiffness": made.stretching[0].tolist(),
+    }
 
 
 def cloth_kind(scene: Callable[..., Scene]) -> Kind:
@@ -266,12 +263,9 @@ def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
     """Return physics with fabrics instead of their names, the user's own numbers, and factors."""
     known = dict(physics)
     factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
-    for prefix in ("", "substrate_"):
-        if f"{prefix}material" in known:
-            name, numbers = known.pop(f"{prefix}material"), known.pop(f"{prefix}fabric", None)
-            known[f"{prefix}material"] = fabric(name) if numbers is None else custom_fabric(name, **numbers)
-    known["material"] = known["material"].scaled(**factors)
-    return known
+    name, numbers = known.pop("material"), known.pop("fabric", None)
+    made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
+    return {**known, "material": made.scaled(**factors)}
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
