@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stickslip_sim_core.scenes.custom import Sheet, scene
 
 from stickslip_sim_core import Body, Cloth, SolverSettings, box, fabric, plane, preset_named
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.scenes.custom import Sheet, scene
 from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.scene import ClothRun
 
