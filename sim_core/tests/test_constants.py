@@ -48,7 +48,7 @@ CASES: dict[str, str] = {
             control.novelty control.reject_at control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
-        "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond",
+        "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",
         "push": "stepping.near_patience stepping.strained_soon",
         "let down": "control.halvings control.halvings_near",
     }.items()

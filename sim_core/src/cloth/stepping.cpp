@@ -36,6 +36,20 @@ void Stepper::place_skeletons(const std::vector<Body>& bodies) {
   }
 }
 
+// Whether a vertex may jump over a body that it touches by its distance.
+bool Stepper::sweeps(const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) const {
+  for (std::size_t b = 0; b < at_end.size(); ++b) {
+    const double far = constants_.sweep * at_end[b].half_thickness();
+    if (!std::isfinite(far) || newton.contact.by_pairs(b)) continue;
+    for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+      const Eigen::Vector3d before = at_node(start_, i);
+      const double way = (before + dt * at_node(v, i) - carried(at_start[b], at_end[b], before)).norm();
+      if (way > far && gap_of(at_start[b], before).distance < way) return true;
+    }
+  }
+  return false;
+}
+
 // Sets the inertial positions and the ends of held vertices, for the part from `begin` to `end` of the step.
 void Stepper::drive_nodes(double begin, double end, double part, const Drive& drive, const std::vector<Body>& bodies) {
   const Numbering& numbering = assembly_.numbering;
@@ -92,6 +106,10 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
     at_end.push_back(between(bodies_before_[b], drive.bodies[b], end));
   }
   drive_nodes(begin, end, part, drive, at_end);
+  if (halvings_ < settings_.halvings_max && sweeps(at_start, at_end, part)) {
+    x = start_;
+    return false;
+  }
   const Buffer<double> driven = x;
   assembly_.read_table(start_);
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
@@ -136,6 +154,12 @@ void Stepper::take(double dt, double residual, StepReport& report) {
 bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   check(dt, drive);
   drive_nodes(0.0, 1.0, dt, drive, drive.bodies);
+  tried_dt_ = dt;
+  predicted_ = x;
+  if (sweeps(bodies_before_, drive.bodies, dt)) {
+    tried_ = {false, 0.0};
+    return false;
+  }
   assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
@@ -143,7 +167,6 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   newton.strained_max = constants_.strained_soon;
   tried_ = newton.solve(problem, x, false, patience(near()), report, settings_.krylov_tolerance, false);
   newton.strained_max = constants_.strained_long;
-  tried_dt_ = dt;
   return tried_.converged;
 }
 

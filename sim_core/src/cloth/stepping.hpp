@@ -54,6 +54,7 @@ class Stepper {
 
  private:
   int patience(bool near) const;
+  bool sweeps(const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) const;
   StepOutcome solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report);
   void check(double dt, const Drive& drive);
   void take(double dt, double residual, StepReport& report);

@@ -21,11 +21,15 @@ struct SteppingSettings {
   // Iterations of an attempt by way of the smoothed law. Sweep: 50 takes 9 % less and 200 takes 38 % more in a crumple.
   int smooth_iterations = 100;
 
+  // Way of a vertex relative to a body that is no skeleton, over half the body's least extent, from which a step is
+  // halved: what begins a step before a body must not be predicted behind its middle.
+  double sweep = 0.5;
+
   template <class Self, class Call>
   static void each(Self& s, const Call& call) {
     call("loose", s.loose), call("easy", s.easy), call("near_patience", s.near_patience),
         call("strained_soon", s.strained_soon), call("strained_long", s.strained_long),
-        call("smooth_iterations", s.smooth_iterations);
+        call("smooth_iterations", s.smooth_iterations), call("sweep", s.sweep);
   }
 };
 

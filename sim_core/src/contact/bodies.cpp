@@ -2,10 +2,15 @@
 
 #include <Eigen/Geometry>
 #include <cmath>
+#include <limits>
 
 namespace sim_core {
 
 using Eigen::Vector3d;
+
+double Body::half_thickness() const {
+  return shape == plane ? std::numeric_limits<double>::infinity() : radius + core.minCoeff();
+}
 
 Gap gap_of(const Body& body, const Vector3d& x) {
   const Vector3d local = body.rotation.transpose() * (x - body.origin);

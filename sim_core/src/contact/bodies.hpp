@@ -17,6 +17,8 @@ struct Body {
   Eigen::Vector3d origin;  // m
   Eigen::Matrix3d rotation;
 
+  // Half of its least extent, m: infinite of a plane.
+  double half_thickness() const;
   double mu_of(int sheet) const { return mu.size() == 1 ? mu[0] : mu[sheet]; }
 };
 

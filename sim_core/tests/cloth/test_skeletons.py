@@ -76,6 +76,20 @@ class TestCarries:
 
 @pytest.mark.physics
 class TestSweeps:
+    @pytest.mark.parametrize("body", ["ball", "box"])
+    def test_a_large_body_takes_the_cloth_along(self, body: str) -> None:
+        """At 10 m/s it would be behind the cloth after one step: steps are halved."""
+
+        def at(time: float) -> list[Body]:
+            origin = (0.001, 0.002, -0.032 + 10.0 * time)
+            return [sphere(0.5, 0.03, origin=origin) if body == "ball" else box(0.5, (0.06,) * 3, origin=origin)]
+
+        cloth = started(0.0, at(0.0))
+        for step in range(1, 3):
+            cloth.step(0.01, bodies=at(0.01 * step))
+        middle = np.linalg.norm(SHEET.rest, axis=1).argmin()
+        assert cloth.positions[middle, 2] > at(0.02)[0].origin[2] + 0.03 - 0.1 * CELL
+
     @pytest.mark.parametrize("speed", [1.0, 10.0])
     def test_a_ball_takes_the_cloth_along(self, speed: float) -> None:
         """The middle of the ball stays below the cloth that lay above it, whatever the step."""
