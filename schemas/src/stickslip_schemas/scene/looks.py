@@ -76,7 +76,7 @@ class SheetLook(Document):
 class BodyLook(Document):
     """What a body looks like."""
 
-    color: tuple[Share, Share, Share] = Field(default=(0.5, 0.5, 0.5), description="linear red, green, blue, 0 to 1")
+    color: tuple[Share, Share, Share] = Field(default=(0.2, 0.2, 0.2), description="linear red, green, blue, 0 to 1")
     roughness: Share = Field(default=0.5, description="0 is a mirror")
 
 

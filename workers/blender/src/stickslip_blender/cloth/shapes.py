@@ -58,16 +58,37 @@ def box(size: tuple[float, float, float], center: tuple[float, float, float]) ->
     return np.asarray(center) + 0.5 * np.asarray(size) * signs, faces
 
 
-def tiles(normal: npt.ArrayLike, side: float, count: int) -> tuple[Array, Faces]:
-    """Return a square across a normal (3,), cut into count x count tiles: a plane that is no floor."""
+def square(normal: npt.ArrayLike, side: float) -> tuple[Array, Faces]:
+    """Return a square across a normal (3,): a plane that is no floor."""
     n = np.asarray(normal, dtype=np.float64) / np.linalg.norm(normal)
     u = np.cross(n, np.eye(3)[np.abs(n).argmin()])
     u /= np.linalg.norm(u)
-    line = side * (np.arange(count + 1) / count - 0.5)
-    a, b = (part.ravel()[:, None] for part in np.meshgrid(line, line, indexing="ij"))
-    row = count + 1
-    return a * u + b * np.cross(n, u), [
-        (i * row + j, (i + 1) * row + j, (i + 1) * row + j + 1, i * row + j + 1)
-        for i in range(count)
-        for j in range(count)
-    ]
+    v = np.cross(n, u)
+    return 0.5 * side * np.stack([-u - v, u - v, u + v, v - u]), [(0, 1, 2, 3)]
+
+
+def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt.NDArray[np.int64]]:
+    """Cut quadrilaterals into tiles of at most a side [m]; return also the face that each tile is of.
+
+    The rasteriser leaves out what reaches behind the camera: a large face would vanish as a whole.
+    """
+    points = [vertices]
+    pieces: Faces = []
+    owners: list[int] = []
+    count = len(vertices)
+    for number, face in enumerate(faces):
+        a, b, c, d = vertices[list(face)]
+        across = max(1, int(np.ceil(max(np.linalg.norm(b - a), np.linalg.norm(c - d)) / side)))
+        along = max(1, int(np.ceil(max(np.linalg.norm(d - a), np.linalg.norm(c - b)) / side)))
+        if across == along == 1:
+            pieces.append(face)
+            owners.append(number)
+            continue
+        u, v = (line[..., None] for line in np.mgrid[0 : across + 1, 0 : along + 1] / np.array([[[across]], [[along]]]))
+        points.append((((1 - u) * a + u * b) * (1 - v) + ((1 - u) * d + u * c) * v).reshape(-1, 3))
+        row = along + 1
+        corners = [count + i * row + j for i in range(across) for j in range(along)]
+        pieces += [(corner, corner + row, corner + row + 1, corner + 1) for corner in corners]
+        owners += [number] * len(corners)
+        count += len(points[-1])
+    return np.concatenate(points), pieces, np.array(owners)

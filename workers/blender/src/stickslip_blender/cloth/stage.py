@@ -22,7 +22,7 @@ from stickslip_blender.cloth.geometry import (
     Prop,
 )
 from stickslip_blender.cloth.looks import grained, look_of
-from stickslip_blender.cloth.shapes import Faces, box, gores, rounded, tiles
+from stickslip_blender.cloth.shapes import Faces, box, gores, rounded, square, tiled
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 
@@ -30,7 +30,7 @@ SUNK = -FLOOR
 """Distance of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it."""
 
 ENDLESS, TILE = 1.0, 0.1
-"""Half the visible size of an endless cylinder, or of a plane that is no floor; side of the plane's tiles [m]."""
+"""Half the visible size of an endless cylinder, or of a plane that is no floor; side of the tiles of bodies [m]."""
 
 JAWS = 0.004
 """By how much a holder is larger than what it holds, along each axis [m]."""
@@ -44,7 +44,7 @@ MOVING = 0.005
 PLAIN = (168, 164, 156)
 """Colour of a sheet that neither a scene nor an axis gives a texture, sRGB."""
 
-_STILL_COLOR, _STILL_ROUGHNESS = (0.5, 0.5, 0.5), 0.5
+_USUAL_COLOR, _USUAL_ROUGHNESS = (0.2, 0.2, 0.2), 0.5  # as the document has them
 _TURNS = (0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0, 120.0, -120.0, 150.0, -150.0, 180.0)  # [degree]
 _ENOUGH = 0.6  # of the most that any turn shows of the cloth: the smallest turn that shows as much is taken
 _WATCHED = 60  # instants at which it is found out what moves
@@ -88,7 +88,7 @@ class Stage:
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
                 self.floor, self.ground = body["origin"][2] + FLOOR, codes[name]
                 continue
-            look = scene["looks"]["bodies"].get(name) or {"color": _STILL_COLOR, "roughness": _STILL_ROUGHNESS}
+            look = scene["looks"]["bodies"].get(name) or {"color": _USUAL_COLOR, "roughness": _USUAL_ROUGHNESS}
             props.append(self._body(name, number, body, look, codes[name]))
         for number, sides in enumerate(record["holder_box"].tolist() if "holder_box" in record else ()):
             if not np.isnan(sides).any():
@@ -157,9 +157,10 @@ class Stage:
             posed = self._posed("body_pose", number, vertices)
             self._placers.append(posed if moved is None else lambda instant: _sunk(moved[instant], triangles))
             return Prop(name, vertices, faces, color, look["roughness"], is_smooth=True, segment=segment)
-        vertices, faces, is_smooth = _shape(body)
+        vertices, shape, is_smooth = _shape(body)
+        vertices, faces, owners = tiled(vertices, shape, TILE)
         if body["type"] in ("sphere", "cylinder", "capsule"):
-            color = gores(color, len(faces))
+            color = gores(color, len(shape))[owners]
         self._placers.append(self._posed("body_pose", number, vertices))
         return Prop(name, vertices, faces, color, look["roughness"], is_smooth=is_smooth, segment=segment)
 
@@ -184,7 +185,7 @@ def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces, bool]:
     """Return the vertices of a body that is no mesh, in its own axes [m], its faces, and whether it is smooth."""
     kind = body["type"]
     if kind == "plane":
-        vertices, faces = tiles(body["normal"], 2.0 * ENDLESS, round(2.0 * ENDLESS / TILE))
+        vertices, faces = square(body["normal"], 2.0 * ENDLESS)
         return vertices - SUNK * np.asarray(body["normal"]) / np.linalg.norm(body["normal"]), faces, False
     if kind == "box":
         rounding = max(body["rounding"] or min(ROUNDING, 0.5 * min(body["size"])), 2.0 * SUNK)
