@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -27,8 +26,7 @@ FRAMES = 24
 def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list[str]:
     """Draw the start and the motions of a scene; return the names of the pictures: of each camera, and an animation.
 
-    Cloth is not simulated: it stays as it starts, but for a sheet that is held from the start, which goes along with
-    its first holder. A sheet that starts hung is drawn flat.
+    Cloth is not simulated: it stays as it starts. A sheet that starts hung is drawn flat.
 
     Args:
         scene: What to draw.
@@ -65,23 +63,12 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
 
 
 def _record(scene: Scene, document: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of a scene at the times of the animation, with cloth that goes along with its holders."""
+    """Return the arrays of a scene at the times of the animation."""
     for sheet in document["sheets"].values():
         if sheet["start"]["type"] == "hung":
             sheet["start"] = {"type": "flat"}
     made = cloth_scene.scene(document)
     times = np.linspace(0.0, (scene.frames - 1) / scene.frame_rate, FRAMES).tolist()
-    track = np.repeat(made.start[None], FRAMES, axis=0)
-    still = made.arrays(cast(ClothRun, SimpleNamespace(positions=track)))
-    ends = np.cumsum([0, *(len(still[f"{name}.rest"]) for name in sorted(scene.sheets))])
-    for begin, end in pairwise(ends.tolist()):
-        held = [one for one in made.holders if one.grasp[0] == 0.0 and begin <= one.vertices[0] < end]
-        for instant, time in enumerate(times if held else ()):
-            pose = held[0].pose(time)
-            track[instant, begin:end] = made.start[begin:end] @ pose[:, :3].T + pose[:, 3]
-    moved = made.arrays(cast(ClothRun, SimpleNamespace(positions=track)))
-    return {
-        **moved,
-        **made.record,
-        **{name: np.stack([at(time) for time in times]) for name, at in made.tracks.items()},
-    }
+    start = SimpleNamespace(positions=np.repeat(made.start[None], FRAMES, axis=0))
+    tracks = {name: np.stack([np.asarray(at(time)) for time in times]) for name, at in made.tracks.items()}
+    return {**made.arrays(cast(ClothRun, start)), **made.record, **tracks}
