@@ -18,6 +18,7 @@ from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, Pa
 from stickslip_schemas.format.codecs import encode_clip, encode_trajectory
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest, Pictures, Rejection
+from stickslip_schemas.kinds.cloth.arrays import CHECKS
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
 from stickslip_schemas.kinds.cloth.spec import PICTURE_DECIBELS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
@@ -98,6 +99,8 @@ class Core:
             missed_steps=2,
             worst_residual=2e-4,
             rest_time=np.nan,
+            checks=dict.fromkeys(CHECKS, 0.0),
+            code="",
             reason="",
         )
         return replace(run, **self.changes)
@@ -142,6 +145,7 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
         "unconverged_steps": 3,
         "missed_steps": 2,
         "worst_residual": 2e-4,
+        **dict.fromkeys(CHECKS, 0.0),
     }
     with np.load(io.BytesIO(store.read(result.output.record.digest))) as arrays:
         record = {name: values[result.output.record.row] for name, values in arrays.items()}
@@ -158,12 +162,12 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
 
 
 def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: Core, store: DirectoryStore) -> None:
-    core.changes = {"reason": "12 of 1200 steps did not converge"}
+    core.changes = {"code": "stretch", "reason": "stretch: must be at most 1.25, got 2.5"}
     (result,) = run_tasks([_task()], store)
-    assert (result.outcome, result.reason) == ("rejected", Reason.solver_diverged)
+    assert (result.outcome, result.reason) == ("rejected", Reason.stretch)
     assert result.message == (
-        "12 of 1200 steps did not converge at material = gray-interlock, density = 1, bending = 1, stretching = 1, "
-        "mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
+        "stretch: must be at most 1.25, got 2.5 at material = gray-interlock, density = 1, bending = 1, "
+        "stretching = 1, mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
     )
     assert not (store.root / "artifacts").exists()
 

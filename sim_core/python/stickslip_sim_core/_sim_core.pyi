@@ -104,6 +104,38 @@ def cloth_constants() -> dict[str, float]:
     Internal: constants of the cloth solver by name; see cloth/constants.hpp.
     """
 
+class Observed:
+    """What is seen of every step that was taken, for the checks of a run."""
+
+    def __init__(self) -> None: ...
+
+    def add(self, next: Observed) -> None:
+        """Add what is seen of later steps."""
+
+    @property
+    def stretch(self) -> float:
+        """Largest principal stretch of a triangle."""
+
+    @property
+    def depth(self) -> float:
+        """Largest depth in a body beyond what round bodies allow [cells]."""
+
+    @property
+    def passages(self) -> int:
+        """Triangles that passed the core of a body."""
+
+    @property
+    def contact_work(self) -> float:
+        """Work of bodies on motion against them, where positive [J]."""
+
+    @property
+    def flow(self) -> float:
+        """Sum of the sizes of all changes of energy and of all work [J]."""
+
+    @property
+    def gain(self) -> float:
+        """Largest energy gained beyond the work of all forces [J]."""
+
 class StepReport:
     """How a step of cloth went."""
 
@@ -142,6 +174,9 @@ class StepReport:
 
     @property
     def halvings(self) -> int: ...
+
+    @property
+    def seen(self) -> Observed: ...
 
     @property
     def contacts(self) -> int: ...

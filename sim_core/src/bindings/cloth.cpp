@@ -66,6 +66,15 @@ void bind_cloth(nb::module_& m) {
   m.def(
       "cloth_constants", [] { return Constants().by_name(); },
       "Internal: constants of the cloth solver by name; see cloth/constants.hpp.");
+  nb::class_<Observed>(m, "Observed", "What is seen of every step that was taken, for the checks of a run.")
+      .def(nb::init<>())
+      .def("add", &Observed::add, "next"_a, "Add what is seen of later steps.")
+      .def_ro("stretch", &Observed::stretch, "Largest principal stretch of a triangle.")
+      .def_ro("depth", &Observed::depth, "Largest depth in a body beyond what round bodies allow [cells].")
+      .def_ro("passages", &Observed::passages, "Triangles that passed the core of a body.")
+      .def_ro("contact_work", &Observed::contact_work, "Work of bodies on motion against them, where positive [J].")
+      .def_ro("flow", &Observed::flow, "Sum of the sizes of all changes of energy and of all work [J].")
+      .def_ro("gain", &Observed::gain, "Largest energy gained beyond the work of all forces [J].");
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")
       .def_ro("converged", &StepReport::converged)
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
@@ -78,6 +87,7 @@ void bind_cloth(nb::module_& m) {
       .def_ro("factorizations", &StepReport::factorizations)
       .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
       .def_ro("halvings", &StepReport::halvings)
+      .def_ro("seen", &StepReport::seen)
       .def_ro("contacts", &StepReport::contacts)
       .def_ro("sliding", &StepReport::sliding)
       .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear a force.")

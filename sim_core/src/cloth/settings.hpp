@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <limits>
 
+#include "cloth/observed.hpp"
+
 namespace sim_core {
 
 struct ClothSettings {
@@ -25,6 +27,7 @@ struct StepReport {
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
   double sharpest = std::numeric_limits<double>::infinity();  // cells: least radius of a skeleton that bears
   double factorizations = 0.0;                                      // whole ones, and shares of those in part
+  Observed seen;
 
   void add_work(const StepReport& other) {
     newton += other.newton;
@@ -46,6 +49,7 @@ struct StepReport {
     pairs = other.pairs;
     least_distance = std::min(least_distance, other.least_distance);
     sharpest = std::min(sharpest, other.sharpest);
+    seen.add(other.seen);
   }
 };
 

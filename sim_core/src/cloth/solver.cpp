@@ -33,7 +33,7 @@ struct ClothSolver::Impl {
         materials(with_skeletons(touch, skeletons, bodies, cell_of(mesh))),
         assembly(cloth_kernel_named(kernel), mesh, Fabrics(mesh, fabrics), held, clamped,
                  static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons), constants.factor),
-        stepper(assembly, settings, constants),
+        stepper(mesh, assembly, settings, constants),
         controller(stepper, control, constants.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {

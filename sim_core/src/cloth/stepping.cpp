@@ -7,11 +7,12 @@
 
 namespace sim_core {
 
-Stepper::Stepper(Assembly& assembly, const ClothSettings& settings, const Constants& constants)
+Stepper::Stepper(const ClothMesh& mesh, Assembly& assembly, const ClothSettings& settings, const Constants& constants)
     : x(4L * assembly.numbering.nodes, 0.0),
       v(x),
       newton(assembly, settings, constants),
       assembly_(assembly),
+      watch_(mesh, assembly),
       settings_(settings),
       constants_(constants.stepping),
       start_(x),
@@ -25,6 +26,7 @@ void Stepper::restart(const std::vector<Body>& bodies) {
   started_ = !bodies.empty();
   if (started_) place_skeletons(bodies);
   newton.contact.forget();
+  watch_.restart();
   if (newton.pairs) newton.pairs->restart();
 }
 
@@ -129,12 +131,13 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
     return false;
   }
   report.converged = report.converged && outcome.converged;
-  take(part, outcome.residual, report);
+  take(part, outcome.residual, drive, at_start, at_end, report);
   return true;
 }
 
 // Makes the state that was solved for that of the cloth.
-void Stepper::take(double dt, double residual, StepReport& report) {
+void Stepper::take(double dt, double residual, const Drive& drive, const std::vector<Body>& at_start,
+                   const std::vector<Body>& at_end, StepReport& report) {
   newton.contact.keep(dt);
   if (newton.pairs) {
     newton.pairs->keep();
@@ -149,6 +152,7 @@ void Stepper::take(double dt, double residual, StepReport& report) {
     momentum_rate_ += assembly_.mass[i] / dt * (at_node(v, i) - before);
   }
   last_dt_ = dt;
+  report.seen.add(watch_.see({start_, x, v, drive.gravity, at_start, at_end}, newton));
 }
 
 bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
@@ -171,7 +175,7 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
 }
 
 void Stepper::accept(const Drive& drive, StepReport& report) {
-  take(tried_dt_, tried_.residual, report);
+  take(tried_dt_, tried_.residual, drive, bodies_before_, drive.bodies, report);
   ++report.steps;
   bodies_before_ = drive.bodies;
   count_contacts(report);

@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "cloth/newton.hpp"
+#include "cloth/watch.hpp"
 #include "contact/skeletons.hpp"
 
 namespace sim_core {
@@ -20,7 +20,7 @@ struct Drive {
 
 class Stepper {
  public:
-  Stepper(Assembly& assembly, const ClothSettings& settings, const Constants& constants);
+  Stepper(const ClothMesh& mesh, Assembly& assembly, const ClothSettings& settings, const Constants& constants);
   Stepper(const Stepper&) = delete;
 
   Buffer<double> x, v;  // (nodes, 4), m, m/s
@@ -57,13 +57,15 @@ class Stepper {
   bool sweeps(const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) const;
   StepOutcome solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report);
   void check(double dt, const Drive& drive);
-  void take(double dt, double residual, StepReport& report);
+  void take(double dt, double residual, const Drive& drive, const std::vector<Body>& at_start,
+            const std::vector<Body>& at_end, StepReport& report);
   void count_contacts(StepReport& report) const;
   bool solve_part(double begin, double end, double dt, const Drive& drive, StepReport& report);
   void drive_nodes(double begin, double end, double part, const Drive& drive, const std::vector<Body>& bodies);
   void place_skeletons(const std::vector<Body>& bodies);
 
   Assembly& assembly_;
+  Watch watch_;
   ClothSettings settings_;
   SteppingSettings constants_;
   Buffer<double> start_, inertial_, predicted_;

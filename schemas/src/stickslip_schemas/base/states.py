@@ -79,6 +79,15 @@ class Reason(StrEnum):
     solver_diverged = "solver_diverged"
     out_of_frame = "out_of_frame"
     invalid_sample = "invalid_sample"
+    # The same, of cloth: the check of the solver that failed.
+    not_finite = "not_finite"
+    unconverged = "unconverged"
+    crossings = "crossings"
+    contact_gain = "contact_gain"
+    stretch = "stretch"
+    depth = "depth"
+    passages = "passages"
+    sharpness = "sharpness"
     # A job's own.
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"
@@ -94,7 +103,20 @@ class Reason(StrEnum):
     @property
     def is_deterministic(self) -> bool:
         """True where a second try gives the same answer, so that the sample is rejected and not retried."""
-        return self in (Reason.solver_diverged, Reason.out_of_frame, Reason.invalid_sample)
+        return self in _OF_SAMPLE
 
 
+_OF_SAMPLE = {
+    Reason.solver_diverged,
+    Reason.out_of_frame,
+    Reason.invalid_sample,
+    Reason.not_finite,
+    Reason.unconverged,
+    Reason.crossings,
+    Reason.contact_gain,
+    Reason.stretch,
+    Reason.depth,
+    Reason.passages,
+    Reason.sharpness,
+}
 _ENDING = {Reason.exec_timeout, Reason.worker_lost, Reason.oom_killed, Reason.renderer_crash, Reason.process_crash}

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, StepReport, check_mesh, cloth_kernels, sheet_count
+from stickslip_sim_core._sim_core import ClothSolver, Observed, StepReport, check_mesh, cloth_kernels, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.bodies import Body, BodyTuple
 from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, PairForces, SelfContact, Surface
@@ -126,6 +126,8 @@ class Cloth:
         """Steps of `advance` that are further off than the preset's `step_error` allows: the shortest there are."""
         self.worst_residual = 0.0
         """Largest residual force of a node in any step, over `force_scale`."""
+        self.seen = Observed()
+        """What every step was seen to do, see `checks`."""
         self.newton = self.krylov = self.flips = self.halvings = 0
         self.factorizations = 0.0
         """Whole factorizations, plus shares of partial ones."""
@@ -364,22 +366,12 @@ class Cloth:
         self.halvings += report.halvings
         self.least_distance = min(self.least_distance, report.least_distance)
         self.sharpest = min(self.sharpest, report.sharpest)
+        self.seen.add(report.seen)
         return report
 
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state, without contact [1/s^2]; > 0: stable."""
         return float(self._solver.softest(self.positions, self.slopes))
-
-    def why_invalid(self, path: Floats) -> str:
-        """Return the reason why a run with these positions (frames, V, 3) is not valid, or an empty text."""
-        if not np.isfinite(path).all():
-            return f"positions are not finite from frame {len(path) - 1} on"
-        if self.unconverged_steps > self.preset.unconverged_share_max * self.steps:
-            return (
-                f"{self.unconverged_steps} of {self.steps} steps did not converge, "
-                f"and {self.preset.name} allows a share of {self.preset.unconverged_share_max:g}"
-            )
-        return ""
 
     def phases(self) -> dict[str, float]:
         """Return CPU times by phase since the start [s]."""

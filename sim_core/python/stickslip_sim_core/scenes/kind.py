@@ -26,6 +26,9 @@ class Outcome:
     reason: str = ""
     """Reason for a rejection; empty if the simulation is valid."""
 
+    code: str = "solver_diverged"
+    """Code of that reason: for cloth, the name of the check that failed."""
+
 
 @dataclass(frozen=True, slots=True)
 class Kind:

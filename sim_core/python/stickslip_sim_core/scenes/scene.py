@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import checks
 from stickslip_sim_core.cloth.bodies import Body
 from stickslip_sim_core.cloth.contact import SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
@@ -67,12 +68,18 @@ class ClothRun:
     rest_time: float
     """When all came to rest, if the scene ends then [s]; NaN if it did not."""
 
+    checks: Mapping[str, float]
+    """Worst value of each check by its name, see `cloth.checks`."""
+
+    code: str
+    """Code of the reason why the run is not valid: the name of the first check that failed; or empty."""
+
     reason: str
-    """Reason why the run is not valid, or empty."""
+    """The reason in words, or empty."""
 
     @property
     def valid(self) -> bool:
-        return not self.reason
+        return not self.code
 
     @property
     def contact_force(self) -> Floats:
@@ -187,6 +194,9 @@ class Scene:
         finite = bool(np.isfinite(path).all())
         record: dict[str, Array] = {name: np.stack([each[name] for each in forces]) for name in forces[0]}
         record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
+        crossings = np.array([self_intersections(p, self.mesh.triangles) if finite else 0 for p in path], np.int32)
+        worst = checks.values(checks.Seen(cloth, path, int(crossings.max()) if self.self_contact else 0))
+        code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
         run = ClothRun(
             positions=path,
             rest=self.mesh.rest,
@@ -194,9 +204,7 @@ class Scene:
             times=times,
             record={**record, **self.record},
             labels={},
-            self_intersections=np.array(
-                [self_intersections(p, self.mesh.triangles) if finite else 0 for p in path], np.int32
-            ),
+            self_intersections=crossings,
             least_distance=cloth.least_distance,
             kernel=cloth.kernel,
             steps=cloth.steps,
@@ -204,7 +212,9 @@ class Scene:
             missed_steps=cloth.missed_steps,
             worst_residual=cloth.worst_residual,
             rest_time=rest_time,
-            reason=self.reason or cloth.why_invalid(path),
+            checks=worst,
+            code=code,
+            reason=reason,
         )
         return replace(run, labels=self.labels(run))
 
@@ -226,7 +236,7 @@ class Scene:
         """Run the scene and return the arrays and labels to store."""
         run = self.run(on_frame)
         if not run.valid:
-            return Outcome(reason=run.reason)
+            return Outcome(reason=run.reason, code=run.code)
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
         arrays: Record = {**self.arrays(run), **run.record}
         labels = {
@@ -235,6 +245,7 @@ class Scene:
             "unconverged_steps": run.unconverged_steps,
             "missed_steps": run.missed_steps,
             "worst_residual": run.worst_residual,
+            **run.checks,
             **run.labels,
         }
         single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}

@@ -37,7 +37,7 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
         outcomes = made.simulate([with_files(physics, files) for physics in simulations], note)
     records = _stored(outcomes, made.batch, store)
     return [
-        _rejection(physics, outcome.reason)
+        _rejection(physics, outcome)
         if outcome.reason
         else TaskResult(outcome="succeeded", output=SimulateOutput(record=records[number], labels=dict(outcome.labels)))
         for number, (physics, outcome) in enumerate(zip(simulations, outcomes, strict=True))
@@ -84,7 +84,7 @@ def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int
     return found
 
 
-def _rejection(physics: Mapping[str, Any], reason: str) -> TaskResult:
+def _rejection(physics: Mapping[str, Any], outcome: "Outcome") -> TaskResult:
     shown = {name: f"{value:g}" if isinstance(value, float) else value for name, value in physics.items()}
     numbers = ", ".join(f"{name} = {value}" for name, value in shown.items() if isinstance(value, int | str))
-    return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=f"{reason} at {numbers}")
+    return TaskResult(outcome="rejected", reason=Reason(outcome.code), message=f"{outcome.reason} at {numbers}")

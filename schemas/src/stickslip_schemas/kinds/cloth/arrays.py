@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 from stickslip_schemas.kinds.cloth.spec import ClipSpec, ClothSpec, GroundTruth
@@ -112,6 +113,22 @@ def physical_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
     )
 
 
+CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
+    {
+        "not_finite": ("coordinates that are not finite numbers", 0.0),
+        "unconverged": ("steps above the tolerance over those that the preset allows", 1.0),
+        "crossings": ("pairs of triangles that cross in a frame, where cloth touches itself", 0.0),
+        "contact_gain": ("work that bodies do on the motion against them, over the flow of energy", 1e-3),
+        "energy_gain": ("largest energy gained beyond the work of all forces, over the flow of energy", None),
+        "stretch": ("largest principal stretch of a triangle", 1.25),
+        "depth": ("largest depth in a body beyond the sagitta of flat triangles [cells]", 0.1),
+        "passages": ("triangles that passed the core of a body", 0.0),
+        "sharpness": ("side of a cell over the radius of the sharpest body that bore cloth", 2.0),
+    }
+)
+"""Checks of the solver by name: what is measured, at its worst, and the limit of valid samples; None: not judged."""
+
+
 def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     """Return the solver's diagnostics."""
     return (
@@ -120,6 +137,10 @@ def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         array("unconverged_steps", "steps that stopped short of the tolerance", "int32"),
         array("missed_steps", "shortest steps that are further off than the preset's step error allows", "int32"),
         array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
+        *(
+            array(name, text if limit is None else f"{text}; at most {limit:g} if valid", attributes={"limit": limit})
+            for name, (text, limit) in CHECKS.items()
+        ),
         over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
     )
 

@@ -1,0 +1,118 @@
+"""Checks of runs: each catches a run that is wrong, and names itself; its values are those of the geometry."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from stickslip_sim_core.cloth import checks, meshes
+from stickslip_sim_core.cloth.bodies import Body, box, capsule, cylinder, plane, sphere
+from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.presets import preset_named
+from stickslip_sim_core.cloth.solver import Cloth
+
+SIDE, CELLS = 0.1, 5
+HELD = range((CELLS + 1) ** 2 - 1)  # all but a corner
+
+
+def judged(cloth: Cloth, crossings: int = 0) -> tuple[str, str]:
+    return checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], crossings)))
+
+
+def sheet(height: float, held: ArrayLike = ()) -> tuple[Cloth, np.ndarray]:
+    mesh = meshes.grid(SIDE, SIDE, CELLS, CELLS)
+    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), held=held)
+    start = np.column_stack([mesh.rest, np.full(len(mesh.rest), height)])
+    cloth.set_state(start)
+    return cloth, start
+
+
+def moved(height: float, by: ArrayLike, bodies: list[Body], held: ArrayLike = HELD) -> Cloth:
+    """A sheet after one step, in which its held vertices move."""
+    cloth, start = sheet(height, held)
+    cloth.step(0.01, held=(start + np.asarray(by))[np.asarray(held)], bodies=bodies)
+    return cloth
+
+
+def test_a_sheet_on_a_floor_passes_all() -> None:
+    cloth, _ = sheet(1e-4)
+    for _ in range(20):
+        cloth.step(0.01, bodies=[plane(0.5)])
+    assert judged(cloth) == ("", "")
+    worst = checks.values(checks.Seen(cloth, cloth.positions[None], 0))
+    assert worst["stretch"] == pytest.approx(1.0, abs=1e-3)
+    assert worst["contact_gain"] < 1e-9
+    assert worst["energy_gain"] < 1e-9
+
+
+def test_stretch_is_the_largest_principal_one() -> None:
+    cloth, start = sheet(0.0, HELD)
+    cloth.step(0.01, held=(start * [1.3, 0.9, 1.0])[:-1])
+    assert cloth.seen.stretch == pytest.approx(1.3, abs=0.02)  # the free corner adds a little
+    code, text = judged(cloth)
+    assert code == "stretch"
+    assert text.startswith("stretch: must be at most 1.25, got 1.3")
+
+
+def test_holders_in_the_floor_are_deep() -> None:
+    cloth = moved(0.005, [0.0, 0.0, -0.009], [plane(0.5)])
+    assert cloth.seen.depth == pytest.approx(0.004 / (SIDE / CELLS))
+    assert judged(cloth)[0] == "depth"
+
+
+def test_round_bodies_may_be_as_deep_as_flat_triangles_let_them() -> None:
+    """The corners of the middle cell are on the ball."""
+    cell, radius = SIDE / CELLS, 0.05
+    height = math.sqrt(radius**2 - cell**2 / 2.0)
+    cloth = moved(height, np.zeros(3), [sphere(0.5, radius)])
+    assert cloth.seen.depth < 1e-9
+    assert moved(height - 0.003, np.zeros(3), [sphere(0.5, radius)]).seen.depth > 0.1
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        sphere(0.5, 0.05, origin=[0.003, 0.005, 0.0]),
+        cylinder(0.5, 0.05, rotation=[[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        capsule(0.5, 0.05, 0.06, origin=[0.003, 0.005, 0.0]),
+        box(0.5, [0.12, 0.14, 0.1], rounding=0.05),
+        box(0.5, [0.4, 0.4, 0.1], rounding=0.05),
+    ],
+    ids=["ball", "rod", "upright capsule", "plate", "wide plate"],
+)
+def test_cloth_that_goes_through_a_body_passes_its_core(body: Body) -> None:
+    cloth = moved(0.1, [0.0, 0.0, -0.2], [body])
+    assert cloth.seen.passages > 0
+    assert judged(cloth)[0]
+    assert moved(0.1, [0.0, 0.0, 0.04], [body]).seen.passages == 0
+
+
+def test_a_body_that_goes_through_cloth_passes_it() -> None:
+    cloth, start = sheet(0.0, HELD)
+    cloth.step(0.01, held=start[:-1], bodies=[sphere(0.5, 0.05, origin=[0.003, 0.005, 0.1])])
+    cloth.step(0.01, held=start[:-1], bodies=[sphere(0.5, 0.05, origin=[0.003, 0.005, -0.1])])
+    assert (cloth.seen.depth, judged(cloth)[0]) == (0.0, "passages")
+
+
+def test_what_is_sharper_than_half_a_cell_is_named() -> None:
+    cloth, _ = sheet(0.0055)
+    for _ in range(5):
+        cloth.step(0.01, bodies=[sphere(0.5, 0.005)])
+    assert judged(cloth)[0] == "sharpness"
+
+
+def test_a_body_that_pushes_out_what_is_in_it_does_work_on_it() -> None:
+    cloth, _ = sheet(-0.01)
+    for _ in range(3):
+        cloth.step(0.01, bodies=[plane(0.5)])
+    assert judged(cloth)[0] == "contact_gain"
+
+
+def test_what_is_no_number_and_what_crosses_is_named() -> None:
+    cloth, _ = sheet(0.0)
+    cloth.step(0.01)
+    assert judged(cloth, crossings=2)[0] == "crossings"
+    worst = dict(checks.values(checks.Seen(cloth, np.full((1, 3, 3), np.nan), 0)))
+    assert checks.failed(worst)[0] == "not_finite"
+    assert checks.failed({**worst, "not_finite": 0.0, "stretch": math.nan})[0] == "stretch"
