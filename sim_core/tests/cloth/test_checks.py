@@ -88,11 +88,11 @@ def test_cloth_that_goes_through_a_body_passes_its_core(body: Body) -> None:
     assert moved(0.1, [0.0, 0.0, 0.04], [body]).seen.passages == 0
 
 
-def test_a_body_that_goes_through_cloth_passes_it() -> None:
+def test_a_body_that_goes_through_cloth_is_caught() -> None:
     cloth, start = sheet(0.0, HELD)
     cloth.step(0.01, held=start[:-1], bodies=[sphere(0.5, 0.05, origin=[0.003, 0.005, 0.1])])
     cloth.step(0.01, held=start[:-1], bodies=[sphere(0.5, 0.05, origin=[0.003, 0.005, -0.1])])
-    assert (cloth.seen.depth, judged(cloth)[0]) == (0.0, "passages")
+    assert judged(cloth)[0] == "depth"  # in a part of the step
 
 
 def test_what_is_sharper_than_half_a_cell_is_named() -> None:
