@@ -1,6 +1,6 @@
 """Contents of the pages of a dataset version: the chosen samples, the distributions of labels, and one sample."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import islice
 from math import prod
 from typing import Any
@@ -126,7 +126,7 @@ def _plot(data: SampleData, name: str, slot: int) -> str:
         values = np.linalg.norm(values, axis=-1).reshape(len(values), -1)
     said = array.attributes
     pairs = [f"{one}, {other}" for one in said.get("sheets", ()) for other in said.get("others", ())]
-    known: Sequence[str] = said.get("names") or pairs or _COMPONENTS.get(array.dimensions[1], ())
+    known: Any = said.get("names") or pairs or _COMPONENTS.get(array.dimensions[1], ())
     parts = known if len(known) == values.shape[1] else tuple(map(str, range(values.shape[1])))
     rate = array.attributes.get("instants_per_second")
     x, x_name = np.linspace(0, 1, len(values)), "arc length over L"
