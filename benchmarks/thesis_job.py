@@ -66,7 +66,7 @@ def service(data: Path, port: int) -> Iterator[httpx.Client]:
 
 def _workers(client: httpx.Client) -> bool:
     try:
-        return bool(client.get("/v1/workers").json())
+        return any(worker["condition"]["state"] == "ready" for worker in client.get("/v1/workers").json())
     except httpx.TransportError:
         return False
 
