@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.plan.sources import UNCOUNTED, sources
+from stickslip_schemas.scene.library import load_scene
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_workers import builds
 from stickslip_workers.kinds import kind
@@ -20,6 +21,18 @@ SIMULATIONS = {
     "rod_hang": {"gamma": 50.0, "phi0": 1.0, "phi1": 6.0, "poisson": 0.5},
     "cloth_drag": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
     | {"seed": 1, "self_friction": None},
+    "cloth_scene": {
+        "seed": 1,
+        "scene": load_scene("belt")
+        .checked(
+            {
+                ("end", "at_most"): 0.1,
+                ("sheets", "cloth", "mesh", "cells", 0): 4,
+                ("sheets", "cloth", "mesh", "cells", 1): 4,
+            }
+        )
+        .model_dump(mode="json"),
+    },
 }
 
 _RUN = """
