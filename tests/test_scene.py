@@ -75,7 +75,7 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
         running = Service(tmp_path / "data", "--store", "s3://lab/one")
         try:
             running.start()
-            words = ["dispatch", "--url", running.url, "--store", "s3://lab/one", "--name", "second", "--slots", "1"]
+            words = ["dispatch", "--url", running.url, "--store", "s3://lab/one", "--name", "second", "--max-cpus", "1"]
             words += ["--key-file", str(running.data / "worker-key")]
             second = subprocess.Popen([sys.executable, "-m", "stickslip_workers", *words])
             try:
