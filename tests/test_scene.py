@@ -114,7 +114,7 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     block, bodies = arrays["body_pose"][:, -1, 0, 0, 3], arrays["pull"]
     assert block == pytest.approx(bodies, abs=1e-6)
     (batch,) = Samples(pulled, "train").loader(8)
-    assert batch["video"].shape == (8, 2, 3, 224, 224)
+    assert batch["video"].shape == (8, 2, 224, 224, 3)
     assert set(batch.names("fabric")) == {"gray-interlock", "camel-ponte-roma"}
 
     # The same again: nothing is left to do. One more friction: only its simulations.

@@ -17,5 +17,5 @@ VERTEX_BYTES = 96 * 1024
 def memory_bytes(stage: Stage, parts: Parts) -> int:
     """Return what to ask Ray for."""
     tasks = [lease.task for part in parts for lease in part]
-    sides = [getattr(task.simulation, "mesh", 0) for task in tasks if isinstance(task, SimulateTask)]
-    return STAGE_BYTES[stage] + VERTEX_BYTES * max(sides, default=0) ** 2
+    vertices = [task.simulation.vertices for task in tasks if isinstance(task, SimulateTask)]
+    return STAGE_BYTES[stage] + VERTEX_BYTES * max(vertices, default=0)

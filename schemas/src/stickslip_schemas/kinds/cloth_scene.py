@@ -98,6 +98,11 @@ class ClothSceneSimulation(Simulation):
         """Meshes, starts and paths that the scene names."""
         return tuple(filter(None, (referred(name) for _, name in self.scene.files())))
 
+    @property
+    def vertices(self) -> int:
+        """How many vertices its sheets have together."""
+        return sum(sheet.mesh.shape[0] for sheet in self.scene.sheets.values())
+
 
 class ClothSceneRender(ClipRender):
     """How a scene is seen."""

@@ -74,6 +74,11 @@ class Simulation(Document):
         """Files in the store that the trajectory is made from."""
         return ()
 
+    @property
+    def vertices(self) -> int:
+        """How many vertices its meshes have; its memory grows with them."""
+        return 0
+
 
 class Render(Document):
     """What the pictures of one sample depend on besides their trajectory and the renderer's build."""

@@ -82,6 +82,11 @@ class ClothSimulation(Simulation):
     frames: int
     seed: Seed
 
+    @property
+    def vertices(self) -> int:
+        """How many vertices its square has."""
+        return self.mesh**2
+
 
 class ClipRender(Render):
     """How cloth is seen: all that its clip depends on besides its trajectory and the build.
