@@ -32,7 +32,7 @@ CASES: dict[str, str] = {
     name: scene
     for scene, names in {
         "pile": """contact.closing_gap contact.crossing_least contact.proximal contact.turn_max contact.law_stiffness
-            factor.changed_share newton.longest newton.pairs_tolerance""",
+            factor.changed_share newton.longest newton.pairs_tolerance stepping.inside""",
         "fold": """contact.end_share contact.match_cosine contact.merge_radius contact.penalty_growth
             contact.transfer_radius contact.length_tolerance contact.stall_ratio contact.stall_up_to contact.mean_share
             factor.hold_change factor.hold_least factor.missing_share factor.stiffening_change

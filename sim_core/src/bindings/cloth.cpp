@@ -126,10 +126,10 @@ void bind_cloth(nb::module_& m) {
       .def(
           "set_state",
           [](ClothSolver& self, const Points3& positions, const Points3& velocities, const Points3& slopes,
-             const Points3& surfaces, const std::vector<BodyTuple>& bodies) {
-            self.set_state(positions, velocities, slopes, surfaces, bodies_of(bodies));
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies, bool begins) {
+            self.set_state(positions, velocities, slopes, surfaces, bodies_of(bodies), begins);
           },
-          "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a, "bodies"_a)
+          "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a, "bodies"_a, "begins"_a)
       .def(
           "step",
           [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,

@@ -131,12 +131,13 @@ void ClothSolver::meet(const std::vector<Body>& bodies) {
 }
 
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes,
-                            const Points3& surfaces, const std::vector<Body>& bodies) {
+                            const Points3& surfaces, const std::vector<Body>& bodies, bool begins) {
   impl_->load(positions, slopes, impl_->stepper.x);
   impl_->load_surfaces(surfaces, impl_->stepper.x);
   if (impl_->newton.pairs && impl_->crosses(positions, surfaces)) {
     refuse("positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
+  if (begins) impl_->stepper.refuse_inside(bodies);
   impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
   impl_->stepper.restart({});
   meet(bodies);

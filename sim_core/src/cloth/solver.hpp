@@ -33,8 +33,9 @@ class ClothSolver {
   ~ClothSolver();
 
   // `surfaces`: positions of their vertices; `bodies`: where they are, or none: they do not move in the next step.
+  // `begins`: refuses free vertices inside a body.
   void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes, const Points3& surfaces,
-                 const std::vector<Body>& bodies = {});
+                 const std::vector<Body>& bodies = {}, bool begins = true);
 
   // `gravity`: acceleration of each vertex; `held`, `slopes` and `surfaces`: at the end of the step; bodies keep their
   // number and order from step to step. `damping`: mass-proportional, 1/s, on top of the fabrics' own.

@@ -30,6 +30,18 @@ void Stepper::restart(const std::vector<Body>& bodies) {
   if (newton.pairs) newton.pairs->restart();
 }
 
+void Stepper::refuse_inside(const std::vector<Body>& bodies) const {
+  const Numbering& numbering = assembly_.numbering;
+  for (int i = 0; i < numbering.vertices; ++i) {
+    if (numbering.node[i] >= numbering.free_nodes) continue;
+    for (std::size_t b = 0; b < bodies.size(); ++b) {
+      const double depth = -gap_of(bodies[b], at_node(x, numbering.node[i])).distance;
+      if (depth <= constants_.inside) continue;
+      refuse(text("positions: must not start inside a body, and vertex ", i, " is ", 1e3 * depth, " mm inside body ", b));
+    }
+  }
+}
+
 void Stepper::place_skeletons(const std::vector<Body>& bodies) {
   int node = assembly_.numbering.nodes - assembly_.numbering.bones;
   for (const Skeleton& skeleton : skeletons) {
@@ -135,7 +147,19 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
   return true;
 }
 
-// Makes the state that was solved for that of the cloth.
+// How far a body pushes out what begins a step inside it, m.
+Eigen::Vector3d Stepper::forced(int node, const std::vector<Body>& at_start) const {
+  Eigen::Vector3d out = Eigen::Vector3d::Zero();
+  if (node >= assembly_.numbering.free_nodes) return out;
+  for (std::size_t b = 0; b < at_start.size(); ++b) {
+    if (newton.contact.by_pairs(b)) continue;
+    const Gap gap = gap_of(at_start[b], at_node(start_, node));
+    if (gap.distance < -constants_.inside) out -= gap.distance * gap.normal;
+  }
+  return out;
+}
+
+// Makes the state that was solved for that of the cloth. What a body forces out of itself gets no velocity by that.
 void Stepper::take(double dt, double residual, const Drive& drive, const std::vector<Body>& at_start,
                    const std::vector<Body>& at_end, StepReport& report) {
   newton.contact.keep(dt);
@@ -148,7 +172,7 @@ void Stepper::take(double dt, double residual, const Drive& drive, const std::ve
   momentum_rate_.setZero();
   for (int i = 0; i < assembly_.numbering.nodes; ++i) {
     const Eigen::Vector3d before = at_node(v, i);
-    at_node(v, i) = (at_node(x, i) - at_node(start_, i)) / dt;
+    at_node(v, i) = (at_node(x, i) - at_node(start_, i) - forced(i, at_start)) / dt;
     momentum_rate_ += assembly_.mass[i] / dt * (at_node(v, i) - before);
   }
   last_dt_ = dt;
@@ -215,6 +239,7 @@ void Stepper::check(double dt, const Drive& drive) {
     refuse("held, slopes and gravity: must be finite");
   }
   if (!started_) {
+    refuse_inside(drive.bodies);
     bodies_before_ = drive.bodies;
     place_skeletons(drive.bodies);
   }

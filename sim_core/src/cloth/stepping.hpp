@@ -52,11 +52,15 @@ class Stepper {
   double last_dt() const { return last_dt_; }
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
 
+  // Throws std::invalid_argument where a free vertex is inside a body.
+  void refuse_inside(const std::vector<Body>& bodies) const;
+
  private:
   int patience(bool near) const;
   bool sweeps(const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) const;
   StepOutcome solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report);
   void check(double dt, const Drive& drive);
+  Eigen::Vector3d forced(int node, const std::vector<Body>& at_start) const;
   void take(double dt, double residual, const Drive& drive, const std::vector<Body>& at_start,
             const std::vector<Body>& at_end, StepReport& report);
   void count_contacts(StepReport& report) const;

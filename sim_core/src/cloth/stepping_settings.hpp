@@ -4,6 +4,9 @@
 namespace sim_core {
 
 struct SteppingSettings {
+  // Depth in a body, in m, from which a vertex is inside it: far above the gaps of solved steps, 1e-9 m, far below what
+  // is visible.
+  double inside = 1e-6;
   // Tolerance of GMRES where a step does not converge with that of the preset: modes of contact that flip under exact
   // solves settle under loose ones. Sweep: nothing changes.
   double loose = 0.1;
@@ -27,7 +30,7 @@ struct SteppingSettings {
 
   template <class Self, class Call>
   static void each(Self& s, const Call& call) {
-    call("loose", s.loose), call("easy", s.easy), call("near_patience", s.near_patience),
+    call("inside", s.inside), call("loose", s.loose), call("easy", s.easy), call("near_patience", s.near_patience),
         call("strained_soon", s.strained_soon), call("strained_long", s.strained_long),
         call("smooth_iterations", s.smooth_iterations), call("sweep", s.sweep);
   }

@@ -12,7 +12,7 @@ from stickslip_schemas.base.keys import ARTIFACT, is_sha256
 Length = Annotated[Float, Field(gt=0, le=100)]
 Place = Annotated[Float, Field(ge=-100, le=100)]
 Vector = tuple[Place, Place, Place]
-Angle = Annotated[Float, Field(ge=-1000, le=1000)]
+Angle = Annotated[Float, Field(ge=-6.2832, le=6.2832, description="at most a full turn [rad]")]
 Turn = tuple[Angle, Angle, Angle]
 Time = Annotated[Float, Field(ge=0, le=10_000)]
 
@@ -56,7 +56,7 @@ class Spin(Document):
     """A rotation about an axis that begins at a time, gains its speed evenly, and then keeps it."""
 
     axis: Vector = (0.0, 0.0, 1.0)
-    speed: Angle = Field(description="[rad/s]")
+    speed: Annotated[Float, Field(ge=-1000, le=1000)] = Field(description="[rad/s]")
     begin: Time = Field(default=0.0, description="when it begins [s]")
     ramp: Time = Field(default=0.0, description="time in which it gains its speed [s]")
 

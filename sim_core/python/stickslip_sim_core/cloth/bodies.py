@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike
 
 from stickslip_sim_core.arrays import Floats
 
+ORTHONORMAL = 1e-6
+"""Largest deviation of the scalar products of a rotation's axes from 0 and 1."""
+
 MU_MAX = 10.0
 """Largest coefficient of friction."""
 
@@ -26,7 +29,7 @@ class Body:
     The core is a box about the origin: a point of a sphere, a segment of a capsule, an endless line of a cylinder.
 
     Raises:
-        ValueError: `mu` is out of range.
+        ValueError: `mu` is out of range, `origin` is not finite, or `rotation` is no rotation.
     """
 
     mu: float | ArrayLike
@@ -51,6 +54,15 @@ class Body:
         mu = np.asarray(self.mu, float)
         if mu.ndim > 1 or not mu.size or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
             raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
+        origin, turn = np.asarray(self.origin, float), np.asarray(self.rotation, float)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError(f"origin: must be three finite numbers [m], got {origin.tolist()}")
+        if (
+            turn.shape != (3, 3)
+            or not np.abs(turn @ turn.T - np.eye(3)).max() <= ORTHONORMAL
+            or np.linalg.det(turn) < 0
+        ):
+            raise ValueError(f"rotation: must be orthonormal (3, 3) with determinant +1, got {turn.tolist()}")
 
     @property
     def pose(self) -> Floats:
@@ -72,6 +84,8 @@ class Body:
 def plane(mu: float | ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
     """Return the half-space below a plane."""
     n = np.asarray(normal, float)
+    if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
+        raise ValueError(f"normal: must be three finite numbers, not all 0, got {n.tolist()}")
     n = n / np.linalg.norm(n)
     other = np.eye(3)[np.argmin(np.abs(n))]
     t = np.cross(n, other)

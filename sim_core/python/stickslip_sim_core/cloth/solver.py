@@ -21,6 +21,9 @@ KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 RESIDUAL_PATCH = 0.005**2
 """Area whose weight residuals are measured in, whatever the mesh [m^2]."""
 
+EXTENT_MAX = 20.0
+"""Largest length and width of all sheets at rest [m]: larger ones are a mistake in the unit."""
+
 GRAVITY = 9.81
 """[m/s^2]"""
 
@@ -75,6 +78,9 @@ class Cloth:
         edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
         self.slopes = np.zeros((len(edges), 3))
         check_mesh(mesh.rest, mesh.triangles)
+        extent = float(np.ptp(mesh.rest, axis=0).max())
+        if extent > EXTENT_MAX:
+            raise ValueError(f"mesh: must be at most {EXTENT_MAX:g} m long and wide, got {extent:g} m")
         self.surfaces = tuple(surfaces)
         self.self_contact = self_contact
         self.time = 0.0
@@ -214,14 +220,15 @@ class Cloth:
         Without `bodies`, those of this time, they do not move in the next step.
 
         Raises:
-            ValueError: The cloth crosses a surface, or, with self-contact, itself; or an array has another shape.
+            ValueError: The cloth crosses a surface, or, with self-contact, itself; a free vertex is more than 1 um
+                inside a body; or an array has another shape.
         """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
         if slopes is not None:
             self.slopes = np.asarray(slopes, float)
         self._solver.set_state(
-            at, speed, self.slopes, self._surfaces_at(self.time), [body.as_tuple() for body in bodies]
+            at, speed, self.slopes, self._surfaces_at(self.time), [body.as_tuple() for body in bodies], begins=True
         )
 
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
@@ -235,7 +242,8 @@ class Cloth:
         positions, velocities = self.positions, self.velocities
         self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
         self._solver = self._make(held=self.held.tolist())
-        self.set_state(positions, velocities, bodies=bodies)
+        around = [body.as_tuple() for body in bodies]
+        self._solver.set_state(positions, velocities, self.slopes, self._surfaces_at(self.time), around, begins=False)
 
     def step(
         self,
