@@ -68,7 +68,7 @@ class TestClothRun:
 
     def test_starts_at_rest_over_the_floor(self, dragged: ClothRun) -> None:
         assert dragged.positions[0, :, 2].min() == pytest.approx(cloth_drag.CLEARANCE, abs=2e-3)  # it sags
-        assert dragged.positions[:, :, 2].min() > -1e-5  # between steps, on a cubic
+        assert dragged.positions[:, :, 2].min() > -2e-5  # between steps, on a cubic
         assert dragged.positions[60, :, 2].min() < 1e-9
 
     def test_friction_in_the_steady_drag(self, dragged: ClothRun) -> None:
