@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stickslip_sim_core.scenes.custom import Sheet, scene
 
 from stickslip_sim_core import Body, Cloth, SolverSettings, box, fabric, plane, preset_named
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes.holders import Holder
-from stickslip_sim_core.scenes.scene import ClothRun
+from stickslip_sim_core.scenes.scene import ClothRun, Scene
 
 CERTIFIED = preset_named("certified")
 MATERIAL = fabric("gray-interlock")
@@ -27,8 +26,18 @@ def swing(
     """A strip swings about its upper edge for 1 s, and is let go at the end of the grasp."""
     down = 0.1 - STRIP.rest[:, 1]
     start = np.column_stack([0.5 * down, STRIP.rest[:, 0], -np.sqrt(0.75) * down])
-    sheet = Sheet(STRIP, MATERIAL, start, holders=[Holder(TOP, lambda _: np.eye(3, 4), grasp)])
-    return scene([sheet], [[0.5]], duration=1.0, frame_rate=frame_rate, preset=preset, kernel="baseline").run()
+    gravity = np.tile([0.0, 0.0, -GRAVITY], (len(start), 1))
+    return Scene(
+        mesh=STRIP,
+        fabrics=[MATERIAL],
+        preset=preset,
+        start=start,
+        motion=lambda _: (gravity, []),
+        holders=[Holder(TOP, lambda _: np.eye(3, 4), grasp)],
+        frames=int(frame_rate) + 1,
+        frame_rate=frame_rate,
+        kernel="baseline",
+    ).run()
 
 
 def shaken(frame_rate: float) -> ClothRun:
@@ -37,8 +46,18 @@ def shaken(frame_rate: float) -> ClothRun:
     def bodies(time: float) -> list[Body]:
         return [plane(1.0, origin=(2e-3 * (1.0 - np.cos(64.0 * np.pi * time)), 0.0, 0.0))]
 
-    sheet = Sheet(PATCH, MATERIAL, np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))]))
-    return scene([sheet], [[0.5]], duration=1.0, frame_rate=frame_rate, bodies=bodies, kernel="baseline").run()
+    start = np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))])
+    gravity = np.tile([0.0, 0.0, -GRAVITY], (len(start), 1))
+    return Scene(
+        mesh=PATCH,
+        fabrics=[MATERIAL],
+        preset=CERTIFIED,
+        start=start,
+        motion=lambda time: (gravity, bodies(time)),
+        frames=int(frame_rate) + 1,
+        frame_rate=frame_rate,
+        kernel="baseline",
+    ).run()
 
 
 @pytest.mark.physics
