@@ -1,0 +1,164 @@
+"""Everyday scenes of cloth with a known answer or bound: each is right, refused, or not valid for the true reason."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import checks, meshes
+from stickslip_sim_core.cloth.bodies import Body, box, cylinder, plane, sphere
+from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.presets import preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+
+SIDE = 0.1
+"""Of the napkin [m]."""
+
+ALONG_Y = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+"""Axes of a rod along y."""
+
+Bodies = Callable[[float], list[Body]]
+
+
+def _run(
+    cells: int,
+    bodies: Bodies,
+    *,
+    height: float = 1e-3,
+    seconds: float = 0.2,
+    held: ArrayLike = (),
+    path: Callable[[Floats, float], Floats] = lambda start, _: start,
+    fps: float = 50.0,
+) -> tuple[str, Cloth]:
+    mesh = meshes.grid(SIDE, SIDE, cells, cells)
+    hands = np.asarray(held, int)
+    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("fast"), held=hands)
+    start = np.column_stack([mesh.rest, np.full(len(mesh.rest), height)])
+    cloth.set_state(start, bodies=bodies(0.0))
+    for frame in range(1, round(seconds * fps) + 1):
+        cloth.advance(frame / fps, lambda t: (cloth.gravity, path(start[hands], t), bodies(t)))
+        if code := checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))[0]:
+            return code, cloth
+    return "", cloth
+
+
+def _rim(cells: int) -> Floats:
+    x, y = np.abs(meshes.grid(SIDE, SIDE, cells, cells).rest.T)
+    return np.flatnonzero(np.maximum(x, y) > 0.499 * SIDE).astype(float)
+
+
+def napkin_on_floor(cells: int) -> str:
+    """The floor bears the weight within 5 %."""
+    code, cloth = _run(cells, lambda _: [plane(0.5)], seconds=0.4)
+    share = cloth.contact_force()[2] / (cloth.masses.sum() * GRAVITY)
+    return code or ("right" if abs(share - 1.0) < 0.05 else f"wrong: bears {share:.3g} of the weight")
+
+
+def _caught(cells: int, bodies: Bodies) -> str:
+    """The middle of a napkin that falls stays above z = 0."""
+    code, cloth = _run(cells, bodies, height=0.02, seconds=0.25)
+    middle = cloth.positions[len(cloth.positions) // 2, 2]
+    return code or ("right" if middle > 0.0 else f"wrong: the middle is at {middle:.3g} m")
+
+
+def rod_of_a_cell(cells: int) -> str:
+    """A rod whose radius is a cell carries the napkin."""
+    return _caught(cells, lambda _: [cylinder(1.0, SIDE / cells, rotation=ALONG_Y)])
+
+
+def ball_of_a_cell(cells: int) -> str:
+    """A ball whose radius is a cell carries the napkin."""
+    return _caught(cells, lambda _: [sphere(5.0, SIDE / cells)])
+
+
+def rod_of_a_quarter(cells: int) -> str:
+    """A rod with a radius of a quarter of a cell is too sharp."""
+    return _caught(cells, lambda _: [cylinder(1.0, 0.25 * SIDE / cells, rotation=ALONG_Y)])
+
+
+def thrown_ball(cells: int) -> str:
+    """A ball of two cells at 10 m/s does not go through a held napkin unseen."""
+    radius = 2.0 * SIDE / cells
+
+    def bodies(t: float) -> list[Body]:
+        return [sphere(0.5, radius, origin=[0.0, 0.0, -radius - 0.05 + 10.0 * t])]
+
+    rim = _rim(cells).astype(int)
+    code, cloth = _run(cells, bodies, seconds=0.02, held=rim, fps=500.0)
+    middle = cloth.positions[len(cloth.positions) // 2, 2]
+    return code or ("right" if middle > 0.1 else f"wrong: the ball went through, the middle is at {middle:.3g} m")
+
+
+def holders_into_floor(cells: int) -> str:
+    """Held vertices go 5 cm under the floor."""
+    return _run(
+        cells,
+        lambda _: [plane(0.5)],
+        height=0.01,
+        held=[0, cells],
+        path=lambda start, t: start - np.array([0.0, 0.0, 0.3 * t]),
+    )[0]
+
+
+def stretched_rim(cells: int) -> str:
+    """A rim that grows by 40 %."""
+    rim = _rim(cells).astype(int)
+    return _run(cells, lambda _: [], held=rim, path=lambda start, t: start * (1.0 + 2.0 * t))[0]
+
+
+def start_in_floor(cells: int) -> str:
+    """A napkin that starts 5 cm under the floor."""
+    try:
+        return _run(cells, lambda _: [plane(0.5)], height=-0.05)[0]
+    except ValueError:
+        return "refused"
+
+
+def start_in_ball(cells: int) -> str:
+    """A napkin that starts through the middle of a ball."""
+    try:
+        return _run(cells, lambda _: [sphere(0.5, 0.03)], height=0.005)[0]
+    except ValueError:
+        return "refused"
+
+
+def shaken_floor(cells: int) -> str:
+    """A floor that shakes at 8 Hz, filmed at 10 and at 100 frames a second, moves cloth alike."""
+
+    def bodies(t: float) -> list[Body]:
+        return [plane(1.0, origin=[2e-3 * np.sin(16.0 * np.pi * t), 0.0, 0.0])]
+
+    runs = [_run(cells, bodies, seconds=0.2, fps=fps) for fps in (10.0, 100.0)]
+    off = float(np.abs(runs[0][1].positions_at(0.2) - runs[1][1].positions_at(0.2)).max())
+    return runs[0][0] or ("right" if off < 1e-5 else f"wrong: off by {off:.3g} m")
+
+
+def squeezed(cells: int) -> str:
+    """Two blocks close on a napkin until they cross."""
+
+    def bodies(t: float) -> list[Body]:
+        return [plane(0.5), box(0.5, [0.2, 0.2, 0.1], rounding=0.04, origin=[0.0, 0.0, 0.06 - 0.2 * t])]
+
+    return _run(cells, bodies, seconds=0.15)[0]
+
+
+EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingProxyType(
+    {
+        made.__name__: (made, allowed)
+        for made, allowed in (
+            (napkin_on_floor, ("right",)),
+            (rod_of_a_cell, ("right",)),
+            (ball_of_a_cell, ("right",)),
+            (rod_of_a_quarter, ("sharpness",)),
+            (thrown_ball, ("right", "stretch", "depth", "passages")),
+            (holders_into_floor, ("depth",)),
+            (stretched_rim, ("stretch",)),
+            (start_in_floor, ("refused", "contact_gain")),
+            (start_in_ball, ("refused", "contact_gain", "depth", "stretch")),
+            (shaken_floor, ("right",)),
+            (squeezed, ("depth", "contact_gain", "passages", "unconverged")),
+        )
+    }
+)
+"""Scenes by name, and what may come of them: "right", "refused", or the code of a check."""
