@@ -69,7 +69,10 @@ def filter_case(context: Any, case: Any) -> bool:
         if case.path == "/v1/jobs":
             return bool(document.sample_count <= SAMPLES_MAX)
     except ValidationError as error:
-        return not any(relation in item["msg"] for item in error.errors() for relation in RELATIONS)
+        items = error.errors()
+        if any(item["loc"][:1] == ("cloth_scene",) for item in items):
+            return False  # most rules of scenes are between fields; schemas/tests/scene has them
+        return not any(relation in item["msg"] for item in items for relation in RELATIONS)
     return True
 
 
@@ -89,3 +92,4 @@ def _picture(form: str) -> bytes:
 
 for form in ("PNG", "JPEG"):  # JSON Schema has no words for what is a picture
     schemathesis.openapi.media_type(f"image/{form.lower()}", st.just(_picture(form)))
+schemathesis.openapi.media_type("application/octet-stream", st.just(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"))
