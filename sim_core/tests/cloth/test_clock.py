@@ -134,6 +134,15 @@ def test_steps_that_miss_their_error_are_counted() -> None:
 
 
 @pytest.mark.physics
+def test_a_run_ends_where_its_iterations_are_spent() -> None:
+    run = swing(10, replace(CERTIFIED, newton_per_second=40))
+    assert not run.valid
+    assert "more than 40 iterations of Newton's method in a second" in run.reason
+    assert len(run.positions) < 11
+    assert np.isfinite(run.positions).all()
+
+
+@pytest.mark.physics
 class TestController:
     @staticmethod
     def sliding(end: float, **change: object) -> Cloth:

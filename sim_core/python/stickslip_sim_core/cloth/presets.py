@@ -53,6 +53,10 @@ class SolverSettings:
     """Parts, a power of two, that the longest step is cut into at most for the sake of `step_error`; steps that do not
     converge are halved further."""
 
+    newton_per_second: int = 50_000
+    """Iterations of Newton's method in a second of scene time, 1 ... 1,000,000, beyond which a run ends as not valid:
+    four times 512 steps of 25 iterations each."""
+
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
 
@@ -79,6 +83,7 @@ class SolverSettings:
             ("refactor_after", 0, 10_000),
             ("patience", 1, 1000),
             ("halvings_max", 0, 20),
+            ("newton_per_second", 1, 1_000_000),
         ):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:

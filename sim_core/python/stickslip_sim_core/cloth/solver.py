@@ -127,6 +127,9 @@ class Cloth:
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
         self.sharpest = np.inf
         """Least radius over the side of a cell of a body that cloth touched by more than its vertices."""
+        self.exhausted = ""
+        """Why `advance` goes no further, or empty: the preset's `newton_per_second` is spent."""
+        self._spent = 0.0
         self.steps = self.unconverged_steps = 0
         self.missed_steps = 0
         """Steps of `advance` that are further off than the preset's `step_error` allows: the shortest there are."""
@@ -302,11 +305,12 @@ class Cloth:
             ends, tuples = np.asarray(held, float).reshape(-1, 3), [body.as_tuple() for body in bodies]
             return self.gravity, ends, self.slopes, self._surfaces_at(time), tuples, damping(time)
 
-        while self.time < end:
+        while self.time < end and not self.exhausted:
             self._before = self.time, self.positions, self.velocities
             if self.preset.step_error is not None:
                 self.time, report = self._solver.advance(self.time, event, drive)
                 self._count(report)
+                self._spend(report.newton, self.time - self._before[0])
                 continue
             if not event > self.time:
                 raise ValueError(f"event: must be after {self.time:g} s, got {event:g}")
@@ -317,6 +321,16 @@ class Cloth:
             self.step(dt, held=held, bodies=bodies, damping=damping(self.time + dt))
             if abs(event - self.time) < 1e-9 * dt:
                 self.time = event
+
+    def _spend(self, iterations: int, seconds: float) -> None:
+        """Count the iterations of the last second of scene time, and give up beyond the preset's number."""
+        limit = self.preset.newton_per_second
+        self._spent = max(0.0, self._spent - limit * seconds) + iterations
+        if self._spent > limit:
+            self.exhausted = (
+                f"at {self.time:.3g} s steps took more than {limit:,} iterations of Newton's method "
+                "in a second of scene time: holders, bodies and cloth cannot all have their way"
+            )
 
     def positions_at(self, time: float) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.

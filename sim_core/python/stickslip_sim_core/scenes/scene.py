@@ -177,6 +177,8 @@ class Scene:
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
             self._advance(cloth, hands, time)
+            if cloth.exhausted:
+                break
             paths.append(cloth.positions_at(time))
             forces.append(self.forces(cloth))
             if on_frame is not None:
@@ -196,7 +198,8 @@ class Scene:
         record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
         crossings = np.array([self_intersections(p, self.mesh.triangles) if finite else 0 for p in path], np.int32)
         worst = checks.values(checks.Seen(cloth, path, int(crossings.max()) if self.self_contact else 0))
-        code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
+        why = self.reason or cloth.exhausted
+        code, reason = ("solver_diverged", why) if why else checks.failed(worst)
         run = ClothRun(
             positions=path,
             rest=self.mesh.rest,
@@ -226,7 +229,7 @@ class Scene:
 
     def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way."""
-        while cloth.time < end:
+        while cloth.time < end and not cloth.exhausted:
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
