@@ -39,14 +39,12 @@ class Assembly {
   Buffer<double> gradient;                             // (nodes, 4), N
   double membrane_energy = 0.0, bending_energy = 0.0;  // J
   ClothMatrix matrix{};
-  // Whether the matrix has the positive part of the stress only: that of a convex energy.
+  // Whether the matrix has the positive part of the stress only, as that of a convex energy does.
   bool definite = false;
   // Whether the matrix is that of the state to rounding: else small folds are left out and old ones kept for a while.
   bool exact = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
-  // The table's stiffness at the positions x; it stays for the whole step.
-  void read_table(const Buffer<double>& x) { membrane_.read_table(x); }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
   void set_diagonal(double dt, double damping);
   void clear_diagonal();
@@ -55,7 +53,7 @@ class Assembly {
   // That block, N/m.
   Eigen::Matrix3d own_block(int node) const;
 
-  // K's neighbour that the factor is of: the positive part of the stress, and the plate element that couples six nodes
+  // K's neighbour that the factor is of: the positive part of the stress and of the law, and the plate element that couples six nodes
   // in place of twelve.
   ClothMatrix neighbour(const Buffer<double>& x, NeighbourNumbers& numbers);
 

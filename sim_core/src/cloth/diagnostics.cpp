@@ -45,7 +45,6 @@ double softest_mode(Assembly& assembly, Newton& newton, const Buffer<double>& x)
   constexpr double period = 0.3;  // T, s
   constexpr int iterations = 40;
   const int free_nodes = assembly.numbering.free_nodes;
-  assembly.read_table(x);
   assembly.set_diagonal(period, 0.0);
   assembly.definite = false;
   newton.evaluate(x, true);

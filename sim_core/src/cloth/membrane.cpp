@@ -1,89 +1,86 @@
 #include "cloth/membrane.hpp"
 
 #include <Eigen/LU>
-#include <algorithm>
 #include <cmath>
+#include <vector>
 
 namespace sim_core {
+namespace {
 
-Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabrics& fabrics)
-    : constant_(std::all_of(fabrics.list.begin(), fabrics.list.end(),
-                            [](const ClothProperties& fabric) { return fabric.stretching.constant(); })) {
+// A, B, C, D of k0 ... k3: see kernels/stretching.hpp.
+Eigen::RowVector4d combined(const Eigen::RowVector4d& k) {
+  return {k[0] + 2.0 * k[1] + k[2], k[0] - k[2], k[0] - 2.0 * k[1] + k[2], 2.0 * k[3]};
+}
+
+// From the values at the angles of the table's rows to the coefficients of the quartic in y = cos(2 angle).
+Eigen::Matrix<double, 5, 5> powers_of_rows() {
+  Eigen::Matrix<double, 5, 5> at_rows;
+  const double y[5] = {1.0, std::sqrt(0.5), 0.0, -std::sqrt(0.5), -1.0};
+  for (int r = 0; r < 5; ++r) {
+    for (int j = 0; j < 5; ++j) at_rows(r, j) = std::pow(y[r], j);
+  }
+  return at_rows.inverse();
+}
+
+// Triangles of one fabric in groups, one after the other.
+std::vector<std::vector<int>> grouped(const Fabrics& fabrics) {
+  std::vector<std::vector<int>> groups;
+  const int count = static_cast<int>(fabrics.of_triangle.size());
+  for (int t = 0; t < count; ++t) {
+    const bool other = groups.empty() || fabrics.of_triangle[groups.back()[0]] != fabrics.of_triangle[t];
+    if (other || groups.back().size() == membrane_lanes) groups.emplace_back();
+    groups.back().push_back(t);
+  }
+  return groups;
+}
+
+}  // namespace
+
+Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabrics& fabrics) {
   constexpr int W = membrane_lanes;
-  const int count = static_cast<int>(mesh.triangles.rows()), groups = (count + W - 1) / W;
+  const std::vector<std::vector<int>> members = grouped(fabrics);
+  const int groups = static_cast<int>(members.size());
   nodes_.assign(3 * W * groups, 0);
   slots_.assign(9 * W * groups, -1);
   shape_.assign(4 * W * groups, 0.0);
   area_.assign(W * groups, 0.0);
-  stiffness_.assign(4 * W * groups, 0.0);
-  for (int t = 0; t < count; ++t) {
-    const int group = t / W, lane = t % W;
-    int n[3];
-    for (int c = 0; c < 3; ++c) {
-      n[c] = numbering.node[mesh.triangles(t, c)];
-      nodes_[(3 * group + c) * W + lane] = n[c];
-    }
-    const Eigen::Vector2d p = mesh.rest.row(mesh.triangles(t, 0));
-    Eigen::Matrix2d edges;
-    edges.col(0) = mesh.rest.row(mesh.triangles(t, 1)).transpose() - p;
-    edges.col(1) = mesh.rest.row(mesh.triangles(t, 2)).transpose() - p;
-    const Eigen::Matrix2d inverse = edges.inverse();  // rows: gradients of the shape functions
-    for (int c = 0; c < 4; ++c) shape_[(4 * group + c) * W + lane] = inverse(c / 2, c % 2);
-    area_[group * W + lane] = mesh.area[t];
-    tables_.push_back(fabrics.at(t).stretching);
-    for (int c = 0; c < 4; ++c) stiffness_[(4 * group + c) * W + lane] = tables_[t].k(0, c);
-    int* slots = &slots_[9 * (group * W + lane)];
-    const int pairs[9][2] = {{0, 1}, {1, 0}, {0, 2}, {2, 0}, {1, 2}, {2, 1}, {0, 0}, {1, 1}, {2, 2}};
-    for (int k = 0; k < 9; ++k) slots[k] = numbering.membrane.slot(n[pairs[k][0]], n[pairs[k][1]]);
-  }
-  // Lanes that pad the last group read its first triangle and weigh nothing.
-  for (int t = count; t < groups * W; ++t) {
-    const int group = t / W, lane = t % W;
-    for (int c = 0; c < 3; ++c) nodes_[(3 * group + c) * W + lane] = nodes_[3 * group * W + c * W];
-  }
-  data_ = {groups, nodes_.data(), shape_.data(), area_.data(), stiffness_.data(), slots_.data()};
-}
-
-void Membrane::read_table(const Buffer<double>& x) {
-  if (constant_) return;
-  for (int group = 0; group < data_.groups; ++group) {
-    for (int lane = 0; lane < membrane_lanes; ++lane) {
-      if (area_[group * membrane_lanes + lane] != 0.0) read_table(x, group, lane);
+  for (int group = 0; group < groups; ++group) {
+    fabric_.push_back(fabrics.of_triangle[members[group][0]]);
+    for (int lane = 0; lane < W; ++lane) {
+      // Lanes that pad a group read its first triangle and weigh nothing.
+      const bool pads = lane >= static_cast<int>(members[group].size());
+      const int t = members[group][pads ? 0 : lane];
+      int n[3];
+      for (int c = 0; c < 3; ++c) {
+        n[c] = numbering.node[mesh.triangles(t, c)];
+        nodes_[(3 * group + c) * W + lane] = n[c];
+      }
+      if (pads) continue;
+      const Eigen::Vector2d p = mesh.rest.row(mesh.triangles(t, 0));
+      Eigen::Matrix2d edges;
+      edges.col(0) = mesh.rest.row(mesh.triangles(t, 1)).transpose() - p;
+      edges.col(1) = mesh.rest.row(mesh.triangles(t, 2)).transpose() - p;
+      const Eigen::Matrix2d inverse = edges.inverse();  // rows: gradients of the shape functions
+      for (int c = 0; c < 4; ++c) shape_[(4 * group + c) * W + lane] = inverse(c / 2, c % 2);
+      area_[group * W + lane] = mesh.area[t];
+      int* slots = &slots_[9 * (group * W + lane)];
+      const int pairs[9][2] = {{0, 1}, {1, 0}, {0, 2}, {2, 0}, {1, 2}, {2, 1}, {0, 0}, {1, 1}, {2, 2}};
+      for (int k = 0; k < 9; ++k) slots[k] = numbering.membrane.slot(n[pairs[k][0]], n[pairs[k][1]]);
     }
   }
-}
-
-void Membrane::read_table(const Buffer<double>& x, int group, int lane) {
-  constexpr int W = membrane_lanes;
-  const double* p[3];
-  for (int c = 0; c < 3; ++c) p[c] = &x[4L * nodes_[(3 * group + c) * W + lane]];
-  const double* s = &shape_[4L * W * group];
-  double f[2][3];
-  for (int c = 0; c < 3; ++c) {
-    const double a = p[1][c] - p[0][c], b = p[2][c] - p[0][c];
-    f[0][c] = a * s[lane] + b * s[2 * W + lane];
-    f[1][c] = a * s[W + lane] + b * s[3 * W + lane];
+  const Eigen::Matrix<double, 5, 5> powers = powers_of_rows();
+  for (const ClothProperties& fabric : fabrics.list) {
+    const StretchTable& table = fabric.stretching;
+    const Eigen::RowVector4d none = combined(table.k.row(0));
+    Eigen::Matrix<double, 5, 4> more;
+    for (int r = 0; r < 5; ++r) more.row(r) = combined(table.k.row(1 + r) - table.k.row(0));
+    const Eigen::Matrix<double, 5, 4> in_y = powers * more;
+    law_.insert(law_.end(), none.data(), none.data() + 4);
+    law_.insert(law_.end(), in_y.data(), in_y.data() + 20);  // column by column
+    tabulated_.push_back(!table.constant());
   }
-  double g00 = -0.5, g11 = -0.5, g01 = 0.0;
-  for (int c = 0; c < 3; ++c) {
-    g00 += 0.5 * f[0][c] * f[0][c];
-    g11 += 0.5 * f[1][c] * f[1][c];
-    g01 += 0.5 * f[0][c] * f[1][c];
-  }
-  // The larger principal stretch, and its angle to the first axis in 0 ... pi/2.
-  const double mean = 0.5 * (g00 + g11), half = 0.5 * (g00 - g11), radius = std::hypot(half, g01);
-  const double stretch = std::sqrt(std::max(0.0, 1.0 + 2.0 * (mean + radius))) - 1.0;
-  const double share = std::clamp(stretch / table_stretch, 0.0, 1.0);
-  if (!std::isfinite(radius)) return;
-  const double angle = 0.5 * std::abs(std::atan2(g01, half));
-  const double place = std::min(angle / (M_PI / 8.0), 4.0);
-  const int row = std::min(static_cast<int>(place), 3);
-  const double between = place - row;
-  const StretchTable& table = tables_[group * W + lane];
-  for (int c = 0; c < 4; ++c) {
-    const double far = (1.0 - between) * table.k(1 + row, c) + between * table.k(2 + row, c);
-    stiffness_[(4 * group + c) * W + lane] = (1.0 - share) * table.k(0, c) + share * far;
-  }
+  data_ = {groups,       nodes_.data(), shape_.data(),     area_.data(),
+           fabric_.data(), law_.data(),   tabulated_.data(), slots_.data()};
 }
 
 }  // namespace sim_core

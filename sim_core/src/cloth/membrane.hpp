@@ -1,7 +1,5 @@
-// Stretching: triangles in groups, and the table of their stiffness.
+// Stretching: triangles in groups of one fabric, and the law of each fabric.
 #pragma once
-
-#include <vector>
 
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
@@ -17,16 +15,10 @@ class Membrane {
 
   const MembraneData& data() const { return data_; }
 
-  // Reads the table at the strain of the positions x (nodes, 4).
-  void read_table(const Buffer<double>& x);
-
  private:
-  void read_table(const Buffer<double>& x, int group, int lane);
-
-  std::vector<StretchTable> tables_;  // of the triangles
-  bool constant_;
-  Buffer<int> nodes_, slots_;
-  Buffer<double> shape_, area_, stiffness_;
+  Buffer<int> nodes_, slots_, fabric_;
+  Buffer<double> shape_, area_, law_;
+  Buffer<char> tabulated_;
   MembraneData data_{};
 };
 

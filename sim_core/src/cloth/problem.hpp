@@ -25,12 +25,21 @@ constexpr long tile_floats(long width, long below) {
 // Krylov vectors that one linear solve may use.
 constexpr int krylov_max = 40;
 
+// Which part of the membrane's matrix is taken: all of it, that with the stress's positive part, or that with the law's
+// positive part, too, which is positive semi-definite.
+enum class MembranePart { exact, tension, definite };
+
+// The table of [Wang et al. 2011] ends at this stretch less one.
+constexpr double table_stretch = 1.0 / 6.0;
+
 struct MembraneData {
-  int groups;
+  int groups;  // of triangles of one fabric each
   const int* nodes;         // (groups, 3, lanes)
   const double* shape;      // (groups, 4, lanes): gradients of the shape functions of nodes 1 and 2, 1/m
   const double* area;       // (groups, lanes), 0 in the lanes that pad the last group
-  const double* stiffness;  // (groups, 4, lanes): k0 ... k3, N/m
+  const int* fabric;        // (groups)
+  const double* law;        // (fabrics, 24): A, B, C, D at no strain, then five coefficients of each, N/m
+  const char* tabulated;    // (fabrics): whether these five are not all zero
   const int* slots;         // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for held nodes
 };
 
@@ -143,7 +152,7 @@ struct KrylovResult {
 struct ClothKernel {
   const char* name;
   // Adds gradients and returns the energy. `blocks` and `folds` may be null.
-  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, bool project);
+  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, MembranePart part);
   double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening, FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
   void (*apply)(const ClothMatrix&, const float* x, float* y);

@@ -125,7 +125,6 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
     return false;
   }
   const Buffer<double> driven = x;
-  assembly_.read_table(start_);
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
   const bool deepest = halvings_ == settings_.halvings_max;
   assembly_.definite = halvings_ > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
@@ -188,7 +187,6 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
     tried_ = {false, 0.0};
     return false;
   }
-  assembly_.read_table(start_);
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, x, predicted_, false);

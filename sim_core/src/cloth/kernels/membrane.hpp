@@ -1,29 +1,32 @@
 // Energy, gradient and matrix of stretching.
 #pragma once
 
+#include "cloth/kernels/stretching.hpp"
 #include "cloth/kernels/vectors.hpp"
 
 namespace sim_core {
 namespace {
 
-// K_ij of the membrane, i and j two of a triangle's nodes: sum over the columns f of the deformation gradient.
-struct Pair {
-  Lane m00, m01, m10, m11, geometric;
-};
-
-inline void add_block(float* blocks, int slot, const double (&block)[3][3], double sign, bool transposed) {
-  if (slot < 0) return;
-  float* target = blocks + 12L * slot;
-  for (int c = 0; c < 3; ++c) {
-    for (int r = 0; r < 3; ++r) target[4 * c + r] += float(sign * (transposed ? block[c][r] : block[r][c]));
+// Adds a block of each lane, or its transpose, at slot `place` of the nine of its triangle.
+inline void add_blocks(float* blocks, const int* slots, int place, const Lane (&block)[3][3], bool transposed) {
+  float entry[3][3][membrane_lanes];
+  for (int r = 0; r < 3; ++r) {
+    for (int c = 0; c < 3; ++c) {
+      for (int l = 0; l < membrane_lanes; ++l) entry[transposed ? r : c][transposed ? c : r][l] = float(block[r][c][l]);
+    }
+  }
+  for (int l = 0; l < membrane_lanes; ++l) {
+    const int slot = slots[9 * l + place];
+    if (slot < 0) continue;
+    Node* columns = reinterpret_cast<Node*>(blocks + 12L * slot);
+    for (int c = 0; c < 3; ++c) columns[c] += Node{entry[c][0][l], entry[c][1][l], entry[c][2][l], 0.0f};
   }
 }
 
-// Green's strain G = (F^T F - 1)/2 and W = A (k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2) [Wang et al. 2011]. If
-// `project`, the matrix has the positive part of the stress in place of the stress [Teran et al. 2005] and is positive
-// semi-definite.
+// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative, of which
+// `part` may leave out what is not positive: of the stress, or of the stress and the law [Teran et al. 2005].
 template <bool matrix>
-double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, bool project) {
+double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, MembranePart part) {
   constexpr int W = membrane_lanes;
   Lane energy{};
   for (int group = 0; group < data.groups; ++group) {
@@ -36,7 +39,7 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
       }
     }
     const Lane* shape = reinterpret_cast<const Lane*>(data.shape + 4L * W * group);
-    const Lane* k = reinterpret_cast<const Lane*>(data.stiffness + 4L * W * group);
+    const int fabric = data.fabric[group];
     const Lane area = *reinterpret_cast<const Lane*>(data.area + 1L * W * group);
     const Lane n[3][2] = {{-shape[0] - shape[2], -shape[1] - shape[3]}, {shape[0], shape[1]}, {shape[2], shape[3]}};
     Lane f[2][3];
@@ -48,8 +51,10 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
     const Lane g00 = 0.5 * (f[0][0] * f[0][0] + f[0][1] * f[0][1] + f[0][2] * f[0][2] - 1.0);
     const Lane g11 = 0.5 * (f[1][0] * f[1][0] + f[1][1] * f[1][1] + f[1][2] * f[1][2] - 1.0);
     const Lane g01 = 0.5 * (f[0][0] * f[1][0] + f[0][1] * f[1][1] + f[0][2] * f[1][2]);
-    const Lane s00 = k[0] * g00 + k[1] * g11, s11 = k[1] * g00 + k[2] * g11, s01 = k[3] * g01;
-    energy += area * (0.5 * k[0] * g00 * g00 + k[1] * g00 * g11 + 0.5 * k[2] * g11 * g11 + k[3] * g01 * g01);
+    StretchLaw law = stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], 0.5 * (g00 + g11),
+                                         0.5 * (g00 - g11), g01);
+    const Lane s00 = 0.5 * (law.a + law.h), s11 = 0.5 * (law.a - law.h), s01 = 0.5 * law.q;
+    energy += area * law.energy;
     Lane force[3][3];
     for (int a = 0; a < 3; ++a) {
       const Lane u = area * (s00 * n[a][0] + s01 * n[a][1]), v = area * (s01 * n[a][0] + s11 * n[a][1]);
@@ -64,7 +69,7 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
     if constexpr (matrix) {
       const Lane zero{};
       Lane t00 = area * s00, t11 = area * s11, t01 = area * s01;
-      if (project) {
+      if (part != MembranePart::exact) {
         const Lane mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11);
         const Lane radius = root(half * half + s01 * s01) + 1e-30;
         const Lane big = mean + radius, small = mean - radius;
@@ -74,32 +79,35 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
         t11 = area * (middle - spread_ratio * half);
         t01 = area * spread_ratio * s01;
       }
-      const Lane k0 = area * k[0], k1 = area * k[1], k2 = area * k[2], k3 = 0.5 * area * k[3];
+      if (part == MembranePart::definite) make_definite(law);
+      // Of (s00, s11, s01) by (G00, G11, 2 G01).
+      const Lane quarter = 0.25 * area;
+      const Lane c00 = quarter * (law.aa + 2.0 * law.ah + law.hh), c11 = quarter * (law.aa - 2.0 * law.ah + law.hh);
+      const Lane c01 = quarter * (law.aa - law.hh), c22 = quarter * law.qq;
+      const Lane c02 = quarter * (law.aq + law.hq), c12 = quarter * (law.aq - law.hq);
       const int* slots = data.slots + 9L * W * group;
       constexpr int first[3] = {0, 0, 1}, second[3] = {1, 2, 2};
+      Lane own[3][3][3] = {};  // a translation costs nothing: rows add up to zero
       for (int pair = 0; pair < 3; ++pair) {
         const Lane *a = n[first[pair]], *b = n[second[pair]];
-        const Lane m00 = k0 * a[0] * b[0] + k3 * a[1] * b[1], m11 = k2 * a[1] * b[1] + k3 * a[0] * b[0];
-        const Lane m01 = k1 * a[0] * b[1] + k3 * a[1] * b[0], m10 = k1 * a[1] * b[0] + k3 * a[0] * b[1];
-        const Lane geometric = a[0] * (t00 * b[0] + t01 * b[1]) + a[1] * (t01 * b[0] + t11 * b[1]);
+        const Lane ab00 = a[0] * b[0], ab01 = a[0] * b[1], ab10 = a[1] * b[0], ab11 = a[1] * b[1], mixed = ab01 + ab10;
+        const Lane m00 = c00 * ab00 + c02 * mixed + c22 * ab11, m11 = c11 * ab11 + c12 * mixed + c22 * ab00;
+        const Lane both = c02 * ab00 + c12 * ab11;
+        const Lane m01 = c01 * ab01 + c22 * ab10 + both, m10 = c01 * ab10 + c22 * ab01 + both;
+        const Lane geometric = t00 * ab00 + t01 * mixed + t11 * ab11;
         Lane block[3][3];
         for (int r = 0; r < 3; ++r) {
           const Lane u = m00 * f[0][r] + m10 * f[1][r], v = m01 * f[0][r] + m11 * f[1][r];
-          for (int c = 0; c < 3; ++c) block[r][c] = u * f[0][c] + v * f[1][c] + (r == c ? geometric : zero);
-        }
-        for (int l = 0; l < W; ++l) {
-          double one[3][3];
-          for (int r = 0; r < 3; ++r) {
-            for (int c = 0; c < 3; ++c) one[r][c] = block[r][c][l];
+          for (int c = 0; c < 3; ++c) {
+            block[r][c] = u * f[0][c] + v * f[1][c] + (r == c ? geometric : zero);
+            own[first[pair]][r][c] -= block[r][c];
+            own[second[pair]][c][r] -= block[r][c];
           }
-          const int* slot = slots + 9L * l;
-          add_block(blocks, slot[2 * pair], one, 1.0, false);
-          add_block(blocks, slot[2 * pair + 1], one, 1.0, true);
-          // A translation costs nothing: rows add up to zero.
-          add_block(blocks, slot[6 + first[pair]], one, -1.0, false);
-          add_block(blocks, slot[6 + second[pair]], one, -1.0, true);
         }
+        add_blocks(blocks, slots, 2 * pair, block, false);
+        add_blocks(blocks, slots, 2 * pair + 1, block, true);
       }
+      for (int a = 0; a < 3; ++a) add_blocks(blocks, slots, 6 + a, own[a], false);
     }
   }
   double total = 0.0;
@@ -107,9 +115,9 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
   return total;
 }
 
-double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks, bool project) {
-  return blocks ? membrane_groups<true>(data, x, gradient, blocks, project)
-                : membrane_groups<false>(data, x, gradient, nullptr, project);
+double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks, MembranePart part) {
+  return blocks ? membrane_groups<true>(data, x, gradient, blocks, part)
+                : membrane_groups<false>(data, x, gradient, nullptr, part);
 }
 
 }  // namespace
