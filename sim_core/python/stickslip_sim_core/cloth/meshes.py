@@ -91,28 +91,37 @@ def together(*parts: Mesh) -> Mesh:
     return Mesh(np.concatenate(rest), np.concatenate(triangles).astype(np.int32))
 
 
-def unstructured(width: float, length: float, spacing: float, seed: int = 0) -> Mesh:
+def unstructured(width: float, length: float, spacing: float, seed: int = 0, *, aligned: int = 0) -> Mesh:
     """Triangulate [-width/2, width/2] x [-length/2, length/2] by a Delaunay mesh of scattered vertices.
 
     Rows of a triangular lattice with edges of about `spacing` are displaced at random by up to 0.3 spacings, and edges
-    are flipped until every circumcircle is empty [Lawson 1977].
+    are flipped until every circumcircle is empty [Lawson 1977]. The first `aligned` rows of cells along the length are
+    squares of side `spacing` instead.
 
     Raises:
-        ValueError: A size is not positive.
+        ValueError: A size is not positive, or the length is less than that of the aligned rows.
     """
     _check(width=width, length=length, spacing=spacing)
+    start = aligned * spacing
+    if not start < length:
+        raise ValueError(f"aligned: rows of {spacing} m must be shorter than the length of {length} m, got {aligned}")
     rng = np.random.default_rng(seed)
     columns = max(1, round(width / spacing))
-    rows = max(1, round(length / (spacing * np.sqrt(0.75))))
+    rows = max(1, round((length - start) / (spacing * np.sqrt(0.75))))
+    height = (length - start) / rows
     strips = []
-    for row in range(rows + 1):
+    for row in range(-aligned, rows + 1):
         x = np.linspace(0.0, 1.0, columns + 1)
-        if row % 2 and row != rows:
+        if row > 0 and row % 2 and row != rows:
             x = np.concatenate([[0.0], (np.arange(columns) + 0.5) / columns, [1.0]])
-        strips.append(np.stack([x * width, np.full_like(x, row / rows * length)], axis=1))
+        y = start + row * (height if row > 0 else spacing)
+        strips.append(np.stack([x * width, np.full_like(x, y)], axis=1))
+    rows += aligned
     rest = np.concatenate(strips)
-    inside = (rest > 1e-9 * max(width, length)) & (rest < np.array([width, length]) * (1.0 - 1e-9))
-    rest += np.where(inside, rng.uniform(-0.3, 0.3, rest.shape) * min(width / columns, length / rows), 0.0)
+    size = np.array([width, length])
+    inside = (rest > 1e-9 * size.max()) & (rest < size * (1.0 - 1e-9))
+    inside[: (aligned + 1) * (columns + 1) if aligned else 0] = False
+    rest += np.where(inside, rng.uniform(-0.3, 0.3, rest.shape) * min(width / columns, height), 0.0)
     starts = np.concatenate([[0], np.cumsum([len(strip) for strip in strips])])
     triangles: list[tuple[int, int, int]] = []
     for row in range(rows):

@@ -9,17 +9,18 @@ import numpy as np
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.protocol import RefinedProtocol
 from stickslip_sim_core.protocols.result import Setting
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, cell_of, strip
 from stickslip_sim_core.reference import master_curves
 
 # Weights rho_A g L^3 / D [-].
 GAMMA = (0.01, 0.1, 1.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-HEAVY = 300.0
-"""Beyond this weight the mesh is twice as fine: the strip bends within a few cells."""
+FINER = {30.0: 4, 300.0: 5}
+"""Beyond these weights meshes are so many times as fine: the strip bends within a few cells."""
 
-WIDTH = 0.02  # m
+CELLS_ACROSS = 2  # without Poisson's effect the width does not matter
+
 DENSITY = 0.2  # kg/m^2
 
 # Stiffness against stretching, over rho_A g L: the strip stretches by half of its inverse at most. Ten times as much
@@ -35,7 +36,7 @@ FORCE_SHARE = 0.1  # of a node's weight: the force that residuals are measured i
 
 
 @dataclass(kw_only=True, eq=False)
-class Cantilever(MeshedProtocol):
+class Cantilever(RefinedProtocol):
     """H/W, drop of the tip over its horizontal reach, against `master_curves.cantilever`.
 
     The preset's time step is the first one; steps grow to 1 s as the strip settles.
@@ -46,22 +47,24 @@ class Cantilever(MeshedProtocol):
 
     gamma: Sequence[float] = GAMMA
     """Weights rho_A g L^3 / D."""
-    cells: int = 50
-    """Of a mesh along the strip, up to `HEAVY`; twice as many beyond."""
-    unstructured: int = 5
-    tolerance: float = 0.01
+    unstructured: int = 2
 
-    def measure(self, gamma: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        cells = 2 * self.cells if gamma > HEAVY else self.cells
-        ratio, cloth = hang(strip(WIDTH, cells, self.kinds[at["mesh"]]), gamma, self.solver)
+    def finer(self, x: float) -> int:
+        return max((times for weight, times in FINER.items() if x > weight), default=1)
+
+    def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
+        ratio, cloth = hang(strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[at["mesh"]]), x, self.solver)
         self.tally.count(cloth)
-        return ratio, float(master_curves.cantilever(gamma))
+        return ratio
+
+    def master(self, x: float, at: Mapping[str, Any]) -> float:
+        return float(master_curves.cantilever(x))
 
     def reported(self) -> dict[str, Setting]:
         return {
             **super().reported(),
             "last_time_step_at_most": LONGEST,
-            f"cells_beyond_{HEAVY:g}": 2 * self.cells,
+            **{f"finer_beyond_{weight:g}": times for weight, times in FINER.items()},
             "stretching_over_weight": STRETCHING,
             "force_scale_over_node_weight": FORCE_SHARE,
             **self.counted(),
@@ -76,15 +79,15 @@ def hang(clamped: Strip, gamma: float, preset: SolverSettings, stretching: float
         isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma),
         preset,
         held=clamped.held,
-        clamped=clamped.clamped,
         force_scale=FORCE_SHARE * DENSITY * GRAVITY * clamped.mesh.spacing**2,
     )
     straight = np.stack([clamped.along, clamped.across, np.zeros_like(clamped.along)], axis=1)
-    cloth.set_state(straight, None, np.tile([-1.0, 0.0, 0.0], (len(clamped.clamped), 1)))
+    cloth.set_state(straight)
+    held = clamped.held
     dt, at_rest = preset.time_step, False
     while cloth.steps < STEPS_MAX and not at_rest:
         before = cloth.positions
-        cloth.step(dt, held=straight[clamped.held], damping=DAMPING)
+        cloth.step(dt, held=straight[held], damping=DAMPING)
         at_rest = 2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
         if cloth.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)

@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.spatial import cKDTree
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.protocol import RefinedProtocol
 from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
 from stickslip_sim_core.reference import master_curves
@@ -30,10 +33,11 @@ STRETCHING = 1e5  # over rho_A g L: the strip sags by 1e-3 L at most
 FORCE_SHARE = 0.01  # of a node's weight: the force that residuals are measured in
 STEPS, GROWTH = 30, 1.5  # of the time step, until inertia is nothing beside stiffness
 DIFFERENCE = 1e-7  # of the length
+REACH = 6.0  # cells: no force of bending acts between vertices that are further apart
 
 
 @dataclass(kw_only=True, eq=False)
-class LateralBuckling(MeshedProtocol):
+class LateralBuckling(RefinedProtocol):
     """The weight Gamma* at which flat strips lose stability, against `master_curves.lateral_buckling`.
 
     The preset's time step is the first one; the others grow.
@@ -46,16 +50,12 @@ class LateralBuckling(MeshedProtocol):
     aspect: Sequence[float] = ASPECT
     """Widths over length."""
     poisson: Sequence[float] = POISSON
-    cells: int = 50
-    """Of a mesh along the strip."""
-    structured: int = 2
-    unstructured: int = 2
-    tolerance: float = 0.03
 
-    def measure(self, aspect: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        clamped = strip(aspect * LENGTH, self.cells, self.kinds[at["mesh"]])
-        weight = threshold(clamped, at["poisson"], self.solver)
-        return weight, float(master_curves.lateral_buckling(aspect, at["poisson"]))
+    def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
+        return threshold(strip(x * LENGTH, cells, self.kinds[at["mesh"]]), at["poisson"], self.solver)
+
+    def master(self, x: float, at: Mapping[str, Any]) -> float:
+        return float(master_curves.lateral_buckling(x, at["poisson"]))
 
     def reported(self) -> dict[str, Setting]:
         shares = {"stretching_over_weight": STRETCHING, "force_scale_over_node_weight": FORCE_SHARE}
@@ -65,18 +65,18 @@ class LateralBuckling(MeshedProtocol):
 def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
     """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
     cloth, flat = loaded(clamped, poisson, RIGIDITY, preset)
-    free = np.setdiff1d(np.arange(len(flat)), clamped.held)
+    held = clamped.held
+    free = np.setdiff1d(np.arange(len(flat)), held)
     bending = out_of_plane(cloth, flat, free)
     for step in range(STEPS):
-        cloth.step(preset.time_step * GROWTH**step, held=flat[clamped.held])
+        cloth.step(preset.time_step * GROWTH**step, held=flat[held])
     stress = out_of_plane(cloth, cloth.positions, free) - bending
-    if not np.isfinite(stress).all():
+    if not np.isfinite(stress.data).all():
         return np.nan
-    # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of L^-1 (-stress) L^-T.
-    lower = np.linalg.cholesky(bending)
-    half = np.linalg.solve(lower, -stress)
-    turned = np.linalg.solve(lower, half.T)
-    largest = float(np.linalg.eigvalsh(0.5 * (turned + turned.T))[-1])
+    # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of -stress over bending.
+    inverse = LinearOperator(bending.shape, splu(bending).solve)
+    start = np.ones(len(free))  # a start at random would not give the same bits twice
+    largest = float(eigsh(-stress, 1, M=bending, Minv=inverse, which="LA", v0=start, return_eigenvectors=False)[0])
     return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
 
 
@@ -87,24 +87,41 @@ def loaded(clamped: Strip, poisson: float, rigidity: float, preset: SolverSettin
         isotropic(DENSITY, STRETCHING * DENSITY * GRAVITY * LENGTH, rigidity, poisson),
         preset,
         held=clamped.held,
-        clamped=clamped.clamped,
         force_scale=FORCE_SHARE * DENSITY * GRAVITY * clamped.mesh.spacing**2,
     )
     flat = np.stack([clamped.along, clamped.across, np.zeros_like(clamped.along)], axis=1)
-    cloth.set_state(flat, None, np.tile([-1.0, 0.0, 0.0], (len(clamped.clamped), 1)))
+    cloth.set_state(flat)
     cloth.gravity[:] = [0.0, -GRAVITY, 0.0]
     return cloth, flat
 
 
-def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> Floats:
-    """Return the stiffness (F, F) of the free vertices of a flat cloth against moving out of its plane."""
-    columns = np.empty((len(free), len(free)))
-    moved = at.copy()
-    for column, vertex in enumerate(free):
+def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matrix:
+    """Return the stiffness (F, F) of the free vertices of a flat cloth against moving out of its plane.
+
+    Vertices that are more than twice `REACH` cells apart have no neighbour in common, so they are moved together.
+    """
+    rest, cell = cloth.mesh.rest[free], cloth.mesh.spacing
+    period = int(np.ceil(2.0 * REACH)) + 1
+    boxes = np.floor((rest - rest.min(axis=0)) / cell + 1e-6).astype(int)
+    crowd = np.zeros(len(free), dtype=int)  # number of a vertex within its box
+    for box in np.unique(boxes, axis=0):
+        inside = np.flatnonzero((boxes == box).all(axis=1))
+        crowd[inside] = np.arange(len(inside))
+    groups = np.unique(np.column_stack([boxes % period, crowd]), axis=0, return_inverse=True)[1].ravel()
+    rows, columns, values = [], [], []
+    for group in range(groups.max() + 1):
+        members = np.flatnonzero(groups == group)
         ends = []
         for sign in (1.0, -1.0):
-            moved[vertex, 2] = at[vertex, 2] + sign * DIFFERENCE * LENGTH
+            moved = at.copy()
+            moved[free[members], 2] += sign * DIFFERENCE * LENGTH
             ends.append(cloth._solver.energies(moved, cloth.slopes)[2][free, 2])
-        moved[vertex, 2] = at[vertex, 2]
-        columns[:, column] = (ends[0] - ends[1]) / (2.0 * DIFFERENCE * LENGTH)
-    return 0.5 * (columns + columns.T)
+        distance, nearest = cKDTree(rest[members]).query(rest)
+        near = np.flatnonzero(distance <= REACH * cell)
+        rows.append(near)
+        columns.append(members[nearest[near]])
+        values.append((ends[0] - ends[1])[near] / (2.0 * DIFFERENCE * LENGTH))
+    whole = csc_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (len(free), len(free))
+    )
+    return csc_matrix(0.5 * (whole + whole.T))

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import pairwise, product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.protocols.result import Curve, ProtocolResult, Setting
-from stickslip_sim_core.protocols.strip import MeshKind, mesh_kinds, mesh_names
+from stickslip_sim_core.protocols.result import Curve, Numbers, ProtocolResult, Refinement, Setting
+from stickslip_sim_core.protocols.strip import LENGTH, MeshKind, cell_of, mesh_kinds, mesh_names
 
 
 @dataclass
@@ -53,11 +53,20 @@ class Protocol(ABC):
     tolerance: float
     """Largest |relative error| that passes."""
 
+    limit_tolerance: float | None = field(default=None, init=False)
+    """The same of the limit, in protocols that are run on three meshes."""
+
     tally: Tally = field(default_factory=Tally, init=False, repr=False)
 
     @abstractmethod
     def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
         """Return the measured value at a point of the curve with the parameters `at`, and that of its master curve."""
+
+    def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
+        """Measure the points x of the curve with the parameters `at`."""
+        pairs = [self.measure(point, at) for point in x]
+        measured, master = (tuple(float(pair[i]) for pair in pairs) for i in (0, 1))
+        return Curve({name: float(value) for name, value in at.items()}, x, measured, master)
 
     @abstractmethod
     def reported(self) -> dict[str, Setting]:
@@ -65,16 +74,20 @@ class Protocol(ABC):
 
     def run(self) -> ProtocolResult:
         """Measure all points of all curves."""
-        curves = []
         x = tuple(float(point) for point in getattr(self, self.points))
-        for values in product(*(getattr(self, values) for values in self.parameters.values())):
-            at = dict(zip(self.parameters, values, strict=True))
-            pairs = [self.measure(point, at) for point in x]
-            measured, master = (tuple(float(pair[i]) for pair in pairs) for i in (0, 1))
-            curves.append(Curve({name: float(value) for name, value in at.items()}, x, measured, master))
-        build = build_info().build_hash
+        curves = tuple(
+            self.curve(x, dict(zip(self.parameters, values, strict=True)))
+            for values in product(*(getattr(self, values) for values in self.parameters.values()))
+        )
         return ProtocolResult(
-            self.name, self.x_name, self.y_name, tuple(curves), self.tolerance, self.reported(), build
+            self.name,
+            self.x_name,
+            self.y_name,
+            curves,
+            self.tolerance,
+            self.reported(),
+            build_info().build_hash,
+            self.limit_tolerance,
         )
 
 
@@ -111,7 +124,7 @@ class MeshedProtocol(ClothProtocol):
     parameters: ClassVar = {"mesh": "meshes"}
     grids_max: ClassVar[int] = 4
 
-    cells: int
+    cells: int | tuple[int, int, int]
     """Of a mesh along a side."""
 
     structured: int = 1
@@ -132,3 +145,55 @@ class MeshedProtocol(ClothProtocol):
 
     def reported(self) -> dict[str, Setting]:
         return {**super().reported(), "cells": self.cells, "meshes": mesh_names(self.kinds)}
+
+
+@dataclass(kw_only=True, eq=False)
+class RefinedProtocol(MeshedProtocol):
+    """A protocol of strips that is run with three sizes of cells, from which the limit of small cells follows.
+
+    Raises:
+        ValueError: `cells` breaks its rule.
+    """
+
+    cells: tuple[int, int, int] = (20, 40, 80)
+    """Cells along the strip of three meshes, each at least 1.5 times the one before: those of sheets of 21, 41 and 81
+    vertices a side. `measured` is the value of the last."""
+
+    tolerance: float = 4e-3
+    limit_tolerance: float = 1e-3
+    """Largest |relative error| of the limit that passes."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.cells) != 3 or not all(2 * fine >= 3 * coarse > 15 for coarse, fine in pairwise(self.cells)):
+            raise ValueError(f"cells: must be three numbers from 6 on, each 1.5 times the one before, got {self.cells}")
+
+    def finer(self, x: float) -> int:
+        """Return by how much finer all three meshes are at a point that needs it."""
+        return 1
+
+    @abstractmethod
+    def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
+        """Return the value at a point, measured with so many cells along the strip."""
+
+    @abstractmethod
+    def master(self, x: float, at: Mapping[str, Any]) -> float:
+        """Return the value of the master curve at a point."""
+
+    def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        return self.measure_with(self.finer(x) * self.cells[-1], x, at), self.master(x, at)
+
+    def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
+        cells = tuple(tuple(self.finer(point) * count for point in x) for count in self.cells)
+        measured = tuple(
+            tuple(self.measure_with(count, point, at) for count, point in zip(counts, x, strict=True))
+            for counts in cells
+        )
+        sizes = tuple(tuple(cell_of(count) / LENGTH for count in counts) for counts in cells)
+        return Curve(
+            {name: float(value) for name, value in at.items()},
+            x,
+            measured[-1],
+            tuple(self.master(point, at) for point in x),
+            Refinement.of(cells, sizes, measured),
+        )

@@ -5,8 +5,53 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from scipy.optimize import brentq
+
 Numbers = tuple[float, ...]
 Setting = float | int | str | Numbers
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What three meshes say about the points of a curve."""
+
+    cells: tuple[Numbers, ...]
+    """By mesh, the coarsest first, and point: cells along the sheet. The last mesh is that of `Curve.measured`."""
+
+    measured: tuple[Numbers, ...]
+    """By mesh and point."""
+
+    limit: Numbers
+    """Values extrapolated to cells of no size [Richardson 1911]."""
+
+    order: Numbers
+    """Power of the cell's size with which errors fall; NaN where the meshes show none, and 2 was taken."""
+
+    @classmethod
+    def of(cls, cells: tuple[Numbers, ...], sizes: tuple[Numbers, ...], measured: tuple[Numbers, ...]) -> "Refinement":
+        """Extrapolate what was measured with cells of three `sizes`, by mesh and point."""
+        points = zip(zip(*sizes, strict=True), zip(*measured, strict=True), strict=True)
+        limits = [_extrapolated(at, values) for at, values in points]
+        limit, order = zip(*limits, strict=True) if limits else ((), ())
+        return cls(cells, measured, limit, order)
+
+
+ORDERS = (1.0, 4.0)
+"""Orders that three meshes are believed to show. Others are those of values that differ by rounding or chance."""
+
+
+def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
+    """Return the limit and the order p of y(h) = limit + c h^p through three values, the coarsest first."""
+
+    def missed(p: float) -> float:
+        a, b, c = (size**p for size in sizes)
+        return (values[0] - values[1]) * (b - c) - (values[1] - values[2]) * (a - b)
+
+    low, high = ORDERS
+    order, power = math.nan, 2.0
+    if missed(low) * missed(high) < 0.0:
+        order = power = float(brentq(missed, low, high))
+    return values[2] + (values[2] - values[1]) / ((sizes[1] / sizes[2]) ** power - 1.0), order
 
 
 @dataclass(frozen=True)
@@ -19,11 +64,26 @@ class Curve:
     x: Numbers
     measured: Numbers
     master: Numbers
+    refinement: Refinement | None = None
+    """Of a protocol that is run on three meshes."""
 
     @property
     def errors(self) -> Numbers:
         """Measured over master less one; zero where both are NaN, infinite where one is."""
-        return tuple(_relative_error(*pair) for pair in zip(self.measured, self.master, strict=True))
+        return self._errors_of(self.measured)
+
+    @property
+    def limit_errors(self) -> Numbers:
+        """The same of the limit, if the curve has one."""
+        return self._errors_of(self.refinement.limit) if self.refinement else ()
+
+    @property
+    def errors_by_mesh(self) -> tuple[Numbers, ...]:
+        """The same by mesh, the coarsest first, if there are several."""
+        return tuple(self._errors_of(measured) for measured in self.refinement.measured) if self.refinement else ()
+
+    def _errors_of(self, values: Numbers) -> Numbers:
+        return tuple(_relative_error(*pair) for pair in zip(values, self.master, strict=True))
 
 
 @dataclass(frozen=True)
@@ -41,14 +101,25 @@ class ProtocolResult:
     build_hash: str
     """`build_info().build_hash` of the core that was measured."""
 
+    limit_tolerance: float | None = None
+    """Largest |relative error| of a limit that passes, of a protocol that is run on three meshes."""
+
     @property
     def error(self) -> float:
         """Largest |relative error| over all curves; infinite if nothing was measured."""
         return max((abs(e) for curve in self.curves for e in curve.errors), default=math.inf)
 
     @property
+    def limit_error(self) -> float | None:
+        """Largest |relative error| of a limit; None without three meshes."""
+        if self.limit_tolerance is None:
+            return None
+        return max((abs(e) for curve in self.curves for e in curve.limit_errors), default=math.inf)
+
+    @property
     def passed(self) -> bool:
-        return self.error <= self.tolerance
+        limit = self.limit_error
+        return self.error <= self.tolerance and (limit is None or limit <= (self.limit_tolerance or 0.0))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result in JSON's types; NaN and infinity become None."""
@@ -58,6 +129,8 @@ class ProtocolResult:
             "y": self.y_name,
             "tolerance": self.tolerance,
             "error": _number(self.error),
+            "limit_tolerance": self.limit_tolerance,
+            "limit_error": None if self.limit_error is None else _number(self.limit_error),
             "passed": self.passed,
             "settings": {
                 name: list(value) if isinstance(value, tuple) else value for name, value in self.settings.items()
@@ -70,10 +143,23 @@ class ProtocolResult:
                         name: [_number(value) for value in getattr(curve, name)]
                         for name in ("x", "measured", "master", "errors")
                     },
+                    **_refinement(curve),
                 }
                 for curve in self.curves
             ],
         }
+
+
+def _refinement(curve: Curve) -> dict[str, Any]:
+    """Return limits, orders and the errors of each mesh in JSON's types; nothing without three meshes."""
+    if curve.refinement is None:
+        return {}
+    rows = {"limit": curve.refinement.limit, "order": curve.refinement.order, "limit_errors": curve.limit_errors}
+    return {
+        **{name: [_number(value) for value in values] for name, values in rows.items()},
+        "cells": [list(cells) for cells in curve.refinement.cells],
+        "errors_by_mesh": [[_number(error) for error in errors] for errors in curve.errors_by_mesh],
+    }
 
 
 def _relative_error(measured: float, master: float) -> float:

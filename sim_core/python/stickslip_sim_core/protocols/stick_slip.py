@@ -1,6 +1,6 @@
 """Stick-Slip: the friction at which the tip of a buckled strip slips on a wall [Sano et al. 2017; Romero et al. 2021].
 
-A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (RATE t)^2 times its length, so
+A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (rate t)^2 times its length, so
 that Q/P, which goes with the square root of that strain, grows at an even pace, and the strain at which the tip leaves
 its place is the friction that the solver has, by `master_curves.stick_slip`.
 """
@@ -15,16 +15,17 @@ from stickslip_sim_core.cloth.bodies import plane
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.protocols.protocol import MeshedProtocol
+from stickslip_sim_core.protocols.protocol import RefinedProtocol
 from stickslip_sim_core.protocols.result import Setting
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
+from stickslip_sim_core.protocols.strip import LENGTH, Strip, cell_of, strip
 from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)
 CELLS_ACROSS = 2
 
 DENSITY, RIGIDITY, STRETCHING = 0.05, 1e-4, 3e4  # kg/m^2, N m, N/m
-RATE = 5e-3  # 1/s: root of the strain
+RATE = 5e-3  # 1/s: root of the strain; less where the tip slips below this root, so that steps resolve it as well
+ROOT = 0.25
 DAMPING = 20.0  # 1/s: the bounce of a buckling strip must not tear its tip off
 
 # Of the load, sideways, until the strip has decided for a side: without it a straight strip stays straight.
@@ -61,7 +62,7 @@ class Press:
 
 
 @dataclass(kw_only=True, eq=False)
-class StickSlip(MeshedProtocol):
+class StickSlip(RefinedProtocol):
     """The friction at which tips slip, against that of the wall.
 
     Raises:
@@ -73,13 +74,8 @@ class StickSlip(MeshedProtocol):
 
     friction: Sequence[float] = FRICTION
     """Of the wall, between 0 and the triple point's 0.356370."""
-    cells: int = 50
-    """Of a mesh along the strip."""
-    structured: int = 2
-    unstructured: int = 2
     phases: bool = True
-    """Whether the first mesh is pressed beyond the triple point, too, for the phase diagram."""
-    tolerance: float = 0.01
+    """Whether the finest grid is pressed beyond the triple point, too, for the phase diagram."""
 
     diagram: list[tuple[float, float, float]] = field(default_factory=list, init=False, repr=False)
     """(mu, strain, regime) of the first mesh."""
@@ -88,15 +84,19 @@ class StickSlip(MeshedProtocol):
         super().__post_init__()
         master_curves.stick_slip_strain(self.friction)  # refuses what is not on it
 
-    def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        strain = self.press(at["mesh"], mu, master_curves.stick_slip_triple_point()[0]).slip
-        return float(master_curves.stick_slip(strain)) if np.isfinite(strain) else np.nan, mu
+    def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
+        strain = self.press(cells, at["mesh"], x, master_curves.stick_slip_triple_point()[0]).slip
+        return float(master_curves.stick_slip(strain)) if np.isfinite(strain) else np.nan
 
-    def press(self, mesh: int, mu: float, end: float) -> "Press":
+    def master(self, x: float, at: Mapping[str, Any]) -> float:
+        return x
+
+    def press(self, cells: int, mesh: int, mu: float, end: float) -> "Press":
         """Press the strip of a mesh up to the strain `end`."""
-        pressed = strip(CELLS_ACROSS * LENGTH / self.cells, self.cells, self.kinds[mesh])
-        found = press(pressed, mu, self.solver, end)
-        if mesh == 0:
+        pressed = strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[mesh])
+        onset = np.sqrt(master_curves.stick_slip_strain(mu)) if mu in self.friction else ROOT
+        found = press(pressed, mu, self.solver, end, RATE * min(1.0, float(onset) / ROOT))
+        if mesh == 0 and cells == self.cells[-1]:
             self.diagram += _phases(mu, found, end)
         if np.isfinite(found.static_error):
             self.tally.note(found.static_error)
@@ -106,7 +106,7 @@ class StickSlip(MeshedProtocol):
 
     def reported(self) -> dict[str, Setting]:
         for mu in PHASE_FRICTION if self.phases and self.kinds else ():
-            self.press(0, mu, PHASE_STRAIN[-1])
+            self.press(self.cells[-1], 0, mu, PHASE_STRAIN[-1])
         columns = list(zip(*self.diagram, strict=True)) or [(), (), ()]
         return {
             **super().reported(),
@@ -116,37 +116,36 @@ class StickSlip(MeshedProtocol):
         }
 
 
-def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float) -> Press:
-    """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`."""
+def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, rate: float) -> Press:
+    """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`; `rate` [1/s] is that of the root of strain."""
+    held, tip = clamped.held, clamped.tip
     width = float(np.ptp(clamped.across))
     buckling = 20.1907 * RIGIDITY * width / LENGTH**2  # N
     cloth = Cloth(
         clamped.mesh,
         isotropic(DENSITY, STRETCHING, RIGIDITY),
         preset,
-        held=clamped.held,
-        clamped=clamped.clamped,
-        force_scale=FORCE_SHARE * buckling / len(clamped.tip),
+        held=held,
+        force_scale=FORCE_SHARE * buckling / len(tip),
     )
-    # The wall is the floor, the clamp above it; the outward slope at the clamp points up.
+    # The wall is the floor, the clamp above it.
     upright = np.stack([np.zeros_like(clamped.along), clamped.across, LENGTH - clamped.along], axis=1)
-    slopes = np.tile([0.0, 0.0, 1.0], (len(clamped.clamped), 1))
-    cloth.set_state(upright, None, slopes)
-    wall, clamp = [plane(mu)], upright[clamped.held]
+    cloth.set_state(upright)
+    wall, clamp = [plane(mu)], upright[held]
     mass = float(cloth.masses.sum())
     dt = preset.time_step
     history: list[tuple[float, float, float]] = []
     slip = extended = np.nan
-    for step in range(1, int(np.sqrt(strain_end) / (RATE * dt)) + 1):
-        strain = (RATE * step * dt) ** 2
+    for step in range(1, int(np.sqrt(strain_end) / (rate * dt)) + 1):
+        strain = (rate * step * dt) ** 2
         load = min(STRETCHING * width * strain, buckling)
         cloth.gravity[:] = [BIAS * load / mass * max(0.0, 1.0 - strain / BIAS_UNTIL), 0.0, 0.0]
         cloth.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
-        force = cloth.reactions[clamped.tip].sum(axis=0)
-        moved = abs(cloth.positions[clamped.tip, 0].mean()) / LENGTH
+        force = cloth.reactions[tip].sum(axis=0)
+        moved = abs(cloth.positions[tip, 0].mean()) / LENGTH
         history.append((strain, float(np.hypot(force[0], force[1]) / max(force[2], 1e-15)), float(moved)))
         touching = np.flatnonzero(cloth.contacts >= 0)
-        if np.isnan(extended) and not np.isin(touching, clamped.tip).all():
+        if np.isnan(extended) and not np.isin(touching, tip).all():
             extended = strain
         if not moved <= MOVED:
             break
@@ -154,7 +153,7 @@ def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float) 
     if not moved_at[-1] <= MOVED:
         stuck = np.flatnonzero(np.abs(np.diff(moved_at, prepend=0.0)) <= LET_GO)
         last = int(stuck[-1]) if len(stuck) else 0
-        slip = float(strain_at[last])
+        slip = (rate * (last + 1.5) * dt) ** 2  # in the middle of the step in which it began to move
         strain_at, ratio = strain_at[:last], ratio[:last]
     on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
         strain_at <= master_curves.stick_slip_triple_point()[0]
