@@ -117,7 +117,10 @@ class StickSlip(RefinedProtocol):
 
 
 def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, rate: float) -> Press:
-    """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`; `rate` [1/s] is that of the root of strain."""
+    """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`.
+
+    The root of the strain grows by `rate` [1/s].
+    """
     held, tip = clamped.held, clamped.tip
     width = float(np.ptp(clamped.across))
     buckling = 20.1907 * RIGIDITY * width / LENGTH**2  # N
