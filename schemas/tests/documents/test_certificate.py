@@ -71,7 +71,7 @@ CONTRADICTIONS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "passed beyond the tolerance": (
         document(protocols=[protocol(curves=off_by(0.02), error=0.02)]),
-        "within the tolerance",
+        "within their tolerances",
     ),
     "passed with an infinite error": (document(protocols=[protocol(curves=off_by(None), error=None)]), "within"),
     "an error that is not that of the curves": (

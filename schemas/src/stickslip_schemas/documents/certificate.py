@@ -29,6 +29,17 @@ class CurveReport(Document):
     measured: Numbers
     master: Numbers
     errors: Numbers = Field(description="measured over master less one; null is infinite")
+    limit: Numbers = Field(default=(), description="extrapolated to cells of no size, of a protocol on three meshes")
+    order: Numbers = Field(
+        default=(), description="power of the cell's size with which errors fall; null: none was found, and 2 was taken"
+    )
+    limit_errors: Numbers = Field(default=(), description="limit over master less one; null is infinite")
+    cells: tuple[Numbers, ...] = Field(
+        default=(), description="by mesh, the coarsest first, and point: cells along the sheet; the last is that of x"
+    )
+    errors_by_mesh: tuple[Numbers, ...] = Field(
+        default=(), description="errors with these cells; the last are `errors`"
+    )
     dense_x: Numbers = Field(default=(), description="where the master curve is drawn densely; for pictures only")
     dense_master: Numbers = ()
 
@@ -37,6 +48,12 @@ class CurveReport(Document):
         lengths = {len(self.x), len(self.measured), len(self.master), len(self.errors)}
         if len(lengths) > 1:
             raise ValueError(f"x, measured, master and errors must have one length, and theirs are {sorted(lengths)}")
+        refined = {len(self.limit), len(self.order), len(self.limit_errors)}
+        refined |= {len(row) for rows in (self.cells, self.errors_by_mesh) for row in rows}
+        if self.cells and (refined != lengths or self.errors_by_mesh[-1:] != (self.errors,)):
+            raise ValueError("limit, order, cells and errors_by_mesh must have the length of x, and end with errors")
+        if len(self.cells) != len(self.errors_by_mesh) or bool(self.limit) != bool(self.cells):
+            raise ValueError("cells and errors_by_mesh must have the same meshes, and limit must come with them")
         if len(self.dense_x) != len(self.dense_master):
             raise ValueError("dense_x and dense_master must have one length")
         return self
@@ -50,6 +67,10 @@ class ProtocolReport(Document):
     y: str
     tolerance: Float = Field(ge=0, description="largest |relative error| that passes")
     error: Float | None = Field(ge=0, description="largest |relative error|; null is infinite")
+    limit_tolerance: Float | None = Field(
+        default=None, ge=0, description="largest |relative error| of a limit that passes; null without three meshes"
+    )
+    limit_error: Float | None = Field(default=None, ge=0, description="largest |relative error| of a limit")
     passed: Bool
     settings: dict[str, Any]
     build_hash: Sha256 = Field(description="of the compiled core")
@@ -64,8 +85,17 @@ class ProtocolReport(Document):
         if self.error != largest:
             raise ValueError(f"error must be the largest of the curves' errors, {largest}, and it is {self.error}")
         within = self.error is not None and self.error <= self.tolerance
+        if self.limit_tolerance is not None:
+            of_limits = [error for curve in self.curves for error in curve.limit_errors]
+            known = [abs(error) for error in of_limits if error is not None]
+            largest = max(known) if of_limits and len(known) == len(of_limits) else None
+            if self.limit_error != largest:
+                raise ValueError(f"limit_error must be the largest of the limits' errors, {largest}")
+            within = within and self.limit_error is not None and self.limit_error <= self.limit_tolerance
+        elif self.limit_error is not None or any(curve.limit for curve in self.curves):
+            raise ValueError("limit_tolerance must be given with limits")
         if self.passed != (within and not self.message):
-            raise ValueError("passed must say whether the error is within the tolerance")
+            raise ValueError("passed must say whether the errors are within their tolerances")
         return self
 
 

@@ -165,8 +165,8 @@ class RefinedProtocol(MeshedProtocol):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.cells) != 3 or not all(2 * fine >= 3 * coarse > 15 for coarse, fine in pairwise(self.cells)):
-            raise ValueError(f"cells: must be three numbers from 6 on, each 1.5 times the one before, got {self.cells}")
+        if len(self.cells) != 3 or not all(2 * fine >= 3 * coarse > 18 for coarse, fine in pairwise(self.cells)):
+            raise ValueError(f"cells: must be three numbers from 7 on, each 1.5 times the one before, got {self.cells}")
 
     def finer(self, x: float) -> int:
         """Return by how much finer all three meshes are at a point that needs it."""

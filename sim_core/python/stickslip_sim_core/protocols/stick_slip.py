@@ -98,7 +98,7 @@ class StickSlip(RefinedProtocol):
         found = press(pressed, mu, self.solver, end, RATE * min(1.0, float(onset) / ROOT))
         if mesh == 0 and cells == self.cells[-1]:
             self.diagram += _phases(mu, found, end)
-        if np.isfinite(found.static_error):
+        if cells == self.cells[-1] and np.isfinite(found.static_error):
             self.tally.note(found.static_error)
         self.tally.steps += found.steps
         self.tally.unconverged_steps += found.unconverged_steps
