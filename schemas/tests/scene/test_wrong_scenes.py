@@ -151,7 +151,7 @@ WRONG: list[tuple[str, Any, str, str]] = [
     ("looks.cameras.door.focal_length", 5.0, "", "greater than or equal to 10 [mm]"),
     ("looks.cameras.door.target", [1, 1, 0], "looks.cameras.door", "straight above or below"),
     ("looks.cameras", "drags", "looks.cameras", "did you mean drag"),
-    ("parameters.mu.sets", ["friction.ball.uper"], "parameters.mu.sets.0", "no pair of ball and uper"),
+    ("parameters.mu.sets", ["friction.ball.tower"], "parameters.mu.sets.0", "no pair of ball and tower"),
     ("parameters.mu.high", 20.0, "", "friction.0.mu: Input should be less than or equal to 10"),
     ("parameters.mu.low", 3.0, "", "low below high"),
     ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2 [1]"),

@@ -105,12 +105,12 @@ def cloth_constants() -> dict[str, float]:
     """
 
 class Observed:
-    """What is seen of every step that was taken, for the checks of a run."""
+    """Worst values over the accepted steps, for the checks of a run."""
 
     def __init__(self) -> None: ...
 
     def add(self, next: Observed) -> None:
-        """Add what is seen of later steps."""
+        """Add the values of later steps."""
 
     @property
     def stretch(self) -> float:

@@ -66,9 +66,9 @@ void bind_cloth(nb::module_& m) {
   m.def(
       "cloth_constants", [] { return Constants().by_name(); },
       "Internal: constants of the cloth solver by name; see cloth/constants.hpp.");
-  nb::class_<Observed>(m, "Observed", "What is seen of every step that was taken, for the checks of a run.")
+  nb::class_<Observed>(m, "Observed", "Worst values over the accepted steps, for the checks of a run.")
       .def(nb::init<>())
-      .def("add", &Observed::add, "next"_a, "Add what is seen of later steps.")
+      .def("add", &Observed::add, "next"_a, "Add the values of later steps.")
       .def_ro("stretch", &Observed::stretch, "Largest principal stretch of a triangle.")
       .def_ro("depth", &Observed::depth, "Largest depth in a body beyond what round bodies allow [cells].")
       .def_ro("passages", &Observed::passages, "Triangles that passed the core of a body.")

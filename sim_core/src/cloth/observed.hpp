@@ -1,4 +1,4 @@
-// What is seen of every step that was taken: the values that the checks of a run judge, see checks.py.
+// Worst values over the accepted steps, which the checks of a run judge, see checks.py.
 #pragma once
 
 #include <algorithm>

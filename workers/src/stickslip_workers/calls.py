@@ -180,7 +180,7 @@ class Calls:
         self._calls = {reference: it for reference, it in self._calls.items() if it is not one}
 
     def _look(self) -> Iterator[tuple[Call, Any]]:
-        """See which nodes there are: Ray may wait for ever for a call on one that is gone."""
+        """Look which nodes are alive: Ray may wait forever for a call on a lost one."""
         nodes = cluster.nodes()
         cpus = sum(node["Resources"].get("CPU", 0) for name, node in nodes.items() if name not in self._foreign)
         self.cpus = min(cpus, self._settings.max_cpus or math.inf)

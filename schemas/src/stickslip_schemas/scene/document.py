@@ -60,7 +60,7 @@ class Calm(Document):
 class End(Document):
     """An end that the scene finds itself; arrays go on with the last frame."""
 
-    when: Literal["rest"] = Field(description="all cloth is at rest, and nothing else moves any more")
+    when: Literal["rest"] = Field(description="all cloth, all holders and all bodies are at rest")
     at_most: Time = Field(gt=0, description="when it ends in any case [s]")
 
 
@@ -187,7 +187,7 @@ class Physics(Document):
 
 
 class Staged(Physics):
-    """A scene whose parameters are set: its physics, and what is seen."""
+    """A scene whose parameters are set: its physics and its looks."""
 
     looks: Looks = Looks()
 
@@ -217,7 +217,7 @@ class Staged(Physics):
 
 
 class Scene(Staged):
-    """A scene: its physics, what may vary, and what is seen."""
+    """A scene: its physics, its parameters and its looks."""
 
     name: CustomName | None = Field(default=None, description="of the scene, for people")
     description: str = Field(default="", max_length=2000, description="for people")

@@ -60,7 +60,7 @@ def _loaded(name: str) -> tuple[Scene, dict[str, bytes]]:
 
 
 def load_scene(name: str) -> Scene:
-    """Return a built-in scene, whose files are references to artifacts; raise ValueError where there is none."""
+    """Return a built-in scene, whose files are references to artifacts; raise ValueError for an unknown name."""
     if name not in scene_names():
         raise ValueError(f"must be one of {', '.join(scene_names())}, or a scene{did_you_mean(name, scene_names())}")
     return _loaded(name)[0]

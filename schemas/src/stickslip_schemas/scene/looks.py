@@ -81,7 +81,7 @@ class BodyLook(Document):
 
 
 class Looks(Document):
-    """What is seen: textures, colours, cameras, light and floor."""
+    """The looks of a scene: textures, colours, cameras, light and floor."""
 
     sheets: Annotated[dict[CustomName, SheetLook], BY_NAME] = Field(
         default_factory=dict,

@@ -25,7 +25,7 @@ class Seen:
     """(frames, V, 3) [m]"""
 
     crossings: int
-    """Largest number of pairs of triangles that cross in a frame; 0 where cloth does not feel itself."""
+    """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact."""
 
 
 @dataclass(frozen=True)

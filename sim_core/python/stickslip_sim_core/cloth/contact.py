@@ -167,4 +167,4 @@ class PairForces:
     """(P,)"""
 
     body: NDArray[np.int32]
-    """(P,): number of the body, -1 where there is none."""
+    """(P,): number of the body, or -1."""

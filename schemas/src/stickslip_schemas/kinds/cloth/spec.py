@@ -45,7 +45,7 @@ PICTURE_DECIBELS = {Quality.preview: 34.8, Quality.draft: 38.9, Quality.standard
 
 
 SEGMENTS = ("background", "floor", "cloth", "prop")
-"""Names of the codes of the array `segmentation` where there is one cloth: add new ones at the end."""
+"""Names of the codes of the array `segmentation` of a scene with one cloth: add new ones at the end."""
 
 
 class ClothAxes(Document):
