@@ -1,7 +1,8 @@
 """`ray start --head --block` for one machine, which `stickslip up` keeps alive: loopback only, with a token.
 
 The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then (ray-project/ray#65983). It
-does not wait for ports that it already knows. One of them is no option of `ray start`, so a private function of Ray adds it.
+does not wait for ports that it already knows. One of them is no option of `ray start`, so a private function of Ray
+adds it.
 """
 
 import os
