@@ -100,9 +100,9 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, const Edges& clamped,
              double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
-             int patience, int halvings_max, double step_error, double longest_step, int finest, const std::string& kernel,
-             const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_share,
-             double second_share, const Triangles& surface_triangles,
+             int patience, int halvings_max, double step_error, double longest_step, int finest,
+             const std::string& kernel, const std::vector<double>& thickness, const Eigen::MatrixXd& mu,
+             double edge_share, double second_share, const Triangles& surface_triangles,
              const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
              const std::vector<double>& crease, const std::map<std::string, double>& changed) {
             const Constants constants(changed);
@@ -126,9 +126,8 @@ void bind_cloth(nb::module_& m) {
       .def(
           "set_state",
           [](ClothSolver& self, const Points3& positions, const Points3& velocities, const Points3& slopes,
-             const Points3& surfaces, const std::vector<BodyTuple>& bodies, bool begins) {
-            self.set_state(positions, velocities, slopes, surfaces, bodies_of(bodies), begins);
-          },
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies,
+             bool begins) { self.set_state(positions, velocities, slopes, surfaces, bodies_of(bodies), begins); },
           "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a, "bodies"_a, "begins"_a)
       .def(
           "step",

@@ -53,8 +53,8 @@ class Assembly {
   // That block, N/m.
   Eigen::Matrix3d own_block(int node) const;
 
-  // K's neighbour that the factor is of: the positive part of the stress and of the law, and the plate element that couples six nodes
-  // in place of twelve.
+  // K's neighbour that the factor is of: the positive part of the stress and of the law, and the plate element that
+  // couples six nodes in place of twelve.
   ClothMatrix neighbour(const Buffer<double>& x, NeighbourNumbers& numbers);
 
  private:

@@ -145,8 +145,8 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
       if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
     }
   }
-  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, {}), materials,
-                                         surfaces.crease, x, radius, settings);
+  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, {}),
+                                         materials, surfaces.crease, x, radius, settings);
 }
 
 }  // namespace sim_core

@@ -43,10 +43,10 @@ class StepController {
   Stepper& stepper_;
   StepControl control_;
   ControlSettings constants_;
-  int finest_, last_, level_;              // log2 of steps in an interval; `last_`: of the shortest
-  int tick_;                               // in the interval, of the shortest steps
-  double begin_ = 0.0, length_ = 0.0;      // of the interval, s
-  std::vector<double> cost_;               // by level: work per interval of late, 0 where unknown
+  int finest_, last_, level_;          // log2 of steps in an interval; `last_`: of the shortest
+  int tick_;                           // in the interval, of the shortest steps
+  double begin_ = 0.0, length_ = 0.0;  // of the interval, s
+  std::vector<double> cost_;           // by level: work per interval of late, 0 where unknown
 };
 
 }  // namespace sim_core

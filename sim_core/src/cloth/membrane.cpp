@@ -79,7 +79,7 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
     law_.insert(law_.end(), in_y.data(), in_y.data() + 20);  // column by column
     tabulated_.push_back(!table.constant());
   }
-  data_ = {groups,       nodes_.data(), shape_.data(),     area_.data(),
+  data_ = {groups,         nodes_.data(), shape_.data(),     area_.data(),
            fabric_.data(), law_.data(),   tabulated_.data(), slots_.data()};
 }
 

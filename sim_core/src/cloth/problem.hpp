@@ -33,14 +33,14 @@ enum class MembranePart { exact, tension, definite };
 constexpr double table_stretch = 1.0 / 6.0;
 
 struct MembraneData {
-  int groups;  // of triangles of one fabric each
-  const int* nodes;         // (groups, 3, lanes)
-  const double* shape;      // (groups, 4, lanes): gradients of the shape functions of nodes 1 and 2, 1/m
-  const double* area;       // (groups, lanes), 0 in the lanes that pad the last group
-  const int* fabric;        // (groups)
-  const double* law;        // (fabrics, 24): A, B, C, D at no strain, then five coefficients of each, N/m
-  const char* tabulated;    // (fabrics): whether these five are not all zero
-  const int* slots;         // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for held nodes
+  int groups;             // of triangles of one fabric each
+  const int* nodes;       // (groups, 3, lanes)
+  const double* shape;    // (groups, 4, lanes): gradients of the shape functions of nodes 1 and 2, 1/m
+  const double* area;     // (groups, lanes), 0 in the lanes that pad the last group
+  const int* fabric;      // (groups)
+  const double* law;      // (fabrics, 24): A, B, C, D at no strain, then five coefficients of each, N/m
+  const char* tabulated;  // (fabrics): whether these five are not all zero
+  const int* slots;       // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for held nodes
 };
 
 // Of each triangle the second derivatives (H11, H22, 2 H12) are linear in the positions of the nodes of its stencil.

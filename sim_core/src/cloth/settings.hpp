@@ -25,7 +25,7 @@ struct StepReport {
   int missed = 0;                  // of those, by steps of the controller that are further off than it allows
   int substeps = 0, newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
-  double sharpest = std::numeric_limits<double>::infinity();  // cells: least radius of a skeleton that bears
+  double sharpest = std::numeric_limits<double>::infinity();        // cells: least radius of a skeleton that bears
   double factorizations = 0.0;                                      // whole ones, and shares of those in part
   Observed seen;
 

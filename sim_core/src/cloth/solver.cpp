@@ -102,8 +102,8 @@ struct ClothSolver::Impl {
 
 ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
                          const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-                         const StepControl& control, const std::string& kernel,
-                         const ContactMaterials& touch, const SurfaceMeshes& surfaces, const Constants& constants)
+                         const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
+                         const SurfaceMeshes& surfaces, const Constants& constants)
     : make_([=](const std::vector<Body>& bodies, const std::vector<Skeleton>& skeletons) {
         return std::make_unique<Impl>(rest, triangles, fabrics, held, clamped, settings, control, kernel, touch,
                                       surfaces, constants, bodies, skeletons);

@@ -27,9 +27,8 @@ class ClothSolver {
   // `touch`: contact among the sheets and then the surfaces.
   ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
               const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-              const StepControl& control, const std::string& kernel,
-              const ContactMaterials& touch, const SurfaceMeshes& surfaces = {},
-              const Constants& constants = {});
+              const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
+              const SurfaceMeshes& surfaces = {}, const Constants& constants = {});
   ~ClothSolver();
 
   // `surfaces`: positions of their vertices; `bodies`: where they are, or none: they do not move in the next step.
@@ -65,8 +64,8 @@ class ClothSolver {
   struct PairForces {
     Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
     Eigen::Matrix<double, Eigen::Dynamic, 4, Eigen::RowMajor> weights;
-    Points3 forces;            // N: on sum w_i x_i
-    Eigen::VectorXd distance;  // m
+    Points3 forces;                           // N: on sum w_i x_i
+    Eigen::VectorXd distance;                 // m
     std::vector<std::int32_t> sliding, body;  // -1: of no body
   };
   PairForces pair_forces() const;

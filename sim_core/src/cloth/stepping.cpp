@@ -37,7 +37,8 @@ void Stepper::refuse_inside(const std::vector<Body>& bodies) const {
     for (std::size_t b = 0; b < bodies.size(); ++b) {
       const double depth = -gap_of(bodies[b], at_node(x, numbering.node[i])).distance;
       if (depth <= constants_.inside) continue;
-      refuse(text("positions: must not start inside a body, and vertex ", i, " is ", 1e3 * depth, " mm inside body ", b));
+      refuse(
+          text("positions: must not start inside a body, and vertex ", i, " is ", 1e3 * depth, " mm inside body ", b));
     }
   }
 }

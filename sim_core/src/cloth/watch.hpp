@@ -34,10 +34,10 @@ class Watch {
   int passages(const Body& begin, const Body& end, const StepTaken& step) const;
 
   const Assembly& assembly_;
-  std::vector<int> nodes_;       // (triangles, 3)
-  std::vector<double> inverse_;  // (triangles, 4): of the matrix of the two sides at rest, by columns, 1/m
-  std::vector<double> cell_;     // (vertices): side of a square of two triangles, m
-  double circle_ = 0.0;          // m: radius of the largest circle around a triangle
+  std::vector<int> nodes_;        // (triangles, 3)
+  std::vector<double> inverse_;   // (triangles, 4): of the matrix of the two sides at rest, by columns, 1/m
+  std::vector<double> cell_;      // (vertices): side of a square of two triangles, m
+  double circle_ = 0.0;           // m: radius of the largest circle around a triangle
   std::optional<double> energy_;  // at the end of the last step, J
 };
 

@@ -23,8 +23,8 @@ struct Candidate {
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x);
 
 // All pairs of sheets that touch each other, without a common node, that are within `reach` at x: vertices and
-// triangles first, sorted by (first, second). By a grid of cells about as large as a triangle. `farther`: of each sheet,
-// how much larger the reach is of pairs with it, m; other than 0 of skeletons only.
+// triangles first, sorted by (first, second). By a grid of cells about as large as a triangle. `farther`: of each
+// sheet, how much larger the reach is of pairs with it, m; other than 0 of skeletons only.
 std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach,
                                   const std::vector<double>& farther = {});
 

@@ -85,8 +85,8 @@ const Bone* PairDetection::bone_of(const Candidate& pair) const {
   return materials.bone_of(sheet[pair.node[0]], sheet[pair.node[3]]);
 }
 
-// `reach`: beyond what a pair keeps apart, m. A vertex may be closest to an edge or a corner of a triangle. Such a pair counts once, and only where all triangles
-// around the feature agree: otherwise a point inside one of them is closer.
+// `reach`: beyond what a pair keeps apart, m. A vertex may be closest to an edge or a corner of a triangle. Such a pair
+// counts once, and only where all triangles around the feature agree: otherwise a point inside one of them is closer.
 void PairDetection::find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
                                   std::vector<Pair>& pairs) {
   const Surface& surface = near.surface;
@@ -205,7 +205,10 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
                    weights,
                    {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
                     k * smoothing_ * smoothing_},
-                   first - (!bone ? 0.5 : a > b ? 1.0 : 0.0) * rho,
+                   first - (!bone   ? 0.5
+                            : a > b ? 1.0
+                                    : 0.0) *
+                               rho,
                    thickness,
                    bone ? materials.thickness[std::min(a, b)] : thickness,
                    along_first,
@@ -213,7 +216,8 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
                    given});
 }
 
-// Motion of the first point over the second, less that by which rho turns: with a body or surface, or half with each sheet.
+// Motion of the first point over the second, less that by which rho turns: with a body or surface, or half with each
+// sheet.
 Vector3d PairDetection::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];

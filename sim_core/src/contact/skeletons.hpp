@@ -22,8 +22,8 @@ struct Skeleton {
   Eigen::Vector3d point(const Body& at, int i) const { return at.origin + at.rotation * points[i]; }
 };
 
-// Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from the cloth, which lies
-// between `low` and `high`.
+// Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from the cloth, which
+// lies between `low` and `high`.
 std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell, const Eigen::Vector3d& low,
                                    const Eigen::Vector3d& high, double beyond, const SkeletonSettings& settings);
 

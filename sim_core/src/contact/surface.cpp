@@ -57,8 +57,7 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
   }
   bone_edges = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_bone, -1}) -
                                 edges.begin());
-  bone_vertices =
-      static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) - vertices.begin());
+  bone_vertices = static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) - vertices.begin());
 }
 
 }  // namespace sim_core

@@ -24,9 +24,9 @@ struct Surface {
   std::vector<int> triangles_of_edge;              // counts
   std::vector<int> around_begin, around;           // triangles around each node, ascending
   std::vector<int> sheet_of_node;
-  int bone_triangles, bone_edges, bone_vertices;   // where those of skeletons begin
-  CollisionMask collides;          // whether two sheets touch each other
-  std::vector<int> last_collider;  // by sheet: the last node that it touches
+  int bone_triangles, bone_edges, bone_vertices;  // where those of skeletons begin
+  CollisionMask collides;                         // whether two sheets touch each other
+  std::vector<int> last_collider;                 // by sheet: the last node that it touches
 
   Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, CollisionMask collides,
           const Bones& bones = {});

@@ -110,7 +110,7 @@ class TestLimits:
         assert found.order[0] == pytest.approx(1.7)
 
     def test_without_an_order(self) -> None:
-        """Values that go to and fro: the order is that of theory, and the certificate says so."""
+        """Values that go to and fro: the order is that of theory, and the certificate gives the one of theory."""
         found = Refinement.of(((10.0,), (20.0,), (40.0,)), ((0.4,), (0.2,), (0.1,)), ((1.0,), (1.3,), (1.2,)))
         assert math.isnan(found.order[0])
         assert found.limit[0] == pytest.approx(1.2 - 0.1 / 3.0)

@@ -51,8 +51,8 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
     const Lane g00 = 0.5 * (f[0][0] * f[0][0] + f[0][1] * f[0][1] + f[0][2] * f[0][2] - 1.0);
     const Lane g11 = 0.5 * (f[1][0] * f[1][0] + f[1][1] * f[1][1] + f[1][2] * f[1][2] - 1.0);
     const Lane g01 = 0.5 * (f[0][0] * f[1][0] + f[0][1] * f[1][1] + f[0][2] * f[1][2]);
-    StretchLaw law = stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], 0.5 * (g00 + g11),
-                                         0.5 * (g00 - g11), g01);
+    StretchLaw law =
+        stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], 0.5 * (g00 + g11), 0.5 * (g00 - g11), g01);
     const Lane s00 = 0.5 * (law.a + law.h), s11 = 0.5 * (law.a - law.h), s01 = 0.5 * law.q;
     energy += area * law.energy;
     Lane force[3][3];

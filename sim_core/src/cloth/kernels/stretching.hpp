@@ -1,7 +1,7 @@
 // The law of stretching: an energy whose stress under uniaxial strain is that of the table of [Wang et al. 2011].
 //
-// With a = (G00 + G11)/2, h = (G00 - G11)/2, q = G01, z = h^2 + q^2 and r = sqrt(z), the principal strains are a + r and
-// a - r. Per area
+// With a = (G00 + G11)/2, h = (G00 - G11)/2, q = G01, z = h^2 + q^2 and r = sqrt(z), the principal strains are a + r
+// and a - r. Per area
 //
 //   W = Q(K0)/2 + m(e) g(t) Q(K(y)),   Q(K) = A a^2 + 2 B a h + C h^2 + D q^2,
 //   A = k0 + 2 k1 + k2,   B = k0 - k2,   C = k0 - 2 k1 + k2,   D = 2 k3,
@@ -25,8 +25,9 @@
 namespace sim_core {
 namespace {
 
-constexpr double table_end = 0.5 * ((1.0 + table_stretch) * (1.0 + table_stretch) - 1.0);                       // U
-constexpr double share_cubic = (1.0 - 6.0 * table_end + 3.0 * table_end * table_end) / (table_end * table_end * table_end);  // d
+constexpr double table_end = 0.5 * ((1.0 + table_stretch) * (1.0 + table_stretch) - 1.0);  // U
+constexpr double share_cubic =
+    (1.0 - 6.0 * table_end + 3.0 * table_end * table_end) / (table_end * table_end * table_end);  // d
 constexpr double share_tail =
     (table_end * (2.0 - table_end * (0.75 - 0.2 * share_cubic * table_end)) - 0.5) * table_end * table_end;  // c
 
@@ -101,8 +102,7 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
     const Lane u_ee = m_ee * g, u_et = m_e * g_t, u_tt = 12.0 * m * rest * (one - 3.0 * t);
     const Lane u_aa = u_ee * e_a * e_a + u_e * e_aa + 2.0 * u_et * e_a * w + u_tt * w * w;
     const Lane u_az = u_ee * e_a * e_z + u_e * e_az + u_et * (e_a * t_z + e_z * w) + u_tt * w * t_z + u_t * w_z;
-    const Lane u_zz =
-        u_ee * e_z * e_z + u_e * e_zz + 2.0 * u_et * e_z * t_z + u_tt * t_z * t_z + u_t * a * w_zz;
+    const Lane u_zz = u_ee * e_z * e_z + u_e * e_zz + 2.0 * u_et * e_z * t_z + u_tt * t_z * t_z + u_t * a * w_zz;
     const Lane u_ah = u_az * h2, u_aq = u_az * q2;
     const Lane u_hh = u_zz * h2 * h2 + 2.0 * u_z, u_hq = u_zz * h2 * q2, u_qq = u_zz * q2 * q2 + 2.0 * u_z;
     const Lane y_zz = h * w_zz, y_az = h * w_az;
@@ -130,8 +130,8 @@ template <bool matrix>
 inline StretchLaw stretch_law(const double* k, bool tabulated, Lane a, Lane h, Lane q) {
   const Lane zero{}, none[4] = {zero + k[0], zero + k[1], zero + k[2], zero + k[3]};
   const Quadratic own = quadratic(none, a, h, q);
-  StretchLaw law{0.5 * own.value, 0.5 * own.a, 0.5 * own.h, 0.5 * own.q,
-                 none[0], none[1], zero, none[2], zero, none[3]};
+  StretchLaw law{0.5 * own.value, 0.5 * own.a, 0.5 * own.h, 0.5 * own.q, none[0],
+                 none[1],         zero,        none[2],     zero,        none[3]};
   if (tabulated) add_table<matrix>(law, k + 4, a, h, q);
   return law;
 }
@@ -142,7 +142,8 @@ inline void make_definite(StretchLaw& law) {
   constexpr int sweeps = 4;  // of Jacobi's rotations, to rounding
   const Lane zero{}, one = zero + 1.0;
   const Lane minor = law.aa * law.hh - law.ah * law.ah;
-  const Lane whole = law.qq * minor - law.aa * law.hq * law.hq - law.hh * law.aq * law.aq + 2.0 * law.ah * law.aq * law.hq;
+  const Lane whole =
+      law.qq * minor - law.aa * law.hq * law.hq - law.hh * law.aq * law.aq + 2.0 * law.ah * law.aq * law.hq;
   const auto definite = (law.aa > zero) & (minor > zero) & (whole >= zero);
   bool all = true;
   for (int l = 0; l < membrane_lanes; ++l) all = all && definite[l];
