@@ -55,7 +55,7 @@ def test_a_scene_is_drawn_before_it_is_simulated(tmp_path: Path, own: bool) -> N
     with Image.open(out / "motion.webp") as clip:
         assert clip.size == (320 * len(views), 320)
         first = np.asarray(clip.convert("RGB"), dtype=float)
-        clip.seek(clip.n_frames - 1)
+        clip.seek(clip.n_frames - 1)  # type: ignore[attr-defined]
         moved = np.abs(np.asarray(clip.convert("RGB")) - first).max(axis=2) > 40
     assert 30 < moved.sum() < 0.2 * moved.size
     with Image.open(out / f"{views[0]}.png") as picture:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.kinds.cloth_scene import ClothSceneSimulation
 from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
@@ -74,6 +75,7 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
     )
     (point,) = keyed_points(spec, BUILDS)
     simulation = spec.simulation_type.model_validate_json(point.simulation_text)
+    assert isinstance(simulation, ClothSceneSimulation)
     document = with_files(simulation.scene.model_dump(mode="json"), simulation.scene.files(), tmp_path)
     (outcome,) = cloth_scene.KIND.simulate([{"scene": document, "seed": 1}], None)
     assert not outcome.reason

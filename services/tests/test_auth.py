@@ -80,7 +80,9 @@ def test_workers_need_the_key(client: httpx.Client, app: FastAPI, path: str, key
 
 def test_the_key_lets_them_in(client: httpx.Client, app: FastAPI) -> None:
     headers = {"Authorization": f"Bearer {app.state.worker_key}"}
-    response = client.post("/v1/worker/heartbeat", headers=headers, json={"worker_id": "x", "leases": []})
+    response = client.post(
+        "/v1/worker/heartbeat", headers=headers, json={"worker_id": "x", "leases": [], "condition": {"slots": 2}}
+    )
     assert (response.status_code, response.json()["code"]) == (404, "unknown_worker")
     assert client.get("/v1/workers").status_code == 200  # looking is for everybody
 

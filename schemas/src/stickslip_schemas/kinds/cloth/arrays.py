@@ -138,7 +138,11 @@ def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         array("missed_steps", "shortest steps that are further off than the preset's step error allows", "int32"),
         array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
         *(
-            array(name, text if limit is None else f"{text}; at most {limit:g} if valid", attributes={"limit": limit})
+            array(
+                name,
+                text if limit is None else f"{text}; at most {limit:g} if valid",
+                attributes={} if limit is None else {"limit": limit},
+            )
             for name, (text, limit) in CHECKS.items()
         ),
         over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
