@@ -22,6 +22,7 @@ import pytest
 import yaml
 from harness import STICKSLIP, Service, command_line, descendants, read_arrays, wait_for
 from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base.states import Stage
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
@@ -159,8 +160,10 @@ RAY = ("raylet/raylet", "gcs/gcs_server")
 
 def test_ray_listens_on_loopback_and_is_replaced_at_once_when_it_dies(service: Service) -> None:
     def session() -> str | None:
-        alive = [worker["id"] for worker in service.get("/v1/workers") if worker["alive"]]
-        return alive[0] if alive else None
+        """Return the session of a dispatcher to which Ray answers: it registers before."""
+        workers = service.get("/v1/workers")
+        ready = [one["id"] for one in workers if one["alive"] and one["condition"]["state"] == "ready"]
+        return ready[0] if ready else None
 
     assert service.process is not None
     before = wait_for("a worker", session, 60)
@@ -186,17 +189,18 @@ LONGEST_GAP = 30.0
 """How long a job may stand still after a death [s], at a load of 4; in proportion longer at more."""
 
 VICTIMS = {
-    "coordinator": "-m stickslip_services.app",
-    "dispatcher": "-m stickslip_workers dispatch",
-    "ray start": "-m stickslip_workers head",
-    "stage or render process": "ray::IDLE",
-    "raylet": "raylet/raylet",
-    "gcs": "gcs/gcs_server",
-    "dashboard agent": "ray::DashboardAgent",
-    "runtime environment agent": "ray::RuntimeEnvAgent",
-    "supervisor": "",
-    "all": "",
+    "coordinator": ("-m stickslip_services.app",),
+    "dispatcher": ("-m stickslip_workers dispatch",),
+    "ray start": ("-m stickslip_workers head",),
+    "stage or render process": ("ray::IDLE", *(f"ray::{stage.value}" for stage in Stage)),  # named after its task
+    "raylet": ("raylet/raylet",),
+    "gcs": ("gcs/gcs_server",),
+    "dashboard agent": ("ray::DashboardAgent",),
+    "runtime environment agent": ("ray::RuntimeEnvAgent",),
+    "supervisor": (),
+    "all": (),
 }
+"""What to kill: one of the processes with one of these in their command lines."""
 
 
 def many_rods(number: int) -> dict[str, Any]:
@@ -262,7 +266,8 @@ def kill_some(service: Service, victim: str) -> None:
                 continue
         service.start()
         return
-    pids = [pid for pid in descendants(service.process.pid) if VICTIMS[victim] in command_line(pid)]
+    lines = {pid: command_line(pid) for pid in descendants(service.process.pid)}
+    pids = [pid for pid, line in lines.items() if any(words in line for words in VICTIMS[victim])]
     if pids:
         kill(random.choice(pids))
 
