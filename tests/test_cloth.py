@@ -121,6 +121,7 @@ def test_what_is_known_of_every_pixel_reaches_the_reader(service: Service, tmp_p
     names = ("depth", "segmentation", "normals", "uv", "flow")
     spec = SPEC | {"ground_truth": list(names), "axes": SPEC["axes"] | {"viewpoint": "left"}}
     job = service.finished(service.submit(spec))
+    assert job["state"] == "succeeded", job["message"]
     assert job["progress"]["stages"]["simulate"]["cached"] == 1
     target = tmp_path / "known"
     command = [STICKSLIP, "pull", job["dataset"]["dataset"], target, "--url", service.url]

@@ -14,6 +14,7 @@ from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -158,3 +159,14 @@ def test_long_values_are_cut_and_errors_are_json() -> None:
 def test_schema_names_the_quantities() -> None:
     definitions = job_spec_adapter.json_schema()["$defs"]
     assert {"RodHangSpec", "ClothDragSpec", "RodHangAxes", "ClothDragAxes"} <= set(definitions)
+
+
+def test_no_two_arrays_have_one_name() -> None:
+    truth = ["depth", "segmentation", "normals", "uv", "flow"]
+    looks = {"texture": ["plaid"], "viewpoint": ["front"]}
+    specs = [RODS, changed(CLOTH, "/ground_truth", truth)]
+    specs.append({"kind": "cloth_scene", "scene": "turning-ball", "axes": looks, "ground_truth": truth})
+    for document in specs:
+        spec = job_spec_adapter.validate_python(document)
+        names = [array.name for array in (*spec.arrays(), *COMMON_ARRAYS)]
+        assert len(set(names)) == len(names)

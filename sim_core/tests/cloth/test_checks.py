@@ -58,7 +58,7 @@ def test_stretch_is_the_largest_principal_one() -> None:
 def test_holders_in_the_floor_are_deep() -> None:
     cloth = moved(0.005, [0.0, 0.0, -0.009], [plane(0.5)])
     assert cloth.seen.depth == pytest.approx(0.004 / (SIDE / CELLS))
-    assert judged(cloth)[0] == "depth"
+    assert judged(cloth)[0] == "penetration"
 
 
 def test_round_bodies_may_be_as_deep_as_flat_triangles_let_them() -> None:
@@ -92,7 +92,7 @@ def test_a_body_that_goes_through_cloth_is_caught() -> None:
     cloth, start = sheet(0.0, HELD)
     cloth.step(0.01, held=start[:-1], bodies=[sphere(0.5, 0.05, origin=[0.003, 0.005, 0.1])])
     cloth.step(0.01, held=start[:-1], bodies=[sphere(0.5, 0.05, origin=[0.003, 0.005, -0.1])])
-    assert judged(cloth)[0] == "depth"  # in a part of the step
+    assert judged(cloth)[0] == "penetration"  # in a part of the step
 
 
 def test_what_is_sharper_than_half_a_cell_is_named() -> None:

@@ -151,13 +151,13 @@ EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingPr
             (rod_of_a_cell, ("right",)),
             (ball_of_a_cell, ("right",)),
             (rod_of_a_quarter, ("sharpness",)),
-            (thrown_ball, ("right", "stretch", "depth", "passages")),
-            (holders_into_floor, ("depth",)),
+            (thrown_ball, ("right", "stretch", "penetration", "passages")),
+            (holders_into_floor, ("penetration",)),
             (stretched_rim, ("stretch",)),
             (start_in_floor, ("refused", "contact_gain")),
-            (start_in_ball, ("refused", "contact_gain", "depth", "stretch")),
+            (start_in_ball, ("refused", "contact_gain", "penetration", "stretch")),
             (shaken_floor, ("right",)),
-            (squeezed, ("depth", "contact_gain", "passages", "unconverged")),
+            (squeezed, ("penetration", "contact_gain", "passages", "unconverged")),
         )
     }
 )

@@ -85,7 +85,7 @@ class Reason(StrEnum):
     crossings = "crossings"
     contact_gain = "contact_gain"
     stretch = "stretch"
-    depth = "depth"
+    penetration = "penetration"
     passages = "passages"
     sharpness = "sharpness"
     # A job's own.
@@ -115,7 +115,7 @@ _OF_SAMPLE = {
     Reason.crossings,
     Reason.contact_gain,
     Reason.stretch,
-    Reason.depth,
+    Reason.penetration,
     Reason.passages,
     Reason.sharpness,
 }

@@ -97,7 +97,7 @@ CHECKS = (
         "the fabrics were measured up to 1 + 1/6; drops reach 1.09 and heaps 1.17",
     ),
     Check(
-        "depth",
+        "penetration",
         "largest depth in a body at the end of a step, beyond the sagitta of flat triangles on its round face, over "
         "the side of a cell",
         "cells",

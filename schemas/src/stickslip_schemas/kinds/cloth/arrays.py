@@ -121,7 +121,7 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
         "contact_gain": ("work that bodies do on the motion against them, over the flow of energy", 1e-3),
         "energy_gain": ("largest energy gained beyond the work of all forces, over the flow of energy", None),
         "stretch": ("largest principal stretch of a triangle", 1.25),
-        "depth": ("largest depth in a body beyond the sagitta of flat triangles [cells]", 0.1),
+        "penetration": ("largest depth in a body beyond the sagitta of flat triangles [cells]", 0.1),
         "passages": ("triangles that passed the core of a body", 0.0),
         "sharpness": ("side of a cell over the radius of the sharpest body that bore cloth", 2.0),
     }
