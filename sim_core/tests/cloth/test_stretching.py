@@ -83,7 +83,7 @@ def test_stress_is_that_of_the_table(name: str, size: float) -> None:
             return pulled * (np.outer(along, along) + width * np.outer(across, across))
 
         def free(stress: Callable[[Floats], Floats], across: Floats = across) -> float:
-            return float(newton(lambda width: across @ stress(strained(width)) @ across, 0.0, x1=-0.05))
+            return float(newton(lambda width: float(across @ stress(strained(width)) @ across), 0.0, x1=-0.05))
 
         held = along @ law(strained(0.0)) @ along
         assert along @ sheet.at(strained(0.0))[1] @ along == pytest.approx(held, rel=1e-3)

@@ -131,11 +131,11 @@ class TestMovingMesh:
 
 class TestOtherMotions:
     def test_a_linear_motion_has_even_speeds_and_ramps(self) -> None:
-        keys = Keyframes([0.0, 3.0], [[0, 0, 0], [3.0, 0, 0]], np.zeros((2, 3)), linear=True, ramp=1.0)
+        keys = Keyframes([0.0, 3.0], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], np.zeros((2, 3)), linear=True, ramp=1.0)
         at = [keys.pose(time)[0, 3] for time in (0.0, 0.5, 1.0, 2.0, 3.0, 3.5, 4.0, 9.0)]
         assert at == pytest.approx([0.0, 0.125, 0.5, 1.5, 2.5, 2.875, 3.0, 3.0])
         assert keys.last == 4.0
-        sharp = Keyframes([0.0, 3.0], [[0, 0, 0], [3.0, 0, 0]], np.zeros((2, 3)), linear=True)
+        sharp = Keyframes([0.0, 3.0], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], np.zeros((2, 3)), linear=True)
         assert sharp.pose(1.5)[0, 3] == pytest.approx(1.5)
 
     def test_a_spin_gains_its_speed_and_keeps_it(self) -> None:
@@ -160,7 +160,7 @@ class TestOtherMotions:
         bones = np.tile(np.eye(3, 4), (2, 2, 1, 1))
         bones[1, 1, 2, 3] = 1.0
         skin = {"rest": np.eye(3), "weights": np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]]), "bones": bones}
-        np.savez(tmp_path / "s.npz", triangles=[[0, 1, 2]], times=[0.0, 1.0], **skin)
+        np.savez(tmp_path / "s.npz", triangles=[[0, 1, 2]], times=[0.0, 1.0], **skin)  # type: ignore[arg-type]
         for strength in (1.0, 0.5):
             moved = read_moving_mesh(tmp_path / "s.npz", strength=strength).at(1.0) - np.eye(3)
             assert moved[:, 2] == pytest.approx(strength * np.array([0.0, 0.5, 1.0]))

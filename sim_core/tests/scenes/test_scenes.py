@@ -8,7 +8,7 @@ import pytest
 from stickslip_sim_core import ClothRun, fabric, fabric_names
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.scenes import cloth_drag
+from stickslip_sim_core.scenes import cloth_drag, hanging
 
 pytestmark = pytest.mark.physics
 
@@ -107,7 +107,7 @@ class TestClothRun:
         mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, 10, 10)
         first = cloth_drag.hang(mesh, fabric("camel-ponte-roma"), seed=0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(cloth_drag, "HANGING", replace(cloth_drag.HANGING, tolerance=1e-4, time_step=0.035))
+            patch.setattr(hanging, "HANGING", replace(hanging.HANGING, tolerance=1e-4, time_step=0.035))
             second = cloth_drag.hang(mesh, fabric("camel-ponte-roma"), seed=0, kernel="baseline")
         assert first.reason == second.reason == ""
         assert second.positions == pytest.approx(first.positions, abs=1e-6)
@@ -127,7 +127,7 @@ class TestClothRun:
             assert hung.softest > 0.0, name
 
     def test_hung_shape_that_does_not_settle_is_not_valid(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(cloth_drag, "HANGING_STEPS_MAX", 2)
+        monkeypatch.setattr(hanging, "HANGING_STEPS_MAX", 2)
         scene = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=1).run()
         assert not scene.valid
         assert "did not come to rest" in scene.reason
@@ -160,9 +160,9 @@ class TestClothRun:
             ({"mesh": 4}, r"mesh: must be in \[5, inf\], got 4"),
             ({"preset": "best"}, "preset: must be one of"),
             ({"material": "silk"}, "fabric: must be one of"),
-            ({"mu": -0.1}, r"mu: must be in \[0, 10\], got -0.1"),
+            ({"mu": -0.1}, r"mu: must be in \[0, 10\], one or one a sheet, got -0.1"),
             ({"self_friction": -1.0}, r"mu: must be in \[0, 10\], got -1.0"),
-            ({"mu": float("nan")}, r"mu: must be in \[0, 10\], got nan"),
+            ({"mu": float("nan")}, r"mu: must be in \[0, 10\], one or one a sheet, got nan"),
         ],
     )
     def test_refusals(self, settings: dict[str, object], message: str) -> None:

@@ -107,7 +107,8 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
     for box in np.unique(boxes, axis=0):
         inside = np.flatnonzero((boxes == box).all(axis=1))
         crowd[inside] = np.arange(len(inside))
-    groups = np.unique(np.column_stack([boxes % period, crowd]), axis=0, return_inverse=True)[1].ravel()
+    kinds = np.column_stack([boxes % period, crowd])
+    groups = np.asarray(np.unique(kinds, axis=0, return_inverse=True)[1]).ravel()
     rows, columns, values = [], [], []
     for group in range(groups.max() + 1):
         members = np.flatnonzero(groups == group)

@@ -51,7 +51,7 @@ def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
     order, power = math.nan, 2.0
     if missed(low) * missed(high) < 0.0:
         order = power = float(brentq(missed, low, high))
-    return values[2] + (values[2] - values[1]) / ((sizes[1] / sizes[2]) ** power - 1.0), order
+    return float(values[2] + (values[2] - values[1]) / ((sizes[1] / sizes[2]) ** power - 1.0)), order
 
 
 @dataclass(frozen=True)
