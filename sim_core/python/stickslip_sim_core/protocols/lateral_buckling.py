@@ -120,7 +120,7 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
         distance, nearest = cKDTree(rest[members]).query(rest)
         near = np.flatnonzero(distance <= REACH * cell)
         rows.append(near)
-        columns.append(members[nearest[near]])
+        columns.append(members[np.asarray(nearest)[near]])
         values.append((ends[0] - ends[1])[near] / (2.0 * DIFFERENCE * LENGTH))
     whole = csc_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (len(free), len(free))

@@ -45,7 +45,7 @@ def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
 
     def missed(p: float) -> float:
         a, b, c = (size**p for size in sizes)
-        return (values[0] - values[1]) * (b - c) - (values[1] - values[2]) * (a - b)
+        return float((values[0] - values[1]) * (b - c) - (values[1] - values[2]) * (a - b))
 
     low, high = ORDERS
     order, power = math.nan, 2.0
