@@ -16,7 +16,7 @@ GENERATED = (".min.js", "_sim_core.pyi")
 MAX_SOURCE_LINES = 57_600
 """The goal is 50,000. Lower this with every change that removes lines; never raise it.
 
-It was raised once, from 53,500, for scenes as data and the checks of cloth: what they added is to be paid back."""
+It was raised once, from 53,500, for scenes as data and the checks of cloth: later changes must pay it back."""
 
 MAX_CODE_LINES = {".py": 400, ".cpp": 300, ".hpp": 300}
 MAX_CLASS_LINES = 250
