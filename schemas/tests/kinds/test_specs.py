@@ -49,6 +49,12 @@ def errors_of(document: Any) -> list[FieldError]:
     return field_errors(caught.value, document, AnyJobSpec)
 
 
+def test_a_scene_s_axis_with_a_wrong_name_and_no_type_is_refused_by_fields() -> None:
+    axes = {"viewpoint": [0], "x-axis": {"low": 0.0, "high": 0.0, "num": 1}}
+    fields = errors_of({"kind": "cloth_scene", "axes": axes})
+    assert {field.pointer for field in fields if "x-axis" in field.pointer} == {"/axes/x-axis", "/axes/x-axis/type"}
+
+
 def test_short_and_long_forms_are_one_spec() -> None:
     short = job_spec_adapter.validate_python(RODS)
     long = job_spec_adapter.validate_python(job_spec_adapter.dump_python(short, mode="json"))

@@ -90,9 +90,8 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
             rule = f"there is no such field{hint} Fields: {', '.join(known)}"
         case "union_tag_invalid" | "union_tag_not_found":
             tag = item["ctx"]["discriminator"].strip("'")
-            known = [
-                word for model in _models_at(of, location) for word in _literals(model.model_fields[tag].annotation)
-            ]
+            tags = [model.model_fields[tag] for model in _models_at(of, location) if tag in model.model_fields]
+            known = [word for field in tags for word in _literals(field.annotation)]
             is_missing = item["type"] == "union_tag_not_found" and isinstance(value, Mapping)
             if isinstance(value, Mapping):
                 location = (*location, tag)

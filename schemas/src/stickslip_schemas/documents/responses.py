@@ -2,7 +2,7 @@
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
@@ -148,7 +148,9 @@ class FileUpload(Document):
     """An uploaded file of a scene."""
 
     file: ArtifactRef = Field(description="reference for the document of a scene")
-    counts: tuple[int, int] | None = Field(description="vertices and triangles of an OBJ file: `counts` of a mesh")
+    counts: Annotated[tuple[int, ...], Field(min_length=2, max_length=2)] | None = Field(
+        description="vertices and triangles of an OBJ file: `counts` of a mesh"
+    )
     bytes: int
 
 
