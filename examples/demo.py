@@ -48,7 +48,7 @@ def main() -> None:
         console.rule("2,500 more rods, without pictures, to learn from")
         more_rods = submit(MORE_RODS, url)
         run("stickslip", "pull", more_rods, OUT / "training-dataset", "--url", url)
-    run("stickslip-train", "curvature", OUT / "training-dataset", "--out", OUT / "training", "--minutes", "1")
+    run("stickslip-train", "curvature", OUT / "training-dataset", "--out", OUT / "training", "--steps", "800")
     console.rule(f"done in {time.monotonic() - started:.0f} s")
     console.print(f"contact sheets {OUT / 'contact-sheet.png'}, {OUT / 'cloth-sheet.png'}")
     console.print(f"training       {OUT / 'training' / 'curvature.png'}")

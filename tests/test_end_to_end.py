@@ -158,7 +158,7 @@ def test_training_learns_from_the_pulled_dataset(directory: Path) -> None:
     (batch,) = rods.loader(8)
     assert batch["views"].shape == (len(rods), 4, 224, 224, 3)
     done = subprocess.run(
-        [TRAIN, "curvature", str(directory), "--out", str(directory.parent / "run"), "--epochs", "2", "--threads", "1"],
+        [TRAIN, "curvature", str(directory), "--out", str(directory.parent / "run"), "--steps", "6", "--threads", "1"],
         capture_output=True,
         text=True,
         check=False,

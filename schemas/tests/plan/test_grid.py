@@ -17,7 +17,7 @@ def numbers(low: float, high: float, length: int | None = None) -> st.SearchStra
     """Axes of numbers in [low, high], of a given length or of any; some ranges are so narrow that values repeat."""
     sizes = st.integers(1, 4) if length is None else st.just(length)
     values = st.floats(low, high, allow_nan=False)
-    lists = sizes.flatmap(lambda size: st.lists(values, min_size=size, max_size=size, unique=True))
+    lists = sizes.flatmap(lambda size: st.lists(values, min_size=size, max_size=size, unique=length is None))
     start = high / 2
     narrow = st.just({"type": "linspace", "start": start, "stop": start * (1 + 3e-16)})
     wide = st.just({"type": "linspace", "start": low, "stop": high})
@@ -30,7 +30,7 @@ def numbers(low: float, high: float, length: int | None = None) -> st.SearchStra
 
 def words(known: list[str], length: int | None = None) -> st.SearchStrategy[Any]:
     size = (1, 3) if length is None else (length, length)
-    return st.lists(st.sampled_from(known), min_size=size[0], max_size=size[1], unique=True)
+    return st.lists(st.sampled_from(known), min_size=size[0], max_size=size[1], unique=length is None)
 
 
 @st.composite

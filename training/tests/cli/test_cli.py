@@ -27,7 +27,7 @@ def test_info_says_what_is_in_a_dataset(clips):
 def test_curvature_trains_and_writes(rods, tmp_path):
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
-    options = ["--epochs", "1", "--noise", "0.01", "--threads", "1", "--batch-size", "20"]
+    options = ["--steps", "2", "--noise", "0.01", "--threads", "1", "--batch-size", "20"]
     result = runner.invoke(app, ["curvature", str(rods.root), "--out", str(out), *options])
     assert result.exit_code == 0, result.output
     for line in (
@@ -43,7 +43,7 @@ def test_curvature_trains_and_writes(rods, tmp_path):
     assert (out / "curvature.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "model.pt").is_file()
     more = runner.invoke(
-        app, ["curvature", str(rods.root), "--out", str(out), "--resume", *options[2:], "--epochs", "2"]
+        app, ["curvature", str(rods.root), "--out", str(out), "--resume", *options[2:], "--steps", "4"]
     )
     assert more.exit_code == 0, more.output
     assert len(json.loads((out / "report.json").read_text())["history"]) == 2
@@ -62,7 +62,7 @@ def test_local_global_trains_and_writes(rods, tmp_path):
     report = json.loads((out / "report.json").read_text())
     assert report["settings"]["noise"] == [0.001, 0.01]
     assert report["methods"][0]["method"] == "network"
-    test, noisy = read_test_rods(CurvatureTraining(dataset=str(rods.root), out=out, epochs=1, noise=0.02))
+    test, noisy = read_test_rods(CurvatureTraining(dataset=str(rods.root), out=out, noise=0.02))
     strains = estimate_strains(load_local_global(out / "local-global.pt"), noisy)
     assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
 
@@ -76,14 +76,6 @@ def test_a_mistake_is_one_line_and_status_1(command, tmp_path, monkeypatch):
         result.stderr == "stickslip-train: nowhere/manifest.json is not there: this is no committed dataset version\n"
     )
     assert list(tmp_path.iterdir()) == []
-
-
-def test_both_a_time_and_epochs_is_a_mistake(rods, tmp_path):
-    result = runner.invoke(
-        app, ["curvature", str(rods.root), "--out", str(tmp_path), "--epochs", "1", "--minutes", "1"]
-    )
-    assert result.exit_code == 1
-    assert "exactly one of minutes and epochs must be given" in result.stderr
 
 
 @pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="this torch has CUDA")

@@ -35,8 +35,17 @@ def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, t
     from stickslip_training.engine import fit as engine
 
     straight = train_friction(*few[:2], SMALL, epoch=2)
-    monkeypatch.setattr(engine, "_is_over", lambda settings, state: state.step == 3)
-    train_friction(*few[:2], SMALL, out=tmp_path, epoch=2)
+    loss = FrictionLearner.loss
+
+    def killed(learner, net, step):
+        if step == 3:
+            raise KeyboardInterrupt
+        return loss(learner, net, step)
+
+    monkeypatch.setattr(engine, "_CHECKPOINT_SECONDS", 0.0)  # after every step
+    monkeypatch.setattr(FrictionLearner, "loss", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train_friction(*few[:2], SMALL, out=tmp_path, epoch=2)
     monkeypatch.undo()
     resumed = train_friction(*few[:2], SMALL, out=tmp_path, epoch=2, resume=True)
     assert equal(straight, resumed)

@@ -106,8 +106,7 @@ def test_a_resumed_run_must_be_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"minutes": 1.0}, "exactly one of minutes and steps"),
-        ({"steps": None}, "exactly one of minutes and steps"),
+        ({"steps": 0}, "steps must be more than 0"),
         ({"epoch": 0}, "epoch must be more than 0"),
         ({"clip": -1.0}, "clip must be more than 0"),
         ({"averaging": 1.0}, "averaging must be from 0"),

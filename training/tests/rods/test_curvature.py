@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stickslip_training.engine import fit as engine
 from stickslip_training.rods.curvature import (
     CurvatureTraining,
     load_model,
@@ -19,14 +18,14 @@ pytestmark = pytest.mark.physics
 @pytest.fixture
 def config(rods, tmp_path):
     """36 rods or so, in three steps an epoch."""
-    return CurvatureTraining(dataset=str(rods.root), out=tmp_path / "out", epochs=2, batch_size=15, threads=1)
+    return CurvatureTraining(dataset=str(rods.root), out=tmp_path / "out", steps=6, batch_size=15, threads=1)
 
 
 @pytest.fixture(scope="module")
 def trained(rods, tmp_path_factory):
     """One run that is long enough to learn something."""
     out = tmp_path_factory.mktemp("run")
-    config = CurvatureTraining(dataset=str(rods.root), out=out, epochs=12, batch_size=8, noise=0.001, threads=1)
+    config = CurvatureTraining(dataset=str(rods.root), out=out, steps=60, batch_size=8, noise=0.001, threads=1)
     return config, train_curvature(config)
 
 
@@ -84,13 +83,10 @@ def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, 
 
 
 @pytest.mark.physics
-def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path, monkeypatch):
+def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path):
     straight = train_curvature(config)
-    stopped = replace(config, out=tmp_path / "stopped", epochs=None, minutes=1000.0)
-    monkeypatch.setattr(engine, "_is_over", lambda settings, state: state.step == 4)
-    halfway = train_curvature(stopped)  # as if the time was up within the second epoch
-    assert halfway.steps == 4
-    monkeypatch.undo()
+    stopped = replace(config, out=tmp_path / "stopped", steps=4)
+    assert train_curvature(stopped).steps == 4  # within the second epoch
     resumed = train_curvature(replace(config, out=stopped.out), resume=True)
     assert [(epoch.step, epoch.train_loss, epoch.validation_loss) for epoch in resumed.history] == [
         (epoch.step, epoch.train_loss, epoch.validation_loss) for epoch in straight.history
@@ -108,7 +104,7 @@ def test_the_model_is_the_average_of_the_weights_or_the_last_ones(config, tmp_pa
     def net_of(file):
         return torch.load(file, weights_only=True)["net"]["head.3.weight"]
 
-    config = replace(config, epochs=1)
+    config = replace(config, steps=3)
     train_curvature(config)
     last = replace(config, out=tmp_path / "last", averaging=0.0)
     train_curvature(last)
@@ -119,22 +115,12 @@ def test_the_model_is_the_average_of_the_weights_or_the_last_ones(config, tmp_pa
 
 
 @pytest.mark.physics
-def test_a_time_budget_is_kept_also_within_an_epoch(config, monkeypatch):
-    clock = iter(np.arange(0.0, 1e6, 10.0))  # ten seconds pass whenever someone looks
-    monkeypatch.setattr(engine.time, "perf_counter", lambda: float(next(clock)))
-    report = train_curvature(replace(config, epochs=None, minutes=0.5))
-    assert 0 < report.steps < 36
-    assert len(report.history) >= 1
-    assert report.best_step > 0
-
-
-@pytest.mark.physics
 def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
     axes = {"gamma": [200.0, 400.0, 800.0], "phi0": [1.0, 3.0], "phi1": 8.0}
 
     def run(name, **splits):
         made = make_rods(axes=axes, splits={"train": 0.0, "validation": 0.0, "test": 0.0} | splits)
-        return train_curvature(CurvatureTraining(dataset=str(made.root), out=tmp_path / name, epochs=1, threads=1))
+        return train_curvature(CurvatureTraining(dataset=str(made.root), out=tmp_path / name, steps=1, threads=1))
 
     only_train = run("train", train=1.0)
     assert only_train.rods == {"train": 6, "validation": 0, "test": 6}
@@ -152,7 +138,7 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
 
 @pytest.mark.physics
 def test_evaluation_of_a_part_is_told(config):
-    report = train_curvature(replace(config, epochs=1, evaluation_rods=3))
+    report = train_curvature(replace(config, steps=3, evaluation_rods=3))
     assert report.rods["test"] == 3
     assert report.notes[0].startswith("Evaluated on 3 of ")
 
@@ -168,9 +154,7 @@ def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"minutes": 1.0}, "exactly one of minutes and epochs must be given"),
-        ({"epochs": None}, "exactly one of minutes and epochs must be given"),
-        ({"epochs": 0}, "epochs must be more than 0 and finite, and is 0"),
+        ({"steps": 0}, "steps must be more than 0 and finite, and is 0"),
         ({"batch_size": -1}, "batch_size must be more than 0"),
         ({"noise": 1.0}, "noise must be a share of L"),
         ({"decay": 1.0}, "decay must be between 0 and 1"),
@@ -187,5 +171,5 @@ def test_a_config_is_checked_where_it_is_built(config, changes, message):
 @pytest.mark.physics
 def test_the_number_of_threads_is_put_back(config):
     before = torch.get_num_threads()
-    train_curvature(replace(config, epochs=1))
+    train_curvature(replace(config, steps=3))
     assert torch.get_num_threads() == before

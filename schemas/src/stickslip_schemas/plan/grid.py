@@ -10,7 +10,7 @@ import numpy as np
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.spec.arrays import SPLITS
-from stickslip_schemas.spec.axes import AnyAxis, ListAxis, axis_values, range_values
+from stickslip_schemas.spec.axes import axis_values
 from stickslip_schemas.spec.jobs import JobSpec, SeedRule
 
 
@@ -87,19 +87,14 @@ def _axes_of(spec: JobSpec, document: type[Document], seeds: Collection[SeedRule
 def _distinct(spec: JobSpec, names: Collection[str]) -> int:
     """Return how many different values some axes take together over the grid."""
     axes = [(place, axis) for place, (name, axis) in enumerate(spec.named_axes.items()) if name in names]
+    # A narrow range holds fewer numbers than it may be asked for, and zipped lists may repeat values.
     if spec.combine == "product":
-        return prod(_distinct_values(axis, 0) for _, axis in axes)
-    # Zipped axes have one length: one whose values are all different tells all samples apart.
-    if any(_distinct_values(axis, place) == spec.sample_count for place, axis in axes):
-        return spec.sample_count
+        return prod(len(set(axis_values(axis))) for _, axis in axes)
     rows = np.zeros(spec.sample_count, dtype=np.int64)
     for place, axis in axes:
-        assert not isinstance(axis, ListAxis)  # whose values are all different
-        values, codes = np.unique(range_values(axis, dimension=place), return_inverse=True)
-        _, rows = np.unique(rows * len(values) + codes, return_inverse=True)
+        values = axis_values(axis, dimension=place)
+        codes = {value: code for code, value in enumerate(dict.fromkeys(values))}
+        if len(codes) == spec.sample_count:  # zipped axes have one length: this one tells all samples apart
+            return spec.sample_count
+        _, rows = np.unique(rows * len(codes) + [codes[value] for value in values], return_inverse=True)
     return int(rows.max()) + 1
-
-
-def _distinct_values(axis: AnyAxis, dimension: int) -> int:
-    """Return how many different values an axis has: a narrow range holds fewer numbers than it may be asked for."""
-    return axis.num if isinstance(axis, ListAxis) else len(np.unique(range_values(axis, dimension=dimension)))

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, field_validator, model_validator
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -43,20 +43,10 @@ class _Axis(Document, Generic[T]):
 
 
 class ListAxis(_Axis[T], Generic[T]):
-    """The values themselves, all different."""
+    """The values themselves; only axes that are zipped may have one twice."""
 
     type: Literal["list"]
-    values: tuple[T, ...] = Field(min_length=1, max_length=MAX_SAMPLES, json_schema_extra={"uniqueItems": True})
-
-    @field_validator("values")
-    @classmethod
-    def _distinct(cls, values: tuple[T, ...]) -> tuple[T, ...]:
-        seen: set[T] = set()
-        for value in values:
-            if value in seen:
-                raise ValueError(f"the values of an axis must be distinct, and {value!r} is there twice")
-            seen.add(value)
-        return values
+    values: tuple[T, ...] = Field(min_length=1, max_length=MAX_SAMPLES)
 
     @property
     def num(self) -> int:

@@ -15,7 +15,7 @@ from stickslip_schemas.base.document import Document, Float, Int
 from stickslip_schemas.base.keys import Sha256, content_key, derived_seed, placed
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
-from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, Seed
+from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed
 from stickslip_schemas.spec.cameras import Camera
 
 D = TypeVar("D", bound=Document)
@@ -137,7 +137,7 @@ class JobSpec(Document):
     )
     combine: Literal["product", "zip"] = Field(
         default="product",
-        description="product: every combination of the axes; zip: axes of equal length, combined entry by entry",
+        description="product: every combination of the axes; zip: axes of equal length, row by row; they may repeat",
     )
     splits: Splits = Field(
         default=Splits(),
@@ -270,6 +270,10 @@ class JobSpec(Document):
         sizes = {name: axis.num for name, axis in self.named_axes.items()}
         if self.combine == "zip" and len(set(sizes.values())) > 1:
             raise ValueError(f"axes that are zipped must have one length, and theirs are {sizes}")
+        for name, axis in self.named_axes.items() if self.combine == "product" else ():
+            if isinstance(axis, ListAxis) and len(set(axis.values)) < axis.num:
+                twice = next(value for value in axis.values if axis.values.count(value) > 1)
+                raise ValueError(f"values of {name} must differ unless axes are zipped, and {twice!r} is there twice")
         if self.sample_count > MAX_SAMPLES:
             raise ValueError(f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}")
         return self

@@ -2,8 +2,8 @@
 
 What is learned is a `Learner`'s business. A run is a function of its settings: every step draws its batch from the seed
 and its own number, and torch's generator is seeded with both, so the same settings, data, machine and number of threads
-give the same weights, and a run that is resumed goes on exactly as if it had not stopped. With a time budget only the
-number of steps depends on the machine. Several processes may train one network: see `ranks`.
+give the same weights, and a run that is resumed goes on exactly as if it had not stopped. Several processes may train
+one network: see `ranks`.
 """
 
 import copy
@@ -30,11 +30,9 @@ _CHECKPOINT_SECONDS = 300.0  # a checkpoint is several times as large as the net
 
 @dataclass(frozen=True, kw_only=True)
 class FitSettings:
-    """Settings of a run. Exactly one of `steps` and `minutes` limits it."""
+    """Settings of a run."""
 
-    steps: int | None = None
-    minutes: float | None = None
-    """Time for training [min]; reading, and what comes after the training, come on top."""
+    steps: int
     epoch: int
     """Steps after which the network is validated and a report made."""
     seed: int = 0
@@ -48,9 +46,7 @@ class FitSettings:
     """Of torch."""
 
     def __post_init__(self) -> None:
-        if (self.minutes is None) == (self.steps is None):
-            raise ValueError("exactly one of minutes and steps must be given")
-        check_positive(self, "minutes", "steps", "epoch", "clip", "threads")
+        check_positive(self, "steps", "epoch", "clip", "threads")
         if not 0 <= self.averaging < 1:
             raise ValueError(f"averaging must be from 0 to less than 1, and is {self.averaging}")
         if not 0 <= self.seed < 2**31:
@@ -175,19 +171,18 @@ class _Run:
         state = self.state
         checkpointed = state.seconds
         started = time.perf_counter() - state.seconds
-        while not _is_over(self.settings, state):
+        while state.step < self.settings.steps:
             self._step()
-            state.seconds = of_first(time.perf_counter() - started)
+            state.seconds = time.perf_counter() - started
             if state.step % self.settings.epoch == 0:
                 self._end_epoch()
-                state.seconds = of_first(time.perf_counter() - started)
             if state.seconds - checkpointed > _CHECKPOINT_SECONDS:
                 self._checkpoint()
                 checkpointed = state.seconds
         self._checkpoint()
         of_first(None)  # wait: a process may go on from the checkpoint at once
         if state.epoch_losses:
-            # The time was up in the middle of an epoch. That is news for this run's report and model, and not for the
+            # The steps ended in the middle of an epoch. That is news for this run's report and model, and not for the
             # checkpoint: a run that goes on from it will end the epoch.
             self._end_epoch()
         self.averaged.load_state_dict(state.best)
@@ -260,10 +255,9 @@ class _Run:
         if self.checkpoint_path is None or not self.checkpoint_path.exists():
             raise ValueError(f"there is nothing to resume: {self.checkpoint_path} does not exist")
         content = load_tensors(self.checkpoint_path, device=self.settings.device)
-        stored = {"processes": 1} | content["identity"]  # older checkpoints do not say it
         for name, value in self.identity.items():
-            if stored.get(name) != value:
-                raise ValueError(f"{name} must be that of the run that is resumed, {stored.get(name)}, and is {value}")
+            if (stored := content["identity"].get(name)) != value:
+                raise ValueError(f"{name} must be that of the run that is resumed, {stored}, and is {value}")
         self.net.load_state_dict(content["net"])
         self.averaged.load_state_dict(content["averaged"])
         self.optimizer.load_state_dict(content["optimizer"])
@@ -271,13 +265,6 @@ class _Run:
             setattr(self.state, name, value)
         self.state.history = [EpochReport(**report) for report in content["state"]["history"]]
         self.state.best = {name: tensor.cpu() for name, tensor in self.state.best.items()}
-
-
-def _is_over(settings: FitSettings, state: _State) -> bool:
-    if settings.steps is not None:
-        return state.step >= settings.steps
-    assert settings.minutes is not None
-    return state.step > 0 and state.seconds >= 60 * settings.minutes
 
 
 # --- for learners ---------------------------------------------------------------------------------------------

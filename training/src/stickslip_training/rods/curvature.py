@@ -30,16 +30,14 @@ _TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apar
 
 @dataclass(frozen=True, kw_only=True)
 class CurvatureTraining:
-    """Settings of a run. Exactly one of `minutes` and `epochs` limits it."""
+    """Settings of a run."""
 
     dataset: str
     """Directory or URL of a dataset of rods."""
     out: Path
     """Directory for the model, the checkpoint and the report."""
-    minutes: float | None = None
-    """Time for training [min]; reading, and the baselines of the evaluation, come on top."""
-    epochs: int | None = None
-    """Passes over the training rods."""
+    steps: int = 1000
+    """Of training, with a batch each; every pass over the training rods ends with a validation."""
     noise: float = 0.005
     """Standard deviation of the white noise on every coordinate of the centreline [L], in training and evaluation."""
     seed: int = 0
@@ -61,9 +59,7 @@ class CurvatureTraining:
     """The most test rods that are evaluated; the first of the split are taken."""
 
     def __post_init__(self) -> None:
-        if (self.minutes is None) == (self.epochs is None):
-            raise ValueError("exactly one of minutes and epochs must be given")
-        check_positive(self, "epochs", "batch_size", "learning_rate", "evaluation_rods")
+        check_positive(self, "batch_size", "learning_rate", "evaluation_rods")
         if not 0 <= self.noise < 1:
             raise ValueError(f"noise must be a share of L, from 0 to less than 1, and is {self.noise}")
         if not 0 < self.decay < 1:
@@ -73,8 +69,7 @@ class CurvatureTraining:
     def fit_settings(self, steps_per_epoch: int) -> FitSettings:
         """Return the settings of the training loop."""
         return FitSettings(
-            steps=None if self.epochs is None else self.epochs * steps_per_epoch,
-            minutes=self.minutes,
+            steps=self.steps,
             epoch=steps_per_epoch,
             seed=self.seed,
             averaging=self.averaging,
