@@ -16,7 +16,7 @@ MOVED = {
     "pile": 2e-4,
     "fold": 2e-4,
     "squeeze": 2e-4,
-    "strip": 1e-4,
+    "strip": 2e-4,
     "let down": 1e-3,
     "ball": 0.01,
     "edges": 0.01,
@@ -59,7 +59,7 @@ CASES: dict[str, str] = {
 DEARER = {("stepping.strained_soon", 0.5): 6.0}
 """Factors of the cost beyond COST."""
 
-OTHERWISE = {("newton.cuts_max", 0.5), ("newton.halving_iterations", 2.0), ("node.penalty", 2.0)}
+OTHERWISE = {("newton.window", 2.0), ("node.penalty", 2.0)}
 """Changes with which the fold falls another way."""
 
 

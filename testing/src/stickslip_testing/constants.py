@@ -184,14 +184,14 @@ def controlled(tumble: Tumble, end: float) -> Cloth:
 SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
     {
         "pile": lambda preset: _steps(pile(2, preset, sheets=3), 22),
-        "fold": lambda preset: _steps(folding(1, preset), 100),
+        "fold": lambda preset: _steps(folding(9, preset), 100),
         "crumple": lambda preset: _steps(crumple(1, preset), 14),
         "squeeze": lambda preset: _steps(squeeze(1, preset), 9),
         "ball": ball,
         "strip": strip,
         "edges": edges,
         "push": lambda preset: controlled(crumple(1, preset), 0.15),
-        "let down": lambda preset: controlled(folding(1, preset), 1.0),
+        "let down": lambda preset: controlled(folding(9, preset), 1.0),
     }
 )
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
