@@ -31,19 +31,6 @@ def ran(**scene: Any) -> ClothRun:
     return run
 
 
-def with_files(document: dict[str, Any], places: Any, folder: Path) -> dict[str, Any]:
-    """Write the files that a document names by digest, and name them by path."""
-    for place, name in places:
-        at = document
-        for step in place[:-1]:
-            at = at[step]
-        suffix = {"shawl": ".obj", "figure": ".npz"}[place[1]]
-        file = folder / f"{name.removeprefix('sha256:')}{suffix}"
-        file.write_bytes(built_in_files()[name.removeprefix("sha256:")])
-        at[place[-1]] = str(file)
-    return document
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -51,7 +38,7 @@ def with_files(document: dict[str, Any], places: Any, folder: Path) -> dict[str,
         for name in scene_names()
     ],  # meshes of files cannot be made coarser
 )
-def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(name: str, tmp_path: Path) -> None:
+def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(name: str) -> None:
     scene = load_scene(name)
     file = Path(__file__).parents[1] / f"schemas/src/stickslip_schemas/scenes/{name}.yaml"
     assert len(file.read_text().splitlines()) <= 80
@@ -76,8 +63,7 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
     (point,) = keyed_points(spec, BUILDS)
     simulation = spec.simulation_type.model_validate_json(point.simulation_text)
     assert isinstance(simulation, ClothSceneSimulation)
-    document = with_files(simulation.scene.model_dump(mode="json"), simulation.scene.files(), tmp_path)
-    (outcome,) = cloth_scene.KIND.simulate([{"scene": document, "seed": 1}], None)
+    (outcome,) = cloth_scene.KIND.simulate([simulation.given(built_in_files().__getitem__)], None)
     assert not outcome.reason
     made = {**outcome.record, **outcome.labels}
     for layout in spec.arrays():

@@ -9,7 +9,7 @@ import pytest
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.scene import files
 from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.scene.files import UnfitFileError, check_file, check_scene_file, counts_of, inlined
+from stickslip_schemas.scene.files import UnfitFileError, check_scene_file, counts_of, inlined, read_file, with_arrays
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
 
 BODY, PATH = ("bodies", "block", "file"), ("bodies", "block", "motion", "path")
@@ -24,11 +24,27 @@ def npz(**arrays: Any) -> bytes:
     return file.getvalue()
 
 
+PATH_FILE = b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0,0\n1.5,1,2,3,0,0,0.5\n"
+
+
 def test_flat_patterns_have_counts() -> None:
-    assert check_file(MESH, FLAT) == (3, 1)
     assert counts_of(FLAT) == (3, 1)
-    assert check_file(BODY, b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n") is None
-    assert counts_of(b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0,0\n1,0,0,1,0,0,0\n") is None
+    assert counts_of(PATH_FILE) is None
+
+
+def test_files_become_arrays() -> None:
+    pattern = read_file(MESH, FLAT)
+    assert pattern["rest"].tolist() == [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
+    assert pattern["positions"].tolist() == [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
+    square = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1 -1//1\n"
+    body = read_file(BODY, square)
+    assert body["triangles"].tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert body["positions"].shape == (1, 4, 3)
+    path = read_file(PATH, PATH_FILE)
+    assert [path[name][-1].tolist() for name in ("time", "move", "turn")] == [1.5, [1.0, 2.0, 3.0], [0.0, 0.0, 0.5]]
+    again = read_file(PATH, npz(**path))
+    assert all(np.array_equal(again[name], path[name]) for name in path)
+    assert read_file(START, npz(positions=pattern["positions"]))["positions"].tolist() == pattern["positions"].tolist()
 
 
 @pytest.mark.parametrize(
@@ -60,20 +76,20 @@ def test_flat_patterns_have_counts() -> None:
 )
 def test_a_file_that_does_not_fit_is_refused(place: tuple[str, ...], data: bytes, rule: str) -> None:
     with pytest.raises(UnfitFileError, match=rule):
-        check_file(place, data)
+        read_file(place, data)
 
 
 def test_a_small_file_cannot_ask_for_much_memory() -> None:
     data = npz(positions=np.zeros((1000, 1000, 3)), triangles=np.array([[0, 1, 2]]), times=np.arange(1000.0))
     assert len(data) < 2**20
     with pytest.raises(UnfitFileError, match="bytes when unpacked"):
-        check_file(BODY, data)
+        read_file(BODY, data)
 
 
 def test_meshes_have_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MAX_VERTICES", 2)
     with pytest.raises(UnfitFileError, match="at most 2 vertices"):
-        check_file(BODY, FLAT)
+        read_file(BODY, FLAT)
     monkeypatch.setattr(files, "MAX_FILE_BYTES", 10)
     with pytest.raises(UnfitFileError, match="at most 10 bytes, and has"):
         counts_of(FLAT)
@@ -99,6 +115,7 @@ def test_files_become_references_with_their_counts(tmp_path: Path) -> None:
     ((place, name),) = made.files()
     assert name == f"sha256:{sha256(FLAT)}"
     check_scene_file(made, place, FLAT)
+    assert with_arrays(made, found.__getitem__)["sheets"]["towel"]["mesh"]["file"]["rest"].shape == (3, 2)
     more = FLAT.replace(b"f 1", b"v 1 1 1\nvt 0.1 0.1\nf 2/2 4/4 3/3\nf 1")
     with pytest.raises(UnfitFileError, match=r"counts must be .* \[4, 2\], and are \[3, 1\]"):
         check_scene_file(made, place, more)

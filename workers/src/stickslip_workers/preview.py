@@ -12,12 +12,12 @@ import numpy.typing as npt
 from stickslip_schemas.base.keys import referred
 from stickslip_schemas.kinds.cloth.arrays import scene_segments
 from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.files import with_arrays
+from stickslip_schemas.scene.parameters import with_values
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.store import Store
 from stickslip_sim_core.scenes import cloth_scene
 from stickslip_sim_core.scenes.scene import ClothRun
-
-from stickslip_workers.stages.simulate import local_files, with_files
 
 FRAMES = 24
 """Of the animation."""
@@ -43,16 +43,17 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
     views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
     cameras = load_rig(given) if isinstance(given, str) else views
     with TemporaryDirectory(prefix="stickslip-preview-") as folder:
-        named = {digest for _, name in scene.files() if (digest := referred(name))}
-        files = local_files(named, store, Path(folder))
+        pictures = {place: Path(folder, referred(name) or "") for place, name in scene.files() if place[0] == "looks"}
+        for path in pictures.values():
+            path.write_bytes(store.read(path.name))
         request = {
-            "scene": with_files(scene.staged(), files),
+            "scene": with_values(scene.staged(), {place: str(path) for place, path in pictures.items()}),
             "sheet": scene.textured,
             "segments": scene_segments(scene.sheets, scene.bodies),
             "cameras": [camera.model_dump(mode="json") for camera in cameras],
         }
         record, document = Path(folder, "record.npz"), Path(folder, "scene.json")
-        np.savez(record, allow_pickle=False, **_record(scene, with_files(scene.physics(), files)))
+        np.savez(record, allow_pickle=False, **_record(scene, with_arrays(scene, store.read)))
         document.write_text(json.dumps(request), encoding="utf-8")
         out.mkdir(parents=True, exist_ok=True)
         command = [str(blender_python), "-m", "stickslip_blender.preview", str(record), str(document), str(out)]

@@ -1,6 +1,6 @@
 """A scene of cloth that is data: what stands where, how it moves, and what of it varies."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from itertools import combinations, product
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -29,6 +29,7 @@ from stickslip_schemas.kinds.cloth.scene_arrays import parameter_label, scene_ar
 from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import Physics, Scene, Staged
+from stickslip_schemas.scene.files import with_arrays
 from stickslip_schemas.scene.library import load_scene, scene_names
 from stickslip_schemas.scene.looks import View
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
@@ -102,6 +103,10 @@ class ClothSceneSimulation(Simulation):
     def vertices(self) -> int:
         """How many vertices its sheets have together."""
         return sum(sheet.mesh.shape[0] for sheet in self.scene.sheets.values())
+
+    def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
+        """Return the scene with arrays instead of files, and the seed."""
+        return {"scene": with_arrays(self.scene, read), "seed": self.seed}
 
 
 class ClothSceneRender(ClipRender):

@@ -1,11 +1,11 @@
-"""The files of a scene: limits, checks, and references by digest.
+"""The files of a scene: limits, references by digest, and the arrays that they hold.
 
 What a file is for follows from its place in the document: a flat pattern, a start, a body, a motion or a texture.
 """
 
 import io
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path as LocalPath
 from typing import Any
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from stickslip_schemas.base.keys import ARTIFACT, sha256
 from stickslip_schemas.scene.bodies import MeshBody
-from stickslip_schemas.scene.document import MAX_VERTICES, Scene
+from stickslip_schemas.scene.document import MAX_VERTICES, Physics, Scene
 from stickslip_schemas.scene.parameters import Path, at, with_values
 
 MAX_FILE_BYTES = 16 * 2**20
@@ -29,6 +29,7 @@ MAX_DOCUMENT_BYTES = 64 * 2**10
 
 Floats = npt.NDArray[np.float64]
 Triangles = npt.NDArray[np.int64]
+Arrays = dict[str, npt.NDArray[Any]]
 
 
 class UnfitFileError(ValueError):
@@ -52,15 +53,29 @@ def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str
             continue
         data = read(name)
         try:
-            counts = check_file(place, data)
+            if (counts := _counts(place, {} if place[0] == "looks" else read_file(place, data))) is not None:
+                values[(*place[:-1], "counts")] = counts
         except UnfitFileError as error:
             raise UnfitFileError(f"{'.'.join(map(str, place))}: {error}, in {name}") from error
         digest = sha256(data)
         found[digest] = data
         values[place] = f"{ARTIFACT}{digest}"
-        if counts is not None:
-            values[(*place[:-1], "counts")] = counts
     return Scene.model_validate(with_values(scene.model_dump(mode="json"), values)), found
+
+
+def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any]:
+    """Return physics as JSON, but with the arrays of files (see `read_file`) instead of references to them.
+
+    Args:
+        physics: Its files are references.
+        read: Returns the bytes of an artifact by its digest.
+
+    Raises:
+        UnfitFileError: A file is not what the scene needs there.
+    """
+    files = Physics.files(physics)
+    arrays = {place: read_file(place, read(name.removeprefix(ARTIFACT))) for place, name in files}
+    return with_values(physics.model_dump(mode="json", include=set(Physics.model_fields)), arrays)
 
 
 def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
@@ -88,35 +103,48 @@ def check_scene_file(scene: Scene, place: Path, data: bytes) -> None:
     Raises:
         UnfitFileError: It is not.
     """
-    counts = check_file(place, data)
-    document = scene.physics()
+    found, document = read_file(place, data), scene.physics()
+    counts = _counts(place, found)
     if counts is not None and (said := at(document, (*place[:-1], "counts"))) != list(counts):
         raise UnfitFileError(f"counts must be the vertices and triangles of the file, {list(counts)}, and are {said}")
     if place[0] == "sheets" and place[2] == "start":
-        vertices, expected = _start(data), scene.sheets[str(place[1])].mesh.shape[0]
+        vertices, expected = found["positions"], scene.sheets[str(place[1])].mesh.shape[0]
         if len(vertices) != expected:
             raise UnfitFileError(f"must have the vertices of its sheet, {expected}, and has {len(vertices)}")
 
 
-def check_file(place: Path, data: bytes) -> tuple[int, int] | None:
-    """Check a file of a scene by itself; return the numbers of vertices and triangles of a flat pattern.
+def read_file(place: Path, data: bytes) -> Arrays:
+    """Return the arrays of a file of the physics.
+
+    - a flat pattern: `rest` (V, 2), `positions` (V, 3) [m] and `triangles` (T, 3)
+    - a start: `positions` (V, 3) [m]
+    - a motion: `time` (K) [s], `move` (K, 3) [m] and `turn` (K, 3) [rad]
+    - a body: `triangles` (T, 3), `times` (F) [s] and `positions` (F, N, 3) [m] or, of a skin, `rest` (N, 3) [m],
+      `weights` (N, B) and `bones` (F, B, 3, 4), x -> A x + b
+
+    Args:
+        place: Of the file in the document.
+        data: The file.
 
     Raises:
         UnfitFileError: It breaks a rule.
     """
+    _check_size(data)
+    if place[-1] == "path":
+        return _path(data)
+    if place[0] == "bodies":
+        return _body(data)
+    return _start(data) if place[2] == "start" else _pattern(data)
+
+
+def _counts(place: Path, found: Arrays) -> tuple[int, int] | None:
+    """Return the numbers of vertices and triangles of a flat pattern."""
+    return (len(found["rest"]), len(found["triangles"])) if place[0] == "sheets" and "rest" in found else None
+
+
+def _check_size(data: bytes) -> None:
     if len(data) > MAX_FILE_BYTES:
         raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes, and has {len(data)}")
-    if place[0] == "looks":
-        return None  # a picture, which has rules of its own
-    if place[-1] == "path":
-        _path(data)
-    elif place[0] == "bodies":
-        _body(data)
-    elif place[2] == "start":
-        _start(data)
-    else:
-        return _pattern(data)
-    return None
 
 
 def counts_of(data: bytes) -> tuple[int, int] | None:
@@ -125,8 +153,7 @@ def counts_of(data: bytes) -> tuple[int, int] | None:
     Raises:
         UnfitFileError: It is none of these.
     """
-    if len(data) > MAX_FILE_BYTES:
-        raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes, and has {len(data)}")
+    _check_size(data)
     if data.startswith(b"PK"):
         _names(data)
     elif data.startswith(b"time"):
@@ -137,7 +164,7 @@ def counts_of(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _pattern(data: bytes) -> tuple[int, int]:
+def _pattern(data: bytes) -> Arrays:
     vertices, triangles, flat = read_obj(data)
     if flat is None:
         raise UnfitFileError("must have texture coordinates (vt), one for each vertex: the flat pattern [m]")
@@ -151,13 +178,14 @@ def _pattern(data: bytes) -> tuple[int, int]:
     _check_edges(triangles, len(vertices))
     if len(np.unique(triangles)) != len(vertices):
         raise UnfitFileError("must have no vertex without a triangle")
-    return len(vertices), len(triangles)
+    return {"rest": flat, "positions": vertices, "triangles": triangles}
 
 
-def _body(data: bytes) -> None:
+def _body(data: bytes) -> Arrays:
     if not data.startswith(b"PK"):
         vertices, triangles, _ = read_obj(data)
-        return _check_edges(triangles, len(vertices))
+        _check_edges(triangles, len(vertices))
+        return {"positions": vertices[None], "triangles": triangles, "times": np.zeros(1)}
     skinned = ("rest", "weights", "bones", "times", "triangles")
     found = _arrays(data, skinned if "rest" in _names(data) else ("positions", "triangles", "times"))
     rest = found["rest"] if "rest" in found else found["positions"][0]
@@ -171,26 +199,27 @@ def _body(data: bytes) -> None:
     triangles = found["triangles"].astype(np.int64)
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.min() < 0 or triangles.max() >= len(rest):
         raise UnfitFileError(f"triangles must be (triangle, 3) of vertices below {len(rest)}")
-    return _check_edges(triangles, len(rest))
+    _check_edges(triangles, len(rest))
+    return {**found, "triangles": triangles}
 
 
-def _start(data: bytes) -> Floats:
+def _start(data: bytes) -> Arrays:
     if not data.startswith(b"PK"):
-        return read_obj(data)[0]
-    found: Floats = _arrays(data, ("positions",))["positions"]
-    if found.ndim != 2 or found.shape[1] != 3:
-        raise UnfitFileError(f"positions must be (vertex, 3), and are {found.shape}")
+        return {"positions": read_obj(data)[0]}
+    found = _arrays(data, ("positions",))
+    if found["positions"].ndim != 2 or found["positions"].shape[1] != 3:
+        raise UnfitFileError(f"positions must be (vertex, 3), and are {found['positions'].shape}")
     return found
 
 
-def _path(data: bytes) -> None:
+def _path(data: bytes) -> Arrays:
     if data.startswith(b"PK"):
         found = _arrays(data, ("time", "move", "turn"))
         _ascending(found["time"], len(found["move"]))
         shapes = {name: found[name].shape for name in ("move", "turn")}
         if set(shapes.values()) != {(len(found["time"]), 3)}:
             raise UnfitFileError(f"move and turn must be (time, 3), and are {shapes}")
-        return
+        return found
     lines = _text(data).splitlines()
     if not lines or lines[0].replace(" ", "") != "time,x,y,z,rx,ry,rz":
         raise UnfitFileError(
@@ -204,8 +233,10 @@ def _path(data: bytes) -> None:
             row = []
         if len(row) != 7 or not np.isfinite(row).all() or max(map(abs, row[1:4])) > FARTHEST:
             raise UnfitFileError(f"line {number} must be seven finite numbers [s, m, rad], and is {line[:80]!r}")
-        rows.append(row[0])
-    _ascending(np.array(rows), len(rows))
+        rows.append(row)
+    table = np.array(rows).reshape(-1, 7)
+    _ascending(table[:, 0], len(rows))
+    return {"time": table[:, 0], "move": table[:, 1:4], "turn": table[:, 4:]}
 
 
 def _ascending(times: Floats, count: int) -> None:
@@ -222,7 +253,7 @@ def _names(data: bytes) -> dict[str, int]:
         raise UnfitFileError(f"must be an NPZ file: {error}") from error
 
 
-def _arrays(data: bytes, names: tuple[str, ...]) -> Mapping[str, npt.NDArray[Any]]:
+def _arrays(data: bytes, names: tuple[str, ...]) -> Arrays:
     sizes = _names(data)
     if missing := [name for name in names if name not in sizes]:
         raise UnfitFileError(f"must have {', '.join(names)}, and {', '.join(missing)} is missing")

@@ -18,7 +18,7 @@ from stickslip_schemas.spec.appearance import (
     Substrate,
 )
 from stickslip_schemas.spec.cameras import Camera, rig_names
-from stickslip_schemas.spec.fabrics import CustomName, Texture, did_you_mean
+from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 
 FILM = 36.0
 """Width of the film that focal lengths refer to [mm]."""
@@ -103,8 +103,3 @@ class Looks(Document):
                 f"{did_you_mean(cameras, rig_names())}"
             )
         return cameras
-
-    @property
-    def uses_picture(self) -> dict[str, str]:
-        """Textures that are files, by sheet."""
-        return {name: look.texture for name, look in self.sheets.items() if look.texture not in list(Texture)}

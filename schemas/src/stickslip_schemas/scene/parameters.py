@@ -108,11 +108,6 @@ class Parameter(Document):
         return isinstance(value, float | int) and self.low <= value <= self.high
 
 
-def _decides_on_shapes(document: Mapping[str, Any], place: Path) -> bool:
-    of_mesh = len(place) > 2 and (place[0], place[2]) == ("sheets", "mesh")
-    return bool({*_FIXED} & {*place}) or (of_mesh and at(document, place[:3])["type"] != "grid")
-
-
 def found(document: Mapping[str, Any], path: str) -> Path:
     """Return the place that a dotted path leads to; `friction.A.B` finds the coefficient of two in any order.
 

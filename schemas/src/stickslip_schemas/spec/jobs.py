@@ -3,7 +3,7 @@
 This module holds what all kinds have in common. A kind itself is one module of `stickslip_schemas.kinds`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from functools import cached_property
 from math import prod
@@ -78,6 +78,10 @@ class Simulation(Document):
     def vertices(self) -> int:
         """How many vertices its meshes have; its memory grows with them."""
         return 0
+
+    def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
+        """Return what it is made from, as JSON and arrays; `read` returns the bytes of an artifact by its digest."""
+        return self.model_dump(mode="json", exclude={"kind"})
 
 
 class Render(Document):

@@ -23,7 +23,7 @@ UPRIGHT = 1.0
 
 
 def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
-    """Return the scene of a document: `Physics` of stickslip_schemas.scene, as JSON, with paths of files here.
+    """Return the scene of a document: `Physics` of stickslip_schemas.scene, as JSON, with arrays for files.
 
     Its run records, besides what all scenes record, sheets, holders and bodies being in the order of their names:
 
@@ -41,7 +41,6 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
-        OSError: A file cannot be read.
     """
     names = sorted(document["sheets"])
     mu = _friction(document)

@@ -3,17 +3,17 @@
 All are smooth in time, and begin and end at rest.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.cloth.meshes import Mesh
+
+RIGHT_ANGLE = 1e-12
+"""Entries of a matrix that are all as near to -1, 0 and 1 are meant to be right angles: radians have no exact ones."""
 
 
 def _times(times: ArrayLike) -> Floats:
@@ -160,10 +160,12 @@ def _monotone(times: Floats, values: Floats) -> Floats:
 
 
 def rotation(turn: ArrayLike) -> Floats:
-    """Return the matrix (3, 3) of a rotation vector (3,) [rad]."""
+    """Return the matrix (3, 3) of a rotation vector (3,) [rad]; right angles are exact."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_rotvec(np.asarray(turn, float)).as_matrix())
+    found = np.asarray(Rotation.from_rotvec(np.asarray(turn, float)).as_matrix())
+    whole = np.rint(found)
+    return found if (np.abs(found - whole) > RIGHT_ANGLE).any() else whole + 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,140 +246,3 @@ class MovingMesh:
         for weight, bone in zip(np.asarray(self.weights, float).T, path, strict=True):
             found += weight[:, None] * (x * bone[:, 0] + y * bone[:, 1] + z * bone[:, 2] + bone[:, 3])
         return found
-
-
-def read_moving_mesh(path: str | Path, *, frame_rate: float | None = None, strength: float = 1.0) -> MovingMesh:
-    """Read triangles that may move: an OBJ file, a folder of them, one a frame, or an NPZ file.
-
-    Polygons are cut into triangles. An NPZ file has `triangles` (T, 3), `times` (F,) [s], and `positions` (F, N, 3)
-    [m] or, of a skin, `rest` (N, 3) [m], `weights` (N, B) and `bones` (F, B, 3, 4): see `MovingMesh`.
-    `python -m stickslip_blender.import_mesh` writes positions from Alembic, USD and what else Blender reads.
-
-    Args:
-        path: What to read; frames of a folder are in the order of their names.
-        frame_rate: Of a folder [1/s]; its first frame is at 0 s.
-        strength: Factor of all displacements since the first frame.
-
-    Raises:
-        ValueError: It holds no such mesh.
-        OSError: It cannot be read.
-    """
-    place = Path(path)
-    if place.is_dir():
-        files = sorted(place.glob("*.obj"))
-        if not files:
-            raise ValueError(f"{place}: must hold OBJ files, one a frame, and holds none")
-        if frame_rate is None or not (np.isfinite(frame_rate) and frame_rate > 0.0):
-            raise ValueError(f"frame_rate: must be > 0 for a folder of frames, got {frame_rate}")
-        frames = [read_obj(file) for file in files]
-        for file, (vertices, triangles) in zip(files, frames, strict=True):
-            if vertices.shape != frames[0][0].shape or not np.array_equal(triangles, frames[0][1]):
-                raise ValueError(f"{file}: must have the vertices and faces of {files[0].name}, in the same order")
-        path_of_frames = np.stack([frame[0] for frame in frames])
-        return MovingMesh(frames[0][1], np.arange(len(files)) / frame_rate, path_of_frames, strength=strength)
-    if place.suffix.lower() == ".obj":
-        vertices, triangles = read_obj(place)
-        return MovingMesh(triangles, [0.0], vertices[None])
-    if place.suffix.lower() == ".npz":
-        with np.load(place, allow_pickle=False) as file:
-            own = ("rest", "weights", "bones") if "bones" in file else ("positions",)
-            missing = [name for name in (*own, "triangles", "times") if name not in file]
-            if missing:
-                raise ValueError(
-                    f"{place}: must have {', '.join(own)}, triangles and times, and {', '.join(missing)} is not there"
-                )
-            skin = {name: file[name] for name in own if name in ("rest", "weights")}
-            return MovingMesh(file["triangles"], file["times"], file[own[-1]], **skin, strength=strength)
-    raise ValueError(f"{place}: must be an OBJ file, a folder of OBJ files, or an NPZ file")
-
-
-PATH_COLUMNS = ("time", "x", "y", "z", "rx", "ry", "rz")
-"""Of a CSV file of a motion: [s], [m] and [rad], since the start."""
-
-
-def read_path(path: Path) -> tuple[Floats, Floats, Floats]:
-    """Return times (K,) [s], displacements (K, 3) [m] and rotation vectors (K, 3) [rad] of a CSV or an NPZ file.
-
-    A CSV file has the columns `PATH_COLUMNS`; an NPZ file has `time`, `move` and `turn`.
-
-    Raises:
-        ValueError: It holds no such motion.
-        OSError: It cannot be read.
-    """
-    if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            missing = [name for name in ("time", "move", "turn") if name not in file]
-            if missing:
-                raise ValueError(f"{path}: must have time, move and turn, and {', '.join(missing)} is not there")
-            return np.asarray(file["time"], float), np.asarray(file["move"], float), np.asarray(file["turn"], float)
-    head, *lines = path.read_text(encoding="utf-8").splitlines()
-    if tuple(head.replace(" ", "").split(",")) != PATH_COLUMNS:
-        raise ValueError(f"{path}: must have the columns {','.join(PATH_COLUMNS)}, got {head!r}")
-    table = np.array([[float(word) for word in line.split(",")] for line in lines if line.strip()], float)
-    if table.ndim != 2 or table.shape[1] != len(PATH_COLUMNS):
-        raise ValueError(f"{path}: must have lines of {len(PATH_COLUMNS)} numbers, got shape {table.shape}")
-    return table[:, 0], table[:, 1:4], table[:, 4:]
-
-
-def read_pattern(path: Path) -> tuple[Mesh, Floats]:
-    """Return the flat pattern of a sheet, and its positions (V, 3) [m], from an OBJ file.
-
-    Its texture coordinates are the pattern [m]: each vertex has one.
-
-    Raises:
-        ValueError: A vertex has none, or several: cloth cannot have seams.
-        OSError: It cannot be read.
-    """
-    vertices, triangles = read_obj(path)
-    lines = path.read_text(encoding="utf-8").splitlines()
-    words = [line.split() for line in lines]
-    pattern = np.array([[float(word[1]), float(word[2])] for word in words if word and word[0] == "vt"], float)
-    rest = np.full((len(vertices), 2), np.nan)
-    for corner in (corner for word in words if word and word[0] == "f" for corner in word[1:]):
-        numbers = corner.split("/")
-        if len(numbers) < 2 or not numbers[1]:
-            raise ValueError(f"{path}: must have texture coordinates, the flat pattern, at each corner, got {corner!r}")
-        vertex = int(numbers[0]) - 1 if int(numbers[0]) > 0 else int(numbers[0])
-        own = pattern[int(numbers[1]) - 1 if int(numbers[1]) > 0 else int(numbers[1])]
-        if not np.isnan(rest[vertex]).any() and (rest[vertex] != own).any():
-            raise ValueError(f"{path}: must have one texture coordinate a vertex, and vertex {vertex + 1} has several")
-        rest[vertex] = own
-    unused = np.flatnonzero(np.isnan(rest).any(axis=1))
-    if len(unused):
-        raise ValueError(f"{path}: must have each vertex in a face, and vertex {unused[0] + 1} is in none")
-    return Mesh(rest, triangles), vertices
-
-
-def read_obj(path: Path) -> tuple[Floats, NDArray[np.int32]]:
-    """Return the vertices (N, 3) and triangles (T, 3) of a Wavefront OBJ file; its polygons are cut into triangles.
-
-    Raises:
-        ValueError: A line is no vertex or face.
-    """
-    vertices: list[list[float]] = []
-    triangles: list[tuple[int, int, int]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        word, *rest = line.split() or [""]
-        try:
-            if word == "v":
-                x, y, z = map(float, rest[:3])
-                vertices.append([x, y, z])
-            elif word == "f":
-                corners = list(_corners(rest, len(vertices)))
-                triangles += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
-        except (ValueError, IndexError) as error:
-            raise ValueError(f"{path}, line {number}: must be a vertex or a face, got {line.strip()!r}") from error
-    if not triangles:
-        raise ValueError(f"{path}: must have faces, and has none")
-    return np.array(vertices), np.array(triangles, dtype=np.int32)
-
-
-def _corners(words: list[str], count: int) -> Iterable[int]:
-    """Return the vertices of a face, from 0: an OBJ file counts from 1, or from -1 back from the last one."""
-    if len(words) < 3:
-        raise ValueError("a face has three corners or more")
-    for word in words:
-        number = int(word.partition("/")[0])
-        if not 1 <= abs(number) <= count:
-            raise ValueError("a corner must be a vertex that is there")
-        yield number - 1 if number > 0 else count + number

@@ -1,11 +1,10 @@
 """Parts of a scene, from its document: meshes and starts of sheets, motions, holders and bodies.
 
-The document is `Physics` of stickslip_schemas.scene, as JSON. Names of files are paths on this machine.
+The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in the place of each file.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,9 +22,6 @@ from stickslip_sim_core.scenes.motions import (
     MovingMesh,
     RigidMotion,
     Spin,
-    read_moving_mesh,
-    read_path,
-    read_pattern,
     rotation,
 )
 
@@ -71,7 +67,6 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
-        OSError: A file cannot be read.
     """
     place = f"sheets.{name}"
     mesh, positions = _mesh(given["mesh"])
@@ -84,7 +79,7 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
         local[:, :2] = (1.0 + np.array(begin["strain"])) * mesh.rest
     elif begin["type"] == "file":
         if begin["file"] is not None:
-            positions = _positions(Path(begin["file"]))
+            positions = begin["file"]["positions"]
         if positions is None or positions.shape != local.shape:
             raise ValueError(f"{place}.start.file: must have {len(local)} vertices, as the mesh has")
         local = positions
@@ -118,15 +113,8 @@ def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
         return meshes.grid(*given["size"], *given["cells"]), None
     if given["type"] == "unstructured":
         return meshes.unstructured(given["size"][0], given["size"][1], given["spacing"], given["seed"]), None
-    return read_pattern(Path(given["file"]))
-
-
-def _positions(path: Path) -> Floats:
-    """Return the positions (V, 3) [m] of an OBJ or NPZ file."""
-    if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            return np.asarray(file["positions"], float)
-    return read_moving_mesh(path).at(0.0)
+    file = given["file"]
+    return meshes.Mesh(file["rest"], np.asarray(file["triangles"], np.int32)), file["positions"]
 
 
 def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
@@ -160,7 +148,7 @@ def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
         spin = given["spin"]
         return Spin(spin["axis"], spin["speed"], spin["begin"], spin["ramp"], about)
     if given["path"] is not None:
-        times, moves, turns = read_path(Path(given["path"]))
+        times, moves, turns = (given["path"][name] for name in ("time", "move", "turn"))
     else:
         times, moves, turns = (np.array([key[name] for key in given["keys"]]) for name in ("time", "move", "turn"))
     return Keyframes(times, moves, turns, about, linear=given["interpolation"] == "linear", ramp=given["ramp"])
@@ -207,7 +195,6 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
-        OSError: A file cannot be read.
     """
     if given["type"] == "plane":
         still = plane(mu, normal=given["normal"], origin=given["origin"])
@@ -236,9 +223,10 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
 
 def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
     try:
-        mesh: MovingMesh = read_moving_mesh(
-            Path(given["file"]), frame_rate=given["frame_rate"], strength=given["strength"]
-        )
+        file = given["file"]
+        skin = {name: file[name] for name in ("rest", "weights") if name in file}
+        frames = file["bones" if skin else "positions"]
+        mesh = MovingMesh(file["triangles"], file["times"], frames, **skin, strength=given["strength"])
         motion = rigid_motion(given["motion"], mesh.at(0.0).mean(axis=0))
 
         def at(time: float) -> Floats:

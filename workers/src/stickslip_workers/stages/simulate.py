@@ -1,12 +1,9 @@
 """Simulate: from the physics of simulations to their records, for every kind."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from stickslip_schemas.base.keys import ARTIFACT
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import RecordRef, SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.store import Store
@@ -30,11 +27,8 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     if len(names) != 1:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
     made = kind(names[0])
-    simulations = [task.simulation.model_dump(mode="json", exclude={"kind"}) for task in tasks]
-    with TemporaryDirectory(prefix="stickslip-files-") as folder:
-        named = {digest for task in tasks for digest in task.simulation.artifacts}
-        files = local_files(named, store, Path(folder))
-        outcomes = made.simulate([with_files(physics, files) for physics in simulations], note)
+    simulations = [task.simulation.given(store.read) for task in tasks]
+    outcomes = made.simulate(simulations, note)
     records = _stored(outcomes, made.batch, store)
     return [
         _rejection(physics, outcome)
@@ -42,29 +36,6 @@ def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
         else TaskResult(outcome="succeeded", output=SimulateOutput(record=records[number], labels=dict(outcome.labels)))
         for number, (physics, outcome) in enumerate(zip(simulations, outcomes, strict=True))
     ]
-
-
-def local_files(digests: Iterable[str], store: Store, folder: Path) -> dict[str, str]:
-    """Copy artifacts into a folder; return their paths by reference."""
-    return {f"{ARTIFACT}{digest}": _local(digest, store, folder) for digest in sorted(digests)}
-
-
-def _local(digest: str, store: Store, folder: Path) -> str:
-    """Copy an artifact into a folder; return its path, whose suffix tells what it holds."""
-    data = store.read(digest)
-    suffix = "npz" if data.startswith(b"PK") else "csv" if data.startswith(b"time") else "obj"
-    path = folder / f"{digest}.{suffix}"
-    path.write_bytes(data)
-    return str(path)
-
-
-def with_files(value: Any, files: Mapping[str, str]) -> Any:
-    """Return JSON in which paths stand for references to artifacts."""
-    if isinstance(value, dict):
-        return {name: with_files(item, files) for name, item in value.items()}
-    if isinstance(value, list):
-        return [with_files(item, files) for item in value]
-    return files.get(value, value) if isinstance(value, str) else value
 
 
 def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:
