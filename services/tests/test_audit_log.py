@@ -8,7 +8,8 @@ import httpx
 import pytest
 from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
-from stickslip_services.access.audit_log import NOBODY, acting, read_audit_log
+from stickslip_services.access.asker import NOBODY, Asker, asking
+from stickslip_services.access.audit_log import read_audit_log
 from stickslip_services.access.keys import create_key, revoke_key
 from stickslip_services.access.scopes import Scope
 from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
@@ -35,10 +36,10 @@ def lines(context: Context, subject: str | None = None) -> list[tuple[str, str, 
 
 
 def test_every_change_of_a_job_has_its_line(context: Context, worker: PretendWorker) -> None:
-    with acting("key-1 ada"):
+    with asking(Asker("key-1 ada")):
         job = submit_job(context, parsed(rods(name="hers")), None, priority=3).id  # type: ignore[union-attr]
         pause_job(context, job)
-    with acting("key-2 bert"):
+    with asking(Asker("key-2 bert")):
         resume_job(context, job)
         prioritise_job(context, job, 7)
         cancel_job(context, job)
@@ -55,7 +56,7 @@ def test_what_is_refused_or_fails_leaves_no_line(context: Context, monkeypatch: 
     job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
     with pytest.raises(Exception, match="has changed since"):
         pause_job(context, job, if_match=['"another"'])
-    monkeypatch.setattr("stickslip_services.queue.control.give_up_tasks", lambda *_: 1 / 0)
+    monkeypatch.setattr("stickslip_services.queue.control.give_up_piece", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cancel_job(context, job)
     again = submit_job(context, parsed(rods()), "the same")
@@ -65,7 +66,7 @@ def test_what_is_refused_or_fails_leaves_no_line(context: Context, monkeypatch: 
 
 
 def test_keys_and_webhooks_have_lines(context: Context) -> None:
-    with acting("user ada"), context.database.write() as connection:
+    with asking(Asker("user ada")), context.database.write() as connection:
         key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
         revoke_key(connection, key.id, 2.0)
         hook, sign = create_webhook(connection, "https://example.org/hook", 3.0)

@@ -7,7 +7,8 @@ from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask
 from stickslip_schemas.documents.worker_api import LeaseRequest
-from stickslip_services.access.projects import acting_for, check_quota, find_project, set_quota
+from stickslip_services.access.asker import Asker, asking
+from stickslip_services.access.projects import check_quota, find_project, set_quota
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, QuotaExceededError
 from stickslip_services.queue.context import Context
@@ -21,7 +22,7 @@ from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejectio
 
 
 def submit(context: Context, *, priority: int = 0, project: str = "", **spec: Any) -> str:
-    with acting_for(project):
+    with asking(Asker(project=project)):
         return submit_job(context, parsed(rods(**spec)), priority=priority).id  # type: ignore[union-attr]
 
 

@@ -7,8 +7,9 @@ from typing import Any
 import httpx
 import pytest
 from stickslip_schemas.base.states import JobState
+from stickslip_services.access.asker import Asker, asking
 from stickslip_services.access.audit_log import read_audit_log
-from stickslip_services.access.projects import acting_for, find_project, list_projects, set_quota
+from stickslip_services.access.projects import find_project, list_projects, set_quota
 from stickslip_services.app import make_app
 from stickslip_services.cli.main import app
 from stickslip_services.errors import QuotaExceededError
@@ -26,7 +27,7 @@ pytestmark = pytest.mark.databases
 
 
 def submit(context: Context, project: str, *, priority: int = 0, **spec: Any) -> str:
-    with acting_for(project):
+    with asking(Asker(project=project)):
         job = submit_job(context, parsed(rods(**spec)), None, priority=priority)
     return job.id  # type: ignore[union-attr]
 

@@ -77,7 +77,8 @@ def receiver() -> Iterator[Receiver]:
 
 
 @pytest.fixture
-def messenger(context: Context) -> WebhookDelivery:
+def messenger(context: Context, monkeypatch: pytest.MonkeyPatch) -> WebhookDelivery:
+    monkeypatch.setattr(webhooks, "WAIT_SECONDS", 20.0)  # a busy machine must not leave a delivery for later
     return WebhookDelivery(context.database, context.clock)
 
 

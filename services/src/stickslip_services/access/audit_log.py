@@ -3,11 +3,9 @@
 An entry is written in the transaction of the change itself, so that neither exists without the other.
 """
 
-import getpass
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -15,16 +13,12 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select
 
+from stickslip_services.access.asker import asking, this_asker, this_user
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
 from stickslip_services.database.tables import audit_log
 from stickslip_services.settings import Settings
-
-NOBODY = "no key"
-"""The actor of a request without a key: anybody on this machine."""
-
-_actor = ContextVar("actor", default=NOBODY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +27,7 @@ class Entry:
 
     at: datetime
     actor: str
-    """The id and the name of a key, `no key`, or `user NAME` of a command on the machine of the data."""
+    """Name of the asker."""
     action: str
     """What was done, for example `job.cancel`."""
     subject: str
@@ -41,29 +35,11 @@ class Entry:
     details: dict[str, Any]
 
 
-@contextmanager
-def acting(name: str) -> Iterator[None]:
-    """Set the actor of all changes in the block, also in threads that it waits for."""
-    token = _actor.set(name)
-    try:
-        yield
-    finally:
-        _actor.reset(token)
-
-
-def this_user() -> str:
-    """Return the actor of a command on this machine."""
-    try:
-        return f"user {getpass.getuser()}"
-    except (KeyError, OSError):  # a container's user may have no name
-        return "user without a name"
-
-
 def note(connection: Connection, action: str, subject: str, now: float, **details: Any) -> None:
     """Write an entry."""
     connection.execute(
         insert(audit_log).values(
-            at=now, actor=_actor.get(), action=action, subject=subject, details=json.dumps(details)
+            at=now, actor=this_asker().name, action=action, subject=subject, details=json.dumps(details)
         )
     )
 
@@ -86,5 +62,5 @@ def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
     A coordinator may run meanwhile. Raises DatabaseRefusedError or SettingsError.
     """
     settings = Settings.chosen(data=data, **({} if database_url is None else {"database": database_url}))
-    with acting(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
+    with asking(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
         yield connection

@@ -15,6 +15,7 @@ from sqlalchemy import Connection, insert, select, update
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
 
+from stickslip_services.access.asker import Asker
 from stickslip_services.access.audit_log import note
 from stickslip_services.access.scopes import Scope, check_project
 from stickslip_services.clock import as_datetime
@@ -96,23 +97,13 @@ def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
         _insert(connection, LOCAL_WORKER, (Scope.work,), local_worker_key(path), now)
 
 
-@dataclass(frozen=True, slots=True)
-class Holder:
-    """The identity that a key stands for."""
-
-    name: str
-    """The id and the name of the key."""
-    scopes: frozenset[Scope]
-    project: str
-
-
 class KeyRing:
     """Cache of the valid keys. Thread-safe."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._lock = threading.Lock()
-        self._holders: dict[str, Holder] = {}
+        self._holders: dict[str, Asker] = {}
         self._read_at = float("-inf")
 
     @property
@@ -120,14 +111,14 @@ class KeyRing:
         """True where `holder_of` does not need the database."""
         return time.monotonic() < self._read_at + FRESH_SECONDS
 
-    def holder_of(self, secret: str) -> Holder | None:
+    def holder_of(self, secret: str) -> Asker | None:
         """Return the holder of a secret; None if it is unknown or revoked."""
         with self._lock:
             if not self.is_fresh:
                 with self._database.read() as connection:
                     rows = connection.execute(select(api_keys).where(api_keys.c.revoked_at.is_(None)))
                     self._holders = {
-                        row.digest: Holder(
+                        row.digest: Asker(
                             f"{row.id} {row.name}", frozenset(map(Scope, row.scopes.split())), row.project
                         )
                         for row in rows

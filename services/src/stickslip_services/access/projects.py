@@ -4,9 +4,6 @@ Leases are shared evenly between projects, and a project may have a quota. Reque
 with the empty name.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, func, insert, select
@@ -18,8 +15,6 @@ from stickslip_services.database.tables import api_keys, jobs, projects
 from stickslip_services.errors import QuotaExceededError
 
 _OPEN = [state for state in JobState if state.is_open]
-
-_project = ContextVar("project", default="")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,21 +28,6 @@ class Project:
     """Jobs that have not ended; None: any number."""
     samples: int
     jobs: int
-
-
-@contextmanager
-def acting_for(project: str) -> Iterator[None]:
-    """Set the project of all submissions in the block, also in threads that it waits for."""
-    token = _project.set(project)
-    try:
-        yield
-    finally:
-        _project.reset(token)
-
-
-def this_project() -> str:
-    """Return the project of the current request."""
-    return _project.get()
 
 
 def set_quota(connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float) -> None:

@@ -1,7 +1,6 @@
 """Scopes of keys, and names of projects."""
 
 import re
-from collections.abc import Collection
 from enum import StrEnum
 
 
@@ -9,13 +8,13 @@ class Scope(StrEnum):
     """What a key permits. `submit` includes `read`; `admin` includes everything."""
 
     read = "read"
-    """Read everything: jobs, datasets, certificates, pages, metrics."""
+    """Read what belongs to the project of the key: jobs, datasets, pages."""
     submit = "submit"
     """Submit jobs, and pause, resume, cancel and prioritise them."""
     work = "work"
     """Be a worker: register, lease tasks and report results."""
     admin = "admin"
-    """Everything, and register certificates."""
+    """Everything of all projects, and register certificates."""
 
 
 _IMPLIED = {
@@ -26,9 +25,9 @@ _IMPLIED = {
 }
 
 
-def allows(granted: Collection[Scope], needed: Scope) -> bool:
-    """Return whether the granted scopes include the needed one."""
-    return any(needed in _IMPLIED[scope] for scope in granted)
+def includes(granted: Scope, needed: Scope) -> bool:
+    """Return whether a scope includes the needed one."""
+    return needed in _IMPLIED[granted]
 
 
 def check_project(name: str) -> str:

@@ -23,6 +23,7 @@ from standardwebhooks import Webhook as Signer
 from stickslip_schemas.documents.responses import EventName
 
 from stickslip_services.access.audit_log import note
+from stickslip_services.access.scopes import check_project
 from stickslip_services.addresses import is_loopback
 from stickslip_services.clock import Clock, as_datetime
 from stickslip_services.database.database import Database
@@ -58,6 +59,7 @@ class Webhook:
     """A webhook without its secret."""
 
     id: str
+    project: str
     url: str
     failures: int
     failing_since: datetime | None
@@ -66,19 +68,30 @@ class Webhook:
     is_given_up: bool
 
 
-def create_webhook(connection: Connection, url: str, now: float) -> tuple[Webhook, str]:
-    """Make a webhook for events from now on; return it and its secret. Raise SettingsError for a bad URL."""
+def create_webhook(connection: Connection, url: str, now: float, *, project: str = "") -> tuple[Webhook, str]:
+    """Make a webhook for events of the jobs of a project from now on; return it and its secret.
+
+    Raises SettingsError for a bad URL, ValueError for a bad project.
+    """
     _check(url)
     secret = f"whsec_{b64encode(secrets.token_bytes(32)).decode()}"
     name = f"hook-{secrets.token_hex(8)}"
     last = connection.scalar(select(func.max(events.c.id))) or 0
     connection.execute(
         insert(webhooks).values(
-            id=name, url=url, secret=secret, position=last, next_at=now, failures=0, fault="", created_at=now
+            id=name,
+            project=check_project(project),
+            url=url,
+            secret=secret,
+            position=last,
+            next_at=now,
+            failures=0,
+            fault="",
+            created_at=now,
         )
     )
-    note(connection, "webhook.create", name, now, url=url)
-    return Webhook(name, url, 0, None, "", as_datetime(now), is_given_up=False), secret
+    note(connection, "webhook.create", name, now, url=url, project=project)
+    return Webhook(name, project, url, 0, None, "", as_datetime(now), is_given_up=False), secret
 
 
 def list_webhooks(connection: Connection, now: float) -> list[Webhook]:
@@ -86,6 +99,7 @@ def list_webhooks(connection: Connection, now: float) -> list[Webhook]:
     return [
         Webhook(
             id=row.id,
+            project=row.project,
             url=row.url,
             failures=row.failures,
             failing_since=None if row.failing_since is None else as_datetime(row.failing_since),
@@ -195,11 +209,11 @@ def _is_due(now: float) -> ColumnElement[bool]:
 
 def _next_message(connection: Connection, seq: int) -> _Message | None:
     """Return the first message that a webhook has not received; None if it has received all."""
-    position = select(webhooks.c.position).where(webhooks.c.seq == seq).scalar_subquery()
     found = connection.execute(
         select(events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name)
         .join(jobs, jobs.c.seq == events.c.job)
-        .where(events.c.id > position, events.c.name.in_(TOLD))
+        .join(webhooks, webhooks.c.project == jobs.c.project)
+        .where(webhooks.c.seq == seq, events.c.id > webhooks.c.position, events.c.name.in_(TOLD))
         .order_by(events.c.id)
         .limit(1)
     ).one_or_none()

@@ -14,10 +14,9 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import ProblemCode
 
-from stickslip_services.access.audit_log import NOBODY, acting
-from stickslip_services.access.keys import Holder, KeyRing
-from stickslip_services.access.projects import acting_for
-from stickslip_services.access.scopes import Scope, allows
+from stickslip_services.access.asker import Asker, asking
+from stickslip_services.access.keys import KeyRing
+from stickslip_services.access.scopes import Scope
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import problem_response
 
@@ -92,8 +91,8 @@ class KeyMiddleware:
             admitted = await self._admitted(Headers(scope=scope), needed)
         except OperationalError:
             admitted = (503, ProblemCode.storage_error, "the coordinator cannot read its keys; its log says more")
-        if isinstance(admitted, Holder):
-            with acting(admitted.name), acting_for(admitted.project):
+        if isinstance(admitted, Asker):
+            with asking(admitted):
                 await self._app(scope, receive, send)
             return
         status, code, detail = admitted
@@ -102,12 +101,12 @@ class KeyMiddleware:
         response = problem_response(status, code, detail, path=scope["path"], request_id=request_id, headers=headers)
         await response(scope, receive, send)
 
-    async def _admitted(self, headers: Headers, needed: Scope) -> Holder | tuple[int, ProblemCode, str]:
+    async def _admitted(self, headers: Headers, needed: Scope) -> Asker | tuple[int, ProblemCode, str]:
         """Return the holder of the request's key, or why the request is refused (status, code, detail)."""
         authorization = headers.get("authorization")
         if authorization is None:
             if needed in self._open:
-                return Holder(NOBODY, frozenset(), "")
+                return Asker(scopes=self._open)
             return 401, ProblemCode.unauthorized, f"the request needs a key of the scope `{needed}`{_HOW}"
         secret = _secret(authorization)
         if secret is None or self._ring.is_fresh:
@@ -116,7 +115,7 @@ class KeyMiddleware:
             holder = await run_in_threadpool(self._ring.holder_of, secret)
         if holder is None:
             return 401, ProblemCode.unauthorized, f"the key is not known, or it was revoked{_HOW}"
-        if needed in self._open or allows(holder.scopes, needed):
+        if needed in self._open or holder.may(needed):
             return holder
         has = ", ".join(scope for scope in Scope if scope in holder.scopes)
         return 403, ProblemCode.scope_missing, f"the request needs the scope `{needed}`, and the key has: {has}"

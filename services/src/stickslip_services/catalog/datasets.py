@@ -3,7 +3,7 @@
 from functools import lru_cache, partial
 from typing import Any
 
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import ColumnElement, Connection, Row, exists, select
 from stickslip_schemas.base.keys import Sha256, sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.format.manifest import (
@@ -18,6 +18,7 @@ from stickslip_schemas.format.manifest import (
 )
 from stickslip_schemas.store import Store
 
+from stickslip_services.access.asker import own_version
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
@@ -27,12 +28,12 @@ from stickslip_services.errors import MissingArtifactError, NotFoundError
 def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
     """Return a page of datasets, newest first."""
     shown = partial(_shown_dataset, connection)
-    return read_page(connection, select(datasets), page, datasets.c.seq, lambda rows: map(shown, rows))
+    return read_page(connection, select(datasets).where(_is_own()), page, datasets.c.seq, lambda rows: map(shown, rows))
 
 
 def find_dataset(connection: Connection, dataset: str) -> Dataset:
     """Return a dataset with its committed versions; raise NotFoundError."""
-    row = connection.execute(select(datasets).where(datasets.c.id == dataset)).one_or_none()
+    row = connection.execute(select(datasets).where(datasets.c.id == dataset, _is_own())).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no dataset {dataset[:100]!r}")
     return _shown_dataset(connection, row)
@@ -87,10 +88,14 @@ def _size(store: Store, digest: Sha256) -> int:
         raise MissingArtifactError(f"artifact {digest} is not in the store") from error
 
 
+def _is_own() -> ColumnElement[bool]:
+    return exists().where(dataset_versions.c.dataset == datasets.c.id, own_version())
+
+
 def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Dataset:
     versions = connection.execute(
         select(dataset_versions)
-        .where(dataset_versions.c.dataset == row.id, dataset_versions.c.manifest.is_not(None))
+        .where(dataset_versions.c.dataset == row.id, dataset_versions.c.manifest.is_not(None), own_version())
         .order_by(dataset_versions.c.version)
     )
     return Dataset(

@@ -7,6 +7,7 @@ from sqlalchemy import Connection, select
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import load_scene, scene_names
 
+from stickslip_services.access.asker import own
 from stickslip_services.database.tables import dataset_versions, jobs
 from stickslip_services.errors import NotFoundError
 
@@ -29,7 +30,7 @@ def known_scenes(connection: Connection) -> dict[str, KnownScene]:
     found = {scene.digest: KnownScene(scene, is_built_in=True) for scene in map(load_scene, scene_names())}
     rows = connection.execute(
         select(jobs.c.spec, jobs.c.dataset, jobs.c.version)
-        .where(jobs.c.kind == KIND)
+        .where(jobs.c.kind == KIND, own(jobs.c.project))
         .order_by(jobs.c.seq.desc())
         .limit(NEWEST)
     )

@@ -1,6 +1,7 @@
 """Uploaded files: textures, and meshes and paths of scenes; specs name them by their digests."""
 
-from stickslip_schemas.base.keys import ARTIFACT
+from sqlalchemy import insert, select
+from stickslip_schemas.base.keys import ARTIFACT, Sha256
 from stickslip_schemas.documents.problems import FieldError
 from stickslip_schemas.documents.responses import FileUpload, TextureEntry
 from stickslip_schemas.format.pictures import UnfitPictureError, read_picture
@@ -10,31 +11,49 @@ from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
 
+from stickslip_services.access.asker import own, this_asker
+from stickslip_services.database.database import Database
+from stickslip_services.database.tables import uploads
 from stickslip_services.errors import UnknownFileError
 
 
-def store_texture(store: Store, data: bytes) -> TextureEntry:
+def store_texture(database: Database, store: Store, data: bytes) -> TextureEntry:
     """Store a picture file; raise UnfitPictureError where it cannot be a texture."""
     side = len(read_picture(data))
-    return TextureEntry(texture=f"{ARTIFACT}{store.publish(data)}", side=side, bytes=len(data))
+    return TextureEntry(texture=f"{ARTIFACT}{_store(database, store, data)}", side=side, bytes=len(data))
 
 
-def store_file(store: Store, data: bytes) -> FileUpload:
+def store_file(database: Database, store: Store, data: bytes) -> FileUpload:
     """Store a file of a scene; raise UnfitFileError where it can be none."""
     counts = counts_of(data)
-    return FileUpload(file=f"{ARTIFACT}{store.publish(data)}", counts=counts, bytes=len(data))
+    return FileUpload(file=f"{ARTIFACT}{_store(database, store, data)}", counts=counts, bytes=len(data))
 
 
-def check_files(store: Store, spec: JobSpec) -> None:
+def _store(database: Database, store: Store, data: bytes) -> Sha256:
+    """Store an artifact for the project of the asker."""
+    row = {"project": this_asker().project, "digest": store.publish(data)}
+    with database.write() as connection:
+        if connection.scalar(select(uploads.c.digest).filter_by(**row)) is None:
+            connection.execute(insert(uploads).values(row))
+    return row["digest"]
+
+
+def check_files(database: Database, store: Store, spec: JobSpec) -> None:
     """Raise UnknownFileError where a spec names files that are missing, damaged, or not what it needs.
 
-    Files of built-in scenes are stored first.
+    Those of other projects are as good as missing. Files of built-in scenes are stored first.
     """
     wrong = []
+    with database.read() as connection:
+        asked = select(uploads.c.digest).where(uploads.c.digest.in_(spec.artifacts.values()), own(uploads.c.project))
+        uploaded = set(connection.scalars(asked))
     for pointer, digest in spec.artifacts.items():
         try:
-            if (data := built_in_files().get(digest)) is not None and not store.exists(digest):
-                store.publish(data)
+            if (data := built_in_files().get(digest)) is not None:
+                if not store.exists(digest):
+                    store.publish(data)
+            elif digest not in uploaded and not this_asker().sees_all:
+                raise FileNotFoundError
             _check(spec, pointer, store.read(digest))
         except (UnfitPictureError, UnfitFileError) as error:
             rule = f"must name a file that fits: {error}"

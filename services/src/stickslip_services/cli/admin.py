@@ -146,6 +146,7 @@ def _limit(value: int | None) -> str:
 @shows_errors
 def create_webhook(
     url: Annotated[str, typer.Argument(help="receiver of the events: https://..., or http:// on this machine")],
+    project: Annotated[str, typer.Option(help="project whose jobs it is told of; default: jobs without one")] = "",
     data: DataOption = DEFAULT_DATA,
     database: DatabaseOption = None,
 ) -> None:
@@ -153,7 +154,7 @@ def create_webhook(
     with _visited(data, database) as connection:
         from stickslip_services.access.webhooks import create_webhook
 
-        webhook, secret = create_webhook(connection, url, time.time())
+        webhook, secret = create_webhook(connection, url, time.time(), project=project)
     typer.echo(secret)
     say(f"{webhook.id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
 
@@ -166,11 +167,11 @@ def list_webhooks(data: DataOption = DEFAULT_DATA, database: DatabaseOption = No
         from stickslip_services.access.webhooks import list_webhooks
 
         found = list_webhooks(connection, time.time())
-    shown = table("webhook", "url", "made", "failed tries", "fault", no_wrap=("webhook",))
+    shown = table("webhook", "project", "url", "made", "failed tries", "fault", no_wrap=("webhook",))
     for webhook in found:
         fault = f"given up: {webhook.fault}" if webhook.is_given_up else webhook.fault
         made = f"{webhook.created_at:%Y-%m-%d %H:%M}"
-        shown.add_row(webhook.id, escape(webhook.url), made, str(webhook.failures), escape(fault))
+        shown.add_row(webhook.id, webhook.project, escape(webhook.url), made, str(webhook.failures), escape(fault))
     console().print(shown)
 
 

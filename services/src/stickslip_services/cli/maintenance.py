@@ -33,7 +33,7 @@ def _owned(
     require_server()
     from stickslip_schemas.store import open_store
 
-    from stickslip_services.access.audit_log import acting, this_user
+    from stickslip_services.access.asker import asking, this_user
     from stickslip_services.database.database import Role
     from stickslip_services.database.opening import check, opened
     from stickslip_services.local.process import locked
@@ -46,7 +46,7 @@ def _owned(
             f"the database {settings.database_name} does not exist or is empty: name the "
             f"{settings.database_option} of a coordinator"
         )
-    with locked(data), acting(this_user()), opened(settings, Role.upkeep) as opened_database:
+    with locked(data), asking(this_user()), opened(settings, Role.upkeep) as opened_database:
         try:
             yield opened_database, open_store(settings.store_place)
         except ValueError as error:  # a damaged manifest in the store

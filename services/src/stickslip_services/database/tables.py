@@ -71,6 +71,7 @@ jobs = Table(
     Column("planned", Integer, nullable=False, server_default="0"),  # number of samples whose tasks are inserted
     Column("planner", String),  # the coordinator that plans it
     Column("planner_until", Float),  # when another coordinator may go on with that
+    Column("given_up", _Wide),  # the last task that was given up, while a cancelled job has more that wait
     Column("publish_task", _Wide, index=True),  # null until the job is planned
     Column("state", String, nullable=False),
     Column("reason", String),
@@ -94,6 +95,7 @@ jobs = Table(
 idempotency_keys = Table(
     "idempotency_keys",
     metadata,
+    Column("project", String, primary_key=True),
     Column("key", String, primary_key=True),
     Column("fingerprint", String, nullable=False),
     Column("job", _Wide, ForeignKey("jobs.seq"), nullable=False),
@@ -288,6 +290,13 @@ certificates = Table(
     sqlite_autoincrement=True,
 )
 
+uploads = Table(  # who has uploaded which artifact
+    "uploads",
+    metadata,
+    Column("project", String, primary_key=True),
+    Column("digest", String, primary_key=True),
+)
+
 api_keys = Table(
     "api_keys",
     metadata,
@@ -327,6 +336,7 @@ webhooks = Table(
     metadata,
     Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
+    Column("project", String, nullable=False),
     Column("url", String, nullable=False),
     Column("secret", String, nullable=False),  # signing needs it as it is
     Column("position", _Wide, nullable=False),  # id of the last event that was delivered, or needs no delivery

@@ -16,6 +16,7 @@ from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
 
+from stickslip_services.access.asker import own_task
 from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
 from stickslip_services.database.database import batches
 from stickslip_services.database.tables import jobs, samples, task_dependencies, tasks
@@ -64,7 +65,8 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     """
     key = task_key(name)
     columns = (tasks.c.seq, tasks.c.stage, tasks.c.payload, tasks.c.preview, tasks.c.waiting_on)
-    row = None if key is None else connection.execute(select(*columns).where(tasks.c.key == key)).one_or_none()
+    asked = tasks.c.key == key, own_task(tasks.c.seq)
+    row = None if key is None else connection.execute(select(*columns).where(*asked)).one_or_none()
     if key is None or row is None or task_id(row.stage, key) != name:
         raise NotFoundError(f"there is no task {name[:100]!r}")
     if row.waiting_on:

@@ -10,6 +10,7 @@ from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 from stickslip_schemas.kinds import job_spec_adapter
 
+from stickslip_services.access.asker import own, own_task
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, read_page
 from stickslip_services.database.prepared import Prepared
@@ -48,7 +49,7 @@ def etag(job: JobDetail) -> str:
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     """Return the row of a job; raise NotFoundError."""
-    row = connection.execute(select(jobs).where(jobs.c.id == job_id)).one_or_none()
+    row = connection.execute(select(jobs).where(jobs.c.id == job_id, own(jobs.c.project))).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no job {job_id!r}")
     return row
@@ -74,7 +75,8 @@ def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
 def list_jobs(context: Context, connection: Connection, page: PageRequest) -> Page[Job]:
     """Return a page of jobs, newest first."""
     workers = alive_workers(context, connection)
-    return read_page(connection, select(jobs), page, jobs.c.seq, lambda rows: _shown(connection, rows, workers, {}))
+    query = select(jobs).where(own(jobs.c.project))
+    return read_page(connection, query, page, jobs.c.seq, lambda rows: _shown(connection, rows, workers, {}))
 
 
 def list_samples(connection: Connection, job: int, page: PageRequest, state: TaskState | None) -> Page[SampleState]:
@@ -138,8 +140,9 @@ def stage_durations(connection: Connection, job: int) -> dict[Stage, StageTiming
 
 
 def is_preview(connection: Connection, digest: str) -> bool:
-    """Return whether an artifact is a preview, which may be served without a dataset."""
-    return connection.scalar(select(previews.c.task).where(previews.c.digest == digest).limit(1)) is not None
+    """Return whether an artifact is a preview that the asker sees, which is served without a dataset."""
+    query = select(previews.c.task).where(previews.c.digest == digest, own_task(previews.c.task))
+    return connection.scalar(query.limit(1)) is not None
 
 
 def _shown(

@@ -12,8 +12,9 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.grid import count
 from stickslip_schemas.spec.jobs import JobSpec
 
+from stickslip_services.access.asker import this_asker
 from stickslip_services.access.audit_log import note
-from stickslip_services.access.projects import check_quota, this_project
+from stickslip_services.access.projects import check_quota
 from stickslip_services.catalog.uploads import check_files
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import dataset_versions, idempotency_keys, jobs, tasks
@@ -57,7 +58,7 @@ def submit_job(
     Raises UnknownFileError, QuotaExceededError, KindNotAvailableError, PresetNotCertifiedError, or
     IdempotencyKeyReusedError.
     """
-    check_files(context.store, spec)
+    check_files(context.database, context.store, spec)
     with collector_at_rest(), tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count):
         answer = _submit(context, spec, idempotency_key, priority, tracing.traceparent())
         tracing.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
@@ -67,7 +68,7 @@ def submit_job(
 def _submit(
     context: Context, spec: JobSpec, key: str | None, priority: int, traceparent: str | None
 ) -> JobDetail | Replay:
-    project, print_ = this_project(), fingerprint(spec)
+    project, print_ = this_asker().project, fingerprint(spec)
     at_once = spec.sample_count <= context.settings.plan_samples
     plan: Plan | None = None
     planned_for: Terms | None = None
@@ -118,7 +119,7 @@ def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> R
     row = connection.execute(
         select(idempotency_keys.c.fingerprint, idempotency_keys.c.response, jobs.c.id)
         .join(jobs, jobs.c.seq == idempotency_keys.c.job)
-        .where(idempotency_keys.c.key == key)
+        .where(idempotency_keys.c.key == key, idempotency_keys.c.project == this_asker().project)
     ).one_or_none()
     if row is None:
         return None
@@ -129,9 +130,8 @@ def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> R
 
 def _keep_replay(connection: Connection, key: str, fingerprint: str, job: int, response: str, now: float) -> None:
     """Store the answer to a request."""
-    connection.execute(
-        insert(idempotency_keys).values(key=key, fingerprint=fingerprint, job=job, response=response, created_at=now)
-    )
+    row = {"project": this_asker().project, "key": key, "fingerprint": fingerprint, "job": job}
+    connection.execute(insert(idempotency_keys).values(row | {"response": response, "created_at": now}))
 
 
 def fingerprint(spec: JobSpec) -> str:
@@ -144,7 +144,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
 
     Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises UnknownFileError.
     """
-    check_files(context.store, spec)
+    check_files(context.database, context.store, spec)
     database = context.database
     counts = count(spec)
     raw = bytes_estimate(spec)

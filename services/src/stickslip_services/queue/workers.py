@@ -13,6 +13,7 @@ from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
 
+from stickslip_services.access.asker import own
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, tasks, workers
@@ -152,11 +153,14 @@ def leased_counts(connection: Connection) -> dict[str, int]:
 def running_tasks(
     connection: Connection, frames: Mapping[str, tuple[int, int]]
 ) -> dict[str, list[responses.RunningTask]]:
-    """Return the tasks on lease by worker, the longest-running first; `frames` is the progress of simulations."""
+    """Return the tasks on lease that the asker sees, by worker, the longest-running first.
+
+    `frames` is the progress of simulations.
+    """
     rows = connection.execute(
         select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
-        .where(text("tasks.owner IS NOT NULL"))
+        .where(text("tasks.owner IS NOT NULL"), own(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
     found: dict[str, list[responses.RunningTask]] = {}

@@ -6,6 +6,7 @@ from sqlalchemy import text
 from stickslip_schemas.base.document import Document
 
 from stickslip_services import __version__
+from stickslip_services.access.asker import refuse_projects
 from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.routes.common import ContextDep, problem_responses
 
@@ -35,9 +36,13 @@ def get_readyz(context: ContextDep) -> Health:
 @router.get(
     "/metrics",
     response_class=Response,
-    responses={200: {"description": "Metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}},
+    responses={
+        200: {"description": "Metrics", "content": {"text/plain": {"schema": {"type": "string"}}}},
+        **problem_responses(404),
+    },
 )
 def get_metrics(request: Request) -> Response:
-    """Return metrics for Prometheus."""
+    """Return metrics for Prometheus. 404: the key belongs to a project."""
+    refuse_projects("metrics")
     metrics: Metrics = request.app.state.metrics
     return Response(metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})

@@ -39,7 +39,7 @@ async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
             raise UnfitPictureError(
                 f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}"
             )
-        return await run_in_threadpool(store_texture, context.store, data)
+        return await run_in_threadpool(store_texture, context.database, context.store, data)
     except UnfitPictureError as error:
         raise _refused(error, data) from error
 
@@ -57,7 +57,7 @@ async def post_file(request: Request, context: ContextDep) -> FileUpload:
     """
     data = await _body(request)
     try:
-        return await run_in_threadpool(store_file, context.store, data)
+        return await run_in_threadpool(store_file, context.database, context.store, data)
     except UnfitFileError as error:
         raise _refused(error, data) from error
 

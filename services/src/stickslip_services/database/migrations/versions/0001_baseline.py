@@ -107,7 +107,7 @@ def upgrade() -> None:
         *_columns(sa.Text, "builds", nullable=True),
         *_columns(sa.Integer, "planned priority", server_default="0"),
         *_columns(sa.Float, "planner_until started_at finished_at", nullable=True),
-        *_columns(_WIDE, "publish_task", nullable=True),
+        *_columns(_WIDE, "publish_task given_up", nullable=True),
         *_columns(sa.Float, "created_at"),
         *_columns(sa.Integer, "version", nullable=True),
         sa.PrimaryKeyConstraint("seq", name="pk_jobs"),
@@ -186,9 +186,14 @@ def upgrade() -> None:
     )
     _index("ix_tasks_retry", "tasks", ["retry_at"], where="state = 'soft_failed'")
     op.create_table(
+        "uploads",
+        *_columns(sa.String, "project digest"),
+        sa.PrimaryKeyConstraint("project", "digest", name="pk_uploads"),
+    )
+    op.create_table(
         "webhooks",
         *_columns(_WIDE, "seq position"),
-        *_columns(sa.String, "id url secret"),
+        *_columns(sa.String, "id project url secret"),
         *_columns(sa.Float, "next_at created_at"),
         *_columns(sa.Integer, "failures"),
         *_columns(sa.Float, "failing_since", nullable=True),
@@ -222,11 +227,11 @@ def upgrade() -> None:
     _index("ix_events_job_id", "events", ["job", "id"])
     op.create_table(
         "idempotency_keys",
-        *_columns(sa.String, "key fingerprint"),
+        *_columns(sa.String, "project key fingerprint"),
         *_columns(_WIDE, "job"),
         *_columns(sa.Text, "response"),
         *_columns(sa.Float, "created_at"),
-        sa.PrimaryKeyConstraint("key", name="pk_idempotency_keys"),
+        sa.PrimaryKeyConstraint("project", "key", name="pk_idempotency_keys"),
         sa.ForeignKeyConstraint(["job"], ["jobs.seq"], name="fk_idempotency_keys_job_jobs"),
     )
     op.create_table(

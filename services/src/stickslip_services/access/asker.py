@@ -1,0 +1,99 @@
+"""Who asks, and what they may do and see: the one place that answers for a scope and a project.
+
+Every query for something that belongs to a project has one of the conditions `own_...`. What belongs to another project
+is thus not found. The coordinator itself, and commands on its machine, see everything, and so do keys of the scope
+`admin`.
+"""
+
+import getpass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, exists, or_, true
+
+from stickslip_services.access.scopes import Scope, includes
+from stickslip_services.database.tables import dataset_versions, job_tasks, jobs
+from stickslip_services.errors import NotFoundError
+
+NOBODY = "no key"
+"""Name of who asks without a key: anybody on this machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """A key, a request without one, a command on this machine, or the coordinator itself."""
+
+    name: str = NOBODY
+    """The id and the name of a key, `no key`, or `user NAME`."""
+    scopes: frozenset[Scope] = frozenset(Scope)
+    project: str = ""
+
+    def may(self, needed: Scope) -> bool:
+        """Return whether a scope of the asker includes `needed`."""
+        return any(includes(scope, needed) for scope in self.scopes)
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether the asker sees what belongs to any project."""
+        return Scope.admin in self.scopes
+
+
+_EVERYTHING = Asker()
+_asker = ContextVar("asker", default=_EVERYTHING)
+
+
+@contextmanager
+def asking(asker: Asker) -> Iterator[None]:
+    """Set who asks in the block, also in threads that it waits for."""
+    token = _asker.set(asker)
+    try:
+        yield
+    finally:
+        _asker.reset(token)
+
+
+def this_asker() -> Asker:
+    """Return who asks."""
+    return _asker.get()
+
+
+def this_user() -> Asker:
+    """Return the asker of a command on this machine."""
+    try:
+        return Asker(f"user {getpass.getuser()}")
+    except (KeyError, OSError):  # a container's user may have no name
+        return Asker("user without a name")
+
+
+def own(project: ColumnElement[str]) -> ColumnElement[bool]:
+    """Return the condition that a row of a project is one that the asker sees."""
+    asker = this_asker()
+    return true() if asker.sees_all else project == asker.project
+
+
+def own_task(task: ColumnElement[int]) -> ColumnElement[bool]:
+    """Return the condition that a job that the asker sees has a task. Projects share tasks of one content."""
+    if this_asker().sees_all:
+        return true()
+    return exists().where(job_tasks.c.task == task, job_tasks.c.job == jobs.c.seq, own(jobs.c.project))
+
+
+def own_version() -> ColumnElement[bool]:
+    """Return the condition that a job that the asker sees has made a dataset version, or would make the same one.
+
+    A version without a job belongs to the project with the empty name.
+    """
+    asker = this_asker()
+    if asker.sees_all:
+        return true()
+    made = jobs.c.publish_task == dataset_versions.c.publish_task
+    is_own = exists().where(made, own(jobs.c.project))
+    return is_own if asker.project else or_(is_own, ~exists().where(made))
+
+
+def refuse_projects(what: str) -> None:
+    """Raise NotFoundError where the asker belongs to a project, for something that tells about all of them."""
+    if this_asker().project and not this_asker().sees_all:
+        raise NotFoundError(f"{what} are of all projects: ask with a key without a project")

@@ -1,0 +1,238 @@
+"""Tenants: what belongs to another project is not there, whatever the operation.
+
+Every operation of the OpenAPI document, and every page, is tried with the key of another project. One that is added
+and not tried fails the test.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from PIL import Image
+from sqlalchemy import select
+from starlette.routing import Route
+from stickslip_services.access.keys import create_key
+from stickslip_services.access.scopes import Scope
+from stickslip_services.app import make_app
+from stickslip_services.database.tables import previews, tasks
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.ids import task_id
+from stickslip_services.settings import Settings
+from stickslip_testing.jobs import rods
+from stickslip_testing.servers import serving
+from stickslip_testing.worker import DirectApi, PretendWorker
+
+SHARED = {
+    ("GET", "/livez"),
+    ("GET", "/readyz"),
+    ("GET", "/v1/certificates"),
+    ("GET", "/v1/datasets"),
+    ("GET", "/v1/jobs"),
+    ("GET", "/v1/workers"),
+    ("POST", "/v1/files"),
+    ("POST", "/v1/jobs"),
+    ("POST", "/v1/jobs:validate"),
+    ("POST", "/v1/textures"),
+    ("GET", "/"),
+    ("GET", "/certificates"),
+    ("GET", "/datasets"),
+    ("GET", "/docs"),
+    ("GET", "/scenes"),
+    ("GET", "/ui/jobs"),
+    ("GET", "/ui/workers"),
+    ("GET", "/workers"),
+}
+"""Operations that every project may call. They must tell nothing of another project."""
+
+HOUSE = {
+    ("GET", "/metrics"): 404,
+    ("GET", "/v1/certificates/{digest}"): 404,  # there is none here; they belong to no project
+    ("GET", "/v1/certificates/{digest}/page"): 404,
+    ("GET", "/certificates/{digest}"): 404,
+    ("GET", "/scenes/{digest}"): 404,
+    ("POST", "/v1/certificates"): 403,
+    ("POST", "/v1/workers"): 403,
+    ("POST", "/v1/worker/lease"): 403,
+    ("POST", "/v1/worker/heartbeat"): 403,
+    ("POST", "/v1/worker/report"): 403,
+}
+"""Operations that are not of a project, and what its key gets."""
+
+ENDLESS = {("GET", "/ui/changes")}
+"""A stream without contents: it says that anything has changed, and not what."""
+
+OWNED = {
+    *(("GET", f"/v1/jobs/{{job_id}}{rest}") for rest in ("", "/samples", "/previews", "/events")),
+    ("PATCH", "/v1/jobs/{job_id}"),
+    *(("POST", f"/v1/jobs/{{job_id}}:{verb}") for verb in ("cancel", "pause", "resume")),
+    ("GET", "/v1/tasks/{task_id}"),
+    ("GET", "/v1/previews/{digest}"),
+    ("GET", "/v1/datasets/{dataset}"),
+    *(
+        (method, f"/v1/datasets/{{dataset}}/versions/{{version}}{rest}")
+        for method in ("GET", "HEAD")
+        for rest in ("", "/manifest", "/page", "/files/{path:path}")
+    ),
+    ("GET", "/jobs/{job_id}"),
+    *(("GET", f"/ui/jobs/{{job_id}}{rest}") for rest in ("", "/map")),
+    ("POST", "/ui/jobs/{job_id}/{verb}"),
+    ("GET", "/datasets/{dataset}"),
+    ("GET", "/datasets/{dataset}/v{version}"),
+    ("GET", "/datasets/{dataset}/v{version}/samples/{slot}"),
+    *(
+        ("GET", f"/ui/datasets/{{dataset}}/v{{version}}/{rest}")
+        for rest in ("thumbs", "samples/{slot}/{array}/{index}.png", "samples/{slot}/{array}.json")
+    ),
+}
+"""Operations on a thing of a project: 404 for the others."""
+
+
+@dataclass
+class Tenants:
+    """A coordinator with a job, a dataset and an upload of the project alpha, and keys of two projects."""
+
+    app: FastAPI
+    alpha: httpx.Client
+    beta: httpx.Client
+    parameters: dict[str, str]
+    upload: str
+
+    def call(self, client: httpx.Client, method: str, template: str) -> httpx.Response:
+        path = template.replace("{path:path}", "{path}").format(**self.parameters)
+        if template.endswith("/files"):
+            return client.post(path, content=b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+        if template.endswith("/textures"):
+            return client.post(path, content=picture(3), headers={"Content-Type": "image/png"})
+        bodies = {"PATCH": {"priority": 3}, "POST": rods()}
+        return client.request(method, path, json=bodies.get(method))
+
+
+def picture(shade: int) -> bytes:
+    file = BytesIO()
+    Image.new("RGB", (64, 64), (shade, 20, 20)).save(file, format="PNG")
+    return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def tenants(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tenants]:
+    app = make_app(Settings(data=tmp_path_factory.mktemp("tenants"), durable=False, require_keys=True))
+    context: Context = app.state.context
+    with serving(app) as url:
+        with context.database.write() as connection:
+            secrets = {
+                name: create_key(connection, name, [Scope.submit], time.time(), project=name)[1]
+                for name in ("alpha", "beta")
+            }
+        clients = {
+            name: httpx.Client(base_url=url, headers={"Authorization": f"Bearer {secret}"}, timeout=20, trust_env=False)
+            for name, secret in secrets.items()
+        }
+        alpha = clients["alpha"]
+        worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
+        made = alpha.post("/v1/jobs", json=rods(name="alpha-s"), headers={"Idempotency-Key": "one"}).json()
+        worker.work()
+        upload = alpha.post("/v1/textures", content=picture(7), headers={"Content-Type": "image/png"}).json()
+        job = alpha.get(f"/v1/jobs/{made['id']}").json()
+        assert job["state"] == "succeeded", job
+        with context.database.read() as connection:
+            stage, key = connection.execute(select(tasks.c.stage, tasks.c.key).limit(1)).one()
+            preview = connection.scalar(select(previews.c.digest).limit(1))
+        assert preview is not None
+        parameters = {
+            "job_id": job["id"],
+            "task_id": task_id(stage, key),
+            "digest": preview,
+            "dataset": job["dataset"]["dataset"],
+            "version": "1",
+            "path": "zarr.json",
+            "verb": "cancel",
+            "slot": "0",
+            "array": "mu",
+            "index": "0",
+        }
+        yield Tenants(app, alpha, clients["beta"], parameters, upload["texture"])
+        for client in clients.values():
+            client.close()
+
+
+def operations(app: FastAPI) -> set[tuple[str, str]]:
+    """Return all operations (method, template), those outside the OpenAPI document included."""
+    nested = [getattr(route, "original_router", None) for route in app.state.routes]
+    all_routes = [*app.state.routes, *(route for router in nested if router for route in router.routes)]
+    routes = {
+        (method, route.path) for route in all_routes if isinstance(route, Route) for method in route.methods or ()
+    }
+    document = {(method.upper(), path) for path, methods in app.openapi()["paths"].items() for method in methods}
+    assert document <= {(method, path.replace("{path:path}", "{path}")) for method, path in routes}
+    return routes
+
+
+def test_every_operation_is_tried(tenants: Tenants) -> None:
+    there = {(method, path) for method, path in operations(tenants.app) if method != "HEAD"}
+    tried = {(method, path) for method, path in SHARED | HOUSE.keys() | ENDLESS | OWNED if method != "HEAD"}
+    assert there == tried, f"not tried: {there - tried}; not there: {tried - there}"
+
+
+@pytest.mark.parametrize(("method", "path"), sorted(OWNED))
+def test_what_belongs_to_another_project_is_not_found(tenants: Tenants, method: str, path: str) -> None:
+    refused = tenants.call(tenants.beta, method, path)
+    if (method, path) not in operations(tenants.app):
+        assert refused.status_code == 405
+        return
+    assert refused.status_code == 404, refused.text
+    own = tenants.call(tenants.alpha, method, path)
+    assert own.status_code != 404 or "array" in path, own.text  # rods have no pictures of that name
+    assert refused.text.replace(refused.headers["x-request-id"], "") not in own.text or method == "HEAD"
+
+
+@pytest.mark.parametrize(("method", "path"), sorted(SHARED))
+def test_lists_tell_nothing_of_another_project(tenants: Tenants, method: str, path: str) -> None:
+    answer = tenants.call(tenants.beta, method, path)
+    assert answer.is_success, answer.text
+    secret = ("job_id", "task_id", "digest")
+    if (method, path) != ("POST", "/v1/jobs:validate"):
+        for name in secret:
+            assert tenants.parameters[name] not in answer.text, (name, answer.text)
+    assert "alpha" not in answer.text
+
+
+@pytest.mark.parametrize(("method", "path"), sorted(HOUSE))
+def test_what_is_of_no_project_is_closed(tenants: Tenants, method: str, path: str) -> None:
+    answer = tenants.call(tenants.beta, method, path)
+    assert answer.status_code == HOUSE[method, path], answer.text
+
+
+def test_a_key_of_idempotency_is_of_its_project(tenants: Tenants) -> None:
+    headers = {"Idempotency-Key": "one"}
+    made = tenants.beta.post("/v1/jobs", json=rods(gamma=(5.0,)), headers=headers)
+    assert made.status_code == 202
+    assert made.json()["id"] != tenants.parameters["job_id"]
+    assert tenants.alpha.post("/v1/jobs", json=rods(name="alpha-s"), headers=headers).status_code == 200
+
+
+def test_an_upload_is_of_its_project(tenants: Tenants) -> None:
+    axes = {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "mine"], "viewpoint": "calibrated"}
+    spec = {"kind": "cloth_drag", "axes": axes, "textures": {"mine": tenants.upload}}
+    refused = tenants.beta.post("/v1/jobs:validate", json=spec)
+    assert (refused.status_code, "must name a file that was uploaded" in refused.text) == (422, True), refused.text
+    assert tenants.alpha.post("/v1/jobs:validate", json=spec).status_code == 200
+
+
+def test_an_admin_sees_every_project(tenants: Tenants) -> None:
+    context: Context = tenants.app.state.context
+    with context.database.write() as connection:
+        secret = create_key(connection, "root", [Scope.admin], time.time())[1]
+    tenants.alpha.get("/livez")
+    answer = httpx.get(
+        str(tenants.alpha.base_url.join(f"/v1/jobs/{tenants.parameters['job_id']}")),
+        headers={"Authorization": f"Bearer {secret}"},
+        trust_env=False,
+    )
+    if answer.status_code == 401:  # a new key takes effect within a second
+        time.sleep(1.1)
+        answer = httpx.get(answer.url, headers=answer.request.headers, trust_env=False)
+    assert answer.status_code == 200
