@@ -11,11 +11,11 @@ from stickslip_schemas.documents.worker_api import LeaseRequest
 from stickslip_schemas.plan.builds import Builds
 from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
-from stickslip_services.database.tables import tasks
+from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
 from stickslip_services.queue.compose import AnyTask, find_task
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
@@ -675,3 +675,24 @@ class TestPausing:
         assert counts(context, job, Stage.simulate) == {TaskState.pending: 4}
         assert worker.lease() == ()
         check(context)
+
+
+def test_a_cancelled_job_gives_up_its_tasks_in_pieces(
+    context: Context, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stickslip_services.queue.ledger.PIECE_TASKS", 3)
+    job = submit(context, gamma=(1.0, 2.0, 3.0))
+    kept = submit(context, gamma=(3.0, 4.0))
+    leases = worker.lease(simulate=1)
+    assert cancel_job(context, job).state is JobState.cancelling
+    with context.database.read() as connection:
+        waiting = connection.scalar(select(jobs.c.given_up).where(jobs.c.id == job))
+    assert waiting is not None  # of a job with more tasks than one transaction takes
+    give_up_waiting(context)
+    with context.database.read() as connection:
+        assert connection.scalar(select(jobs.c.given_up).where(jobs.c.id == job)) is None
+        assert violations(connection) == []
+    assert worker.beat(*leases) == (leases[0].task_id,)
+    assert show_job(context, job).state is JobState.cancelled
+    worker.work()
+    assert show_job(context, kept).state is JobState.succeeded

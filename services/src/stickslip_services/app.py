@@ -45,6 +45,7 @@ from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.local.process import configure_logging, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import give_up_waiting
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.sweep import start, sweep
@@ -53,7 +54,7 @@ from stickslip_services.settings import Settings
 logger = logging.getLogger(__name__)
 
 PLAN_SECONDS = 0.2
-"""Polling interval for unplanned jobs [s]."""
+"""Polling interval for jobs to plan or to cancel [s]."""
 
 GRACE_SECONDS = 3
 """Time that open requests (event streams) have to end after a signal [s]."""
@@ -108,6 +109,14 @@ class PlanService(LoopService):
         self._planner.run()
 
 
+class CancelService(LoopService):
+    """Gives up the tasks of cancelled jobs of many samples."""
+
+    def run_once(self) -> None:
+        """Give up what waits."""
+        give_up_waiting(self.context)
+
+
 class WebhookService(LoopService):
     """Delivers job events to webhooks."""
 
@@ -131,6 +140,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         every = settings.sweep_seconds
         webhooks = WebhookService(context, every)
         services = [SweepService(context, every), CheckService(context, every), PlanService(context, PLAN_SECONDS)]
+        services.append(CancelService(context, PLAN_SECONDS))
         running = [asyncio.create_task(service.run()) for service in (*services, webhooks)]
         running.append(asyncio.create_task(context.database.listen(context.notifier.notify)))
         yield

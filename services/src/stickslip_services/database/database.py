@@ -34,9 +34,10 @@ class Role(Enum):
 class Database(ABC):
     """Transactions on one database."""
 
-    def __init__(self, reader: Engine, writer: Engine) -> None:
+    def __init__(self, reader: Engine, writer: Engine, *others: Engine) -> None:
         self._reader = reader
         self._writer = writer
+        self._engines = {reader, writer, *others}
         # The database's own waiting is unfair, or takes a connection, so threads of this process wait here.
         self._writing = threading.Lock()
         self._ahead = time.time() - time.monotonic()
@@ -58,6 +59,13 @@ class Database(ABC):
     def write(self) -> AbstractContextManager[Connection]:
         """Open a transaction that excludes other writers; it is durable after the block."""
 
+    def touch(self) -> AbstractContextManager[Connection]:
+        """Open a transaction for changes that may be lost, beside writers where the database has row locks.
+
+        A statement must not wait for a row while it holds another: `with_for_update(skip_locked=True)`.
+        """
+        return self.write()
+
     def is_alone(self, connection: Connection) -> bool:
         """Return whether no other coordinator uses the database; call it in a write transaction."""
         return True
@@ -68,7 +76,7 @@ class Database(ABC):
 
     def close(self) -> None:
         """Close all connections; one that a thread still uses is closed when it is returned."""
-        for engine in (self._reader, self._writer):
+        for engine in self._engines:
             event.listen(engine, "checkin", _close_returned)
             engine.dispose()
 

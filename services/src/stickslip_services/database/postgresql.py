@@ -10,7 +10,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 import psycopg
@@ -80,14 +80,16 @@ class PostgresqlDatabase(Database):
         self._role = role
         self._durable = durable
         given = {name: value for name, value in _CONNECT.items() if name not in url.query}
-        # 32 readers and the writer: three coordinators fit into the 100 connections that a server has by default.
-        reader = create_engine(url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=24)
+        # 24 readers, 4 touchers, a writer: three coordinators fit into the 100 connections of a server by default.
+        reader = create_engine(url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=16)
         writer = create_engine(url, paramstyle="format", connect_args=given, pool_size=1, max_overflow=0)
+        self._toucher = create_engine(url, paramstyle="format", connect_args=given, pool_size=4, max_overflow=0)
         self._arguments: dict[str, Any] = {**writer.dialect.create_connect_args(url)[1], **given}
         event.listen(reader, "connect", _prepare_reader)
         event.listen(writer, "connect", self._prepare_writer)
         event.listen(writer, "close", _leave)
-        super().__init__(reader, writer)
+        event.listen(self._toucher, "connect", _prepare_toucher)
+        super().__init__(reader, writer, self._toucher)
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
@@ -97,6 +99,10 @@ class PostgresqlDatabase(Database):
             # Leases are granted, renewed and taken back in writes: all coordinators do it by the same clock.
             self._ahead = now - time.monotonic()
             yield connection
+
+    def touch(self) -> AbstractContextManager[Connection]:
+        """Open a transaction beside writers. A crash of the server may lose it."""
+        return self._toucher.begin()
 
     def is_alone(self, connection: Connection) -> bool:
         """Return whether no other coordinator uses the database; call it in a write transaction."""
@@ -139,6 +145,12 @@ def _prepare_reader(connection: Any, _record: Any) -> None:
     _prepare(connection)
     connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
     connection.read_only = True
+
+
+def _prepare_toucher(connection: Any, _record: Any) -> None:
+    _prepare(connection)
+    connection.execute("SET synchronous_commit = off")
+    connection.commit()
 
 
 def _prepare(connection: Any) -> None:

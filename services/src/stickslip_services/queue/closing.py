@@ -228,8 +228,9 @@ def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, Ta
 
 
 def _finish_cancelling(connection: Connection, now: float) -> None:
-    """Cancel the `cancelling` jobs of which no task is on lease any more, unless another live job needs it."""
-    for job in _jobs_in(connection, JobState.cancelling):
+    """Cancel the `cancelling` jobs of which no task waits or is on lease any more, unless another job needs it."""
+    given_up = select(jobs.c.seq).where(_OPEN, jobs.c.state == JobState.cancelling, jobs.c.given_up.is_(None))
+    for job in connection.scalars(given_up).all():
         held = _held_tasks(connection, job)
         if not set(held) - live_jobs(connection, held).keys():
             message = "cancelled; what had been finished is kept and will not be done again"
@@ -238,17 +239,13 @@ def _finish_cancelling(connection: Connection, now: float) -> None:
 
 def _finish_pausing(connection: Connection, now: float) -> None:
     """Pause the `pausing` jobs of which no task is on lease any more, unless a runnable job needs it."""
-    for job in _jobs_in(connection, JobState.pausing):
+    for job in connection.scalars(select(jobs.c.seq).where(_OPEN, jobs.c.state == JobState.pausing)).all():
         held = _held_tasks(connection, job)
         if not set(held) - runnable_tasks(connection, held):
             reason, message = connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job)).one()
             if reason is None:
                 message = "paused; resume it to go on"
             set_job_state(connection, job, JobState.paused, now, reason=reason, message=message)
-
-
-def _jobs_in(connection: Connection, state: JobState) -> list[int]:
-    return list(connection.scalars(select(jobs.c.seq).where(_OPEN, jobs.c.state == state)))
 
 
 def _held_tasks(connection: Connection, job: int) -> list[int]:

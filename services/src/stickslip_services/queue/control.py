@@ -1,5 +1,9 @@
-"""Control of jobs: cancel, pause, resume and prioritise them. Each change is one transaction with an audit entry."""
+"""Control of jobs: cancel, pause, resume and prioritise them. Each change is one transaction with an audit entry.
 
+Only the tasks of a cancelled job are given up in more transactions, since a job of a million has millions.
+"""
+
+import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +19,7 @@ from stickslip_services.errors import ConflictError, PreconditionFailedError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import etag, find_job, show_job
-from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_tasks
+from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_piece
 from stickslip_services.queue.planner import plan_waiting_jobs
 from stickslip_services.queue.workers import NO_WORKER, note_stranded
 
@@ -30,8 +34,27 @@ def cancel_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> Jo
             if not JobState(job.state).is_open:
                 raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
             _set_state(book, job.seq, JobState.cancelling, Reason.cancelled, "tasks that are running are being stopped")
-            give_up_tasks(book, job.seq)
+            _give_up_more(book, job.seq, 0)
     return _shown(context, job.seq)
+
+
+def give_up_waiting(context: Context) -> None:
+    """Give up what is left of the waiting tasks of cancelled jobs, piece by piece, with pauses for other writers."""
+    left = select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1)
+    while not context.is_closing:
+        with context.database.read() as connection:
+            if connection.execute(left).one_or_none() is None:
+                return
+        began = time.monotonic()
+        with context.ledger() as book:
+            if (job := book.connection.execute(left).one_or_none()) is not None:
+                _give_up_more(book, job.seq, job.given_up)
+        time.sleep(time.monotonic() - began)
+
+
+def _give_up_more(book: Ledger, job: int, after: int) -> None:
+    last = give_up_piece(book, job, after)
+    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(given_up=last))
 
 
 def pause_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:

@@ -6,7 +6,7 @@ has lost its lease is recognised.
 
 from collections.abc import Iterable, Sequence
 
-from sqlalchemy import Connection, select, text, update
+from sqlalchemy import Connection, bindparam, exists, select, text, update
 from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Stage, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
@@ -17,13 +17,13 @@ from stickslip_schemas.documents.worker_api import (
     LeaseBatch,
     LeaseRequest,
     LeaseState,
-    WorkerCondition,
     WorkerRegistration,
     WorkerSession,
 )
 
 from stickslip_services.database.database import batches
-from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.compose import Publish, compose_tasks
 from stickslip_services.queue.context import Context
@@ -31,6 +31,7 @@ from stickslip_services.queue.grants import Grant, grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.ledger import (
+    RUNNABLE,
     HeldTask,
     Ledger,
     cancel_tasks,
@@ -75,7 +76,9 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         due = is_sweep_due(connection, context.clock())
         ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
         waiting = ready or has_runnable_job(connection)
-    _note_seen(context, worker, worker.condition)
+    if is_silent(context, worker):
+        with context.database.touch() as connection:
+            note_seen(connection, worker.id, context.clock())
     if due:
         take_back(context)
     if context.store_watch.trouble:
@@ -94,27 +97,56 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
 
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
     """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
-    with context.database.read() as connection:
+    with context.database.touch() as connection:
         worker = find_worker(connection, message.worker_id)
-    _note_seen(context, worker, message.condition)
+        # A poll is not worth a write.
+        if is_silent(context, worker) or message.condition != worker.condition:
+            note_seen(connection, worker.id, context.clock(), message.condition)
+        left = _leave_renewed(connection, worker, message.leases, context.clock() + context.settings.lease_seconds)
+    if message.condition.state != worker.condition.state:
+        note_stranded(context)
     context.frames_by_worker[worker.id] = {
         lease.task_id: lease.frames for lease in message.leases if lease.frames is not None
     }
-    if not message.leases:
+    if not left:
         return HeartbeatAnswer(drop=())
     with context.ledger() as book:
         worker = find_worker(book.connection, worker.id)
-        drop = _renew_leases(book, worker, message.leases, context.settings.lease_seconds)
+        drop = _renew_leases(book, worker, left, context.settings.lease_seconds)
     return HeartbeatAnswer(drop=drop)
 
 
-def _note_seen(context: Context, worker: RegisteredWorker, condition: WorkerCondition) -> None:
-    """Store that a worker is alive, unless that was done a moment ago: a poll is not worth a write."""
-    if is_silent(context, worker) or condition != worker.condition:
-        with context.database.write() as connection:
-            note_seen(connection, worker.id, context.clock(), condition)
-    if condition.state != worker.condition.state:
-        note_stranded(context)
+_RENEWED = (
+    select(tasks.c.seq)
+    .where(
+        tasks.c.key.in_(bindparam("b_keys", expanding=True)),
+        tasks.c.owner == bindparam("b_worker"),
+        exists().where(job_tasks.c.task == tasks.c.seq, jobs.c.seq == job_tasks.c.job, jobs.c.state.in_(RUNNABLE)),
+    )
+    .with_for_update(skip_locked=True)
+)
+_RENEW = Prepared(
+    update(tasks)
+    .where(tasks.c.seq.in_(_RENEWED))
+    .values(expires_at=bindparam("b_until"))
+    .returning(tasks.c.key, tasks.c.token, tasks.c.state)
+)
+
+
+def _leave_renewed(
+    connection: Connection, worker: RegisteredWorker, held: Sequence[LeaseState], until: float
+) -> list[LeaseState]:
+    """Renew the leases whose tasks go on as they are, with one statement; return the others."""
+    if worker.superseded:
+        return list(held)
+    keys = {lease.task_id: task_key(lease.task_id) for lease in held}
+    states = {
+        (key, token): state
+        for batch in batches(key for key in keys.values() if key is not None)
+        for key, token, state in _RENEW.tuples(connection, {"b_keys": batch, "b_worker": worker.id, "b_until": until})
+    }
+    goes_on = {False: (TaskState.leased, TaskState.running), True: (TaskState.running,)}
+    return [lease for lease in held if states.get((keys[lease.task_id], lease.token)) not in goes_on[lease.started]]
 
 
 def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
