@@ -13,9 +13,9 @@ import json
 import logging
 import socket
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -60,73 +60,14 @@ GRACE_SECONDS = 3
 """Time that open requests (event streams) have to end after a signal [s]."""
 
 
-class LoopService(ABC):
-    """A background service: calls `run_once` in a thread, again and again, with pauses of `seconds` [s]."""
-
-    def __init__(self, context: Context, seconds: float) -> None:
-        self.context = context
-        self.seconds = seconds
-
-    @abstractmethod
-    def run_once(self) -> None:
-        """Do the work that is due."""
-
-    async def run(self) -> None:
-        """Loop until cancelled. An error is logged, and does not end the loop."""
-        while True:
-            await asyncio.sleep(self.seconds)
-            try:
-                await run_in_threadpool(self.run_once)
-            except Exception:  # for example a full disk
-                logger.exception("%s failed", type(self).__name__)
-
-
-class SweepService(LoopService):
-    """Takes back expired leases, retries tasks, and watches the store."""
-
-    def run_once(self) -> None:
-        """Sweep once."""
-        sweep(self.context)
-
-
-class CheckService(LoopService):
-    """Checks the files of existing datasets for the jobs that asked for them again."""
-
-    def run_once(self) -> None:
-        """Check the datasets of all waiting jobs."""
-        check_made_datasets(self.context)
-
-
-class PlanService(LoopService):
-    """Plans jobs of many samples."""
-
-    def __init__(self, context: Context, seconds: float) -> None:
-        super().__init__(context, seconds)
-        self._planner = Planner(context)
-
-    def run_once(self) -> None:
-        """Plan until nothing is left to plan."""
-        self._planner.run()
-
-
-class CancelService(LoopService):
-    """Gives up the tasks of cancelled jobs of many samples."""
-
-    def run_once(self) -> None:
-        """Give up what waits."""
-        give_up_waiting(self.context)
-
-
-class WebhookService(LoopService):
-    """Delivers job events to webhooks."""
-
-    def __init__(self, context: Context, seconds: float) -> None:
-        super().__init__(context, seconds)
-        self.delivery = WebhookDelivery(context.database, context.clock)
-
-    def run_once(self) -> None:
-        """Deliver all messages that are due."""
-        self.delivery.run()
+async def _repeat(run_once: Callable[[], object], seconds: float) -> None:
+    """Call a function in a thread, again and again, with pauses of `seconds` [s]. Log its errors, and go on."""
+    while True:
+        await asyncio.sleep(seconds)
+        try:
+            await run_in_threadpool(run_once)
+        except Exception:  # for example a full disk
+            logger.exception("a background service failed: %s", run_once)
 
 
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
@@ -138,13 +79,18 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(start, context)
         every = settings.sweep_seconds
-        webhooks = WebhookService(context, every)
-        services = [SweepService(context, every), CheckService(context, every), PlanService(context, PLAN_SECONDS)]
-        services.append(CancelService(context, PLAN_SECONDS))
-        running = [asyncio.create_task(service.run()) for service in (*services, webhooks)]
+        delivery = WebhookDelivery(context.database, context.clock)
+        services: list[tuple[Callable[[], object], float]] = [
+            (partial(sweep, context), every),
+            (partial(check_made_datasets, context), every),
+            (Planner(context).run, PLAN_SECONDS),
+            (partial(give_up_waiting, context), PLAN_SECONDS),
+            (delivery.run, every),
+        ]
+        running = [asyncio.create_task(_repeat(*service)) for service in services]
         running.append(asyncio.create_task(context.database.listen(context.notifier.notify)))
         yield
-        webhooks.delivery.stop()
+        delivery.stop()
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
