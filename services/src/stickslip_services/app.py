@@ -67,7 +67,7 @@ async def _repeat(run_once: Callable[[], object], seconds: float) -> None:
         try:
             await run_in_threadpool(run_once)
         except Exception:  # for example a full disk
-            logger.exception("a background service failed: %s", run_once)
+            logger.exception("a background service failed")
 
 
 def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
