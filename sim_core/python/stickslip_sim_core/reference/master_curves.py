@@ -8,11 +8,12 @@ definitions and figures: docs/protocols.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from math import gamma as gamma_function
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+from scipy.special import jv
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.reference import boundary_value, plate_buckling
@@ -69,16 +70,7 @@ def lateral_buckling_rod() -> float:
 
     [Prandtl 1899]: six times the first zero of the Bessel function J_{-1/6}.
     """
-    # z^{1/6} J_{-1/6}(z) up to a factor: sum_k a_k z^{2k} with a_k = (-1/4)^k / (k! Gamma(k + 5/6)).
-    k = np.arange(25)
-    coefficients = np.array(
-        [(-0.25) ** i / (gamma_function(i + 1.0) * gamma_function(i + 5.0 / 6.0)) for i in range(25)]
-    )
-    z = 2.0
-    for _ in range(8):  # Newton; quadratic from a start that is 7 % off
-        powers = z ** (2.0 * k)
-        z -= float(coefficients @ powers / (coefficients[1:] * 2.0 * k[1:] @ (powers[1:] / z)))
-    return 6.0 * z
+    return 6.0 * float(brentq(partial(jv, -1.0 / 6.0), 1.5, 2.5, xtol=1e-15))
 
 
 def lateral_buckling(aspect: ArrayLike, poisson: float) -> Floats:
@@ -429,13 +421,10 @@ def _capstan(mu: float, wrap: float, bending: float) -> float:
         lying = wrap - first - np.arccos(1.0 - bending / heavy)
         return float((heavy - bending - tail) / (light * np.exp(mu * lying)) - 1.0)
 
-    low, high = 1.0, 2.0
+    high = 2.0
     while missed(high) < 0.0:
         high *= 2.0
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if missed(middle) < 0.0 else (low, middle)
-    return 0.5 * (low + high)
+    return float(brentq(missed, 1.0, high, xtol=1e-14))
 
 
 @dataclass(frozen=True)

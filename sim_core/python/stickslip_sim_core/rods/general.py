@@ -107,17 +107,6 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
         raise ValueError(
             f"clamp_frame: must be a rotation, got R^T R - 1 = {error:.1e}, det {np.linalg.det(R).min():.3g}"
         )
-    # 4 q q^T is linear in R; its column of largest diagonal is the one without cancellation.
-    x, y, z = R[:, 0], R[:, 1], R[:, 2]
-    products = np.empty((n, 4, 4))
-    products[:, 0] = np.stack(
-        [1 + x[:, 0] + y[:, 1] + z[:, 2], z[:, 1] - y[:, 2], x[:, 2] - z[:, 0], y[:, 0] - x[:, 1]], 1
-    )
-    products[:, 1, 1:] = np.stack([1 + x[:, 0] - y[:, 1] - z[:, 2], x[:, 1] + y[:, 0], x[:, 2] + z[:, 0]], 1)
-    products[:, 2, 2:] = np.stack([1 - x[:, 0] + y[:, 1] - z[:, 2], y[:, 2] + z[:, 1]], 1)
-    products[:, 3, 3] = 1 - x[:, 0] - y[:, 1] + z[:, 2]
-    for i in range(4):
-        products[:, i, :i] = products[:, :i, i]
-    largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)
-    q = products[np.arange(n), largest]
-    return np.ascontiguousarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+    from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
+
+    return np.ascontiguousarray(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1)) if n else np.empty((0, 4))

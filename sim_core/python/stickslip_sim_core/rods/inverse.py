@@ -120,7 +120,10 @@ def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) ->
         if i % 2 == 1:
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
             frames.append(q)
-    return _rotation(np.stack(frames, axis=1))
+    from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
+
+    quaternions = np.roll(np.stack(frames, axis=1), -1, axis=2).reshape(-1, 4)
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(n, points, 3, 3)
 
 
 def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:
@@ -134,17 +137,6 @@ def _product(p: Floats, q: Floats) -> Floats:
     """Multiply quaternions (w, x, y, z), shape (n, 4)."""
     w = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(axis=1, keepdims=True)
     return np.concatenate([w, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])], axis=1)
-
-
-def _rotation(q: Floats) -> Floats:
-    """Rotation matrices of unit quaternions, shape (..., 4) to (..., 3, 3)."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
