@@ -75,7 +75,8 @@ def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any
     """
     files = Physics.files(physics)
     arrays = {place: read_file(place, read(name.removeprefix(ARTIFACT))) for place, name in files}
-    return with_values(physics.model_dump(mode="json", include=set(Physics.model_fields)), arrays)
+    found: dict[str, Any] = with_values(physics.model_dump(mode="json", include=set(Physics.model_fields)), arrays)
+    return found
 
 
 def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
