@@ -350,18 +350,6 @@ class Cloth:
         found: Floats = x + s * s * (3.0 - 2.0 * s) * way + h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
         return found
 
-    def body_forces(self, count: int) -> Floats:
-        """Return the forces of the first `count` bodies on the cloth in the last step (count, 3) [N]."""
-        pairs, contacts, reactions = self.pair_forces, self.contacts, self.reactions
-        free = np.setdiff1d(np.arange(len(contacts)), self.held)
-        on_cloth = (pairs.weights * (pairs.vertices < len(contacts))).sum(axis=1)[:, None] * pairs.forces
-        return np.stack(
-            [
-                reactions[free][contacts[free] == body].sum(axis=0) + on_cloth[pairs.body == body].sum(axis=0)
-                for body in range(count)
-            ]
-        )
-
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
