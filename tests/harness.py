@@ -131,6 +131,10 @@ class Service:
             if pid != os.getpid() and any(place in command_line(pid) + log_of(pid) for place in places)
         ]
 
+    def wait_for_end(self) -> None:
+        """Expect that all processes end by themselves."""
+        wait_for("the end of all processes", lambda: None if self.all_processes() else True, 10)
+
     def get(self, path: str) -> Any:
         """Return the JSON of a GET."""
         response = httpx.get(self.url + path, timeout=30)

@@ -72,6 +72,8 @@ class Services:
             NAME,
             "--key-file",
             self.store.parent / "worker-key",
+            "--max-cpus",  # so that one can kill it in the middle of a job, however many there are
+            "1",
         )
         self._wait_for_line(log, "registered as")
         return process
@@ -80,7 +82,7 @@ class Services:
         spec = {
             "kind": "rod_hang",
             "axes": {"gamma": {"type": "linspace", "start": 100.0, "stop": 900.0, "num": count}, "phi0": 2, "phi1": 8},
-            "samples_per_shard": 4,
+            "samples_per_shard": 8,
             "quality": "draft",
         }
         for axis in ("phi0", "phi1"):
@@ -119,11 +121,11 @@ def _processes() -> list[int]:
 
 def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> None:
     first = services.dispatch("first")
-    job = services.submit(12)
+    job = services.submit(24)
 
     def some_rendered() -> bool | None:
-        counts = services.job(job)["progress"]["stages"]["render"]["counts"]
-        return True if 1 < counts.get("succeeded", 0) < 12 else None
+        stages = services.job(job)["progress"]["stages"]  # empty before the dispatcher says what it makes
+        return True if 1 < stages.get("render", {"counts": {}})["counts"].get("succeeded", 0) < 24 else None
 
     _wait_for("some renders", some_rendered)
     assert _processes()
@@ -136,8 +138,8 @@ def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> 
     version = services.store / "datasets" / done["dataset"]["dataset"] / f"v{done['dataset']['version']}"
     group = zarr.open_group(version, mode="r")
     assert group["valid"][...].all()
-    assert (group["views"][...].reshape(12, -1).max(axis=1) > 0).all()
+    assert (group["views"][...].reshape(24, -1).max(axis=1) > 0).all()
 
     second.send_signal(signal.SIGTERM)
-    assert second.wait(timeout=20) == 0
-    _wait_for("the end of Ray's processes", lambda: True if not _processes() else None, 5)
+    assert second.wait(timeout=30) == 0
+    _wait_for("the end of Ray's processes", lambda: True if not _processes() else None, 10)

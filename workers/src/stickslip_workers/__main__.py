@@ -134,12 +134,12 @@ def _dispatch(options: argparse.Namespace) -> int:
     from stickslip_workers.starting import StartError
 
     address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
-    head: subprocess.Popen[bytes] | None = None
     if address is None and data is None:
         data = Path(settings.name)
         command = [sys.executable, "-m", "stickslip_workers", "head", "--ray-data", str(data)]
         command += [] if settings.max_cpus is None else ["--cpus", str(settings.max_cpus)]
-        head = subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
+        # It ends after this process: Ray aborts a driver whose head ends at the same time.
+        subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
     place = Place(address, None if data is None else own_directory(data))
     stopped_early = False
     dispatcher: Dispatcher | None = None
@@ -166,8 +166,6 @@ def _dispatch(options: argparse.Namespace) -> int:
         return 1
     finally:
         tracing.stop()
-        if head is not None:
-            head.terminate()
     return 0
 
 

@@ -10,8 +10,9 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
-RECONNECT_SECONDS = "15"
-"""How long Ray looks for a head that is gone; then it ends the driver, and another one is started."""
+RECONNECT_SECONDS, OWN_RECONNECT_SECONDS = "15", "2"
+"""How long Ray looks for a head that is gone; then it ends the driver, and another one is started [s]. The next head of
+this machine has another port."""
 
 RETRY_SECONDS = 1.0
 """Time between two attempts to connect [s]."""
@@ -28,7 +29,8 @@ class Place:
         """Wait until Ray answers, and become a driver of it."""
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"  # a call after the end must not start a cluster
-        os.environ.setdefault("RAY_gcs_rpc_server_reconnect_timeout_s", RECONNECT_SECONDS)
+        seconds = RECONNECT_SECONDS if self.directory is None else OWN_RECONNECT_SECONDS
+        os.environ.setdefault("RAY_gcs_rpc_server_reconnect_timeout_s", seconds)
         if self.directory is not None:
             # With 0, Ray does not take another address of this machine for loopback.
             os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}

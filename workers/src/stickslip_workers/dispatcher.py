@@ -8,7 +8,8 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from concurrent.futures import Future
 from typing import Any
 
 from stickslip_schemas import tracing
@@ -81,12 +82,12 @@ class Dispatcher:
     def run(self) -> None:
         """Work until stopped."""
         try:
-            self._described = self._await(lambda: find_builds(self._settings)) or {}
+            begin, connected = time.monotonic(), in_thread(self._place.connect)
+            self._described = self._await(in_thread(lambda: find_builds(self._settings))) or {}
             if self._heartbeat is not None:
                 self._heartbeat.session_lost.set()  # now it can say what it makes
-            begin = time.monotonic()
             self._status.reason = lambda: f"waiting for Ray: {time.monotonic() - begin:.0f} s, {self._place.trouble()}"
-            self._await(self._place.connect)
+            self._await(connected)
             if not self._stopping:
                 calls = self._calls = Calls(
                     self._settings, {who: said["builds"] for who, said in self._described.items()}
@@ -107,9 +108,8 @@ class Dispatcher:
 
     # --- the start ------------------------------------------------------------------------------------------
 
-    def _await(self, work: Callable[[], Any]) -> Any:
-        """Do something in another thread while this one keeps the session; return what it returns."""
-        done = in_thread(work)
+    def _await(self, done: "Future[Any]") -> Any:
+        """Keep the session until something is done; return what it gave."""
         while not (self._stopping or done.done()):
             self._keep_session()
             time.sleep(0.05)
