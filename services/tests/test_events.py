@@ -16,7 +16,7 @@ from stickslip_services.queue.jobs import show_job
 from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods
-from stickslip_testing.servers import serving
+from stickslip_testing.servers import serving, wait_until
 from stickslip_testing.worker import DirectApi, PretendWorker, failure
 
 pytestmark = pytest.mark.databases
@@ -162,3 +162,20 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
         assert ids == [number for number in everything if int(number) > int(last_id or 0)]
     assert len(looks) < len(threads) * 3
     assert app.state.feeds._feeds == {}  # nobody watches any more
+
+
+def test_an_address_has_only_so_many_streams(
+    client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stickslip_services.api.sse.MOST_STREAMS", 2)
+    path = f"/v1/jobs/{client.post('/v1/jobs', json=rods(gamma=(77.0,))).json()['id']}/events"
+    with client.stream("GET", path), client.stream("GET", path):
+        for refused in (client.get(path), client.get("/ui/changes")):
+            assert (refused.status_code, refused.json()["code"]) == (429, "too_many_streams")
+        assert client.get("/v1/jobs").status_code == 200
+
+    def is_free() -> bool:
+        with client.stream("GET", path) as again:
+            return again.status_code == 200
+
+    wait_until(is_free, seconds=5)

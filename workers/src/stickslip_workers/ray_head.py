@@ -9,6 +9,7 @@ import os
 import secrets
 import shutil
 import socket
+import stat
 import sys
 import tempfile
 from contextlib import ExitStack
@@ -40,8 +41,9 @@ def own_directory(data: Path) -> Path:
     root = Path(tempfile.gettempdir())
     root = (root if len(str(root)) <= 20 else Path("/tmp")) / f"stickslip-ray-{os.getuid()}"
     root.mkdir(mode=0o700, exist_ok=True)
-    if root.stat().st_uid != os.getuid():
-        raise PermissionError(f"{root} must belong to this user")
+    there = root.lstat()
+    if there.st_uid != os.getuid() or not stat.S_ISDIR(there.st_mode) or there.st_mode & 0o077:
+        raise PermissionError(f"{root} must be a directory of this user, which others cannot enter, and no link")
     return root / sha256(str(data).encode())[:8]
 
 

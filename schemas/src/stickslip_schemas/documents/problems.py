@@ -37,6 +37,7 @@ class ProblemCode(StrEnum):
     unknown_worker = "unknown_worker"
     storage_error = "storage_error"
     busy = "busy"
+    too_many_streams = "too_many_streams"
     too_slow = "too_slow"
     internal_error = "internal_error"
 

@@ -7,13 +7,19 @@ carries that of the event before it.
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
+from starlette.types import ASGIApp, Receive, Scope, Send
+from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.documents.responses import EventName, JobProgressEvent
 
+from stickslip_services.access.asker import this_asker
+from stickslip_services.api.problems import ProblemError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import StoredEvent, read_events
 from stickslip_services.queue.jobs import show_job
@@ -23,6 +29,8 @@ KEEP_ALIVE_SECONDS = 15.0
 PROGRESS_SECONDS = 1.0
 LOOK_SECONDS = 0.2
 BATCH = 200
+MOST_STREAMS = 500
+"""Event streams of one key, and of one address: a quarter of all connections."""
 KEPT_EVENTS = 1000
 """Number of events that a feed keeps in memory; older ones are read from the database."""
 
@@ -42,6 +50,27 @@ OPENAPI = {
 }
 
 
+class EventStream(StreamingResponse):
+    """A stream of events; 429 where its key or its address has as many as it may."""
+
+    _open: ClassVar[Counter[tuple[ASGIApp, str]]] = Counter()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the stream."""
+        address = scope["client"][0] if scope["client"] else "no address"
+        places = {(scope["app"], f"key {this_asker().name}"), (scope["app"], f"address {address}")}
+        for place in places:
+            if self._open[place] >= MOST_STREAMS:
+                detail = f"the {place[1]} has {MOST_STREAMS} event streams, and may have no more: close some"
+                headers = {"Retry-After": "60"}
+                raise ProblemError(429, ProblemCode.too_many_streams, detail, headers=headers)
+        self._open.update(places)
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._open.subtract(places)
+
+
 class Feeds:
     """The feeds of watched jobs, for one event loop."""
 
@@ -52,7 +81,7 @@ class Feeds:
     def stream(self, job: int, *, after: int) -> StreamingResponse:
         """Answer with the events of a job after the one with the id `after`."""
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # no proxy may buffer events
-        return StreamingResponse(self._watch(job, after), headers=headers, media_type="text/event-stream")
+        return EventStream(self._watch(job, after), headers=headers, media_type="text/event-stream")
 
     async def _watch(self, job: int, cursor: int) -> AsyncIterator[bytes]:
         feed = self._feeds.get(job)

@@ -40,7 +40,7 @@ _TITLES = {
     415: "The `Content-Type` of the body is not JSON",
     416: "The range lies outside the file",
     422: "The request breaks a rule; `errors` lists the fields, rules and values",
-    429: "The project of the key has as much in flight as it may have; `errors` names the rule and the value",
+    429: "The project of the key has as much in flight as it may have, or the key or the address as many streams",
     500: "The coordinator failed; its log says more",
     503: "The coordinator is busy or cannot reach its database; try again later",
 }

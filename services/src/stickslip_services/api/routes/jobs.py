@@ -177,7 +177,7 @@ def get_previews(job_id: str, context: ContextDep) -> list[Preview]:
             ),
             "content": {"text/event-stream": STREAM},
         },
-        **problem_responses(404, 422),
+        **problem_responses(404, 422, 429),
     },
 )
 def get_events(

@@ -6,7 +6,6 @@ from typing import Any
 
 import yaml
 from fastapi import APIRouter, Response
-from fastapi.responses import StreamingResponse
 from sqlalchemy import Connection
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
@@ -15,6 +14,7 @@ from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.routes.pages.common import html_page
+from stickslip_services.api.sse import EventStream
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
@@ -144,9 +144,9 @@ def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
 
 
 @router.get("/ui/changes")
-def get_changes(context: ContextDep) -> StreamingResponse:
+def get_changes(context: ContextDep) -> EventStream:
     """Send an event to a page after each change of the database, at most once a second, without reading it."""
-    return StreamingResponse(_changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
+    return EventStream(_changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
 
 
 async def _changes(context: Context) -> AsyncIterator[bytes]:
