@@ -18,6 +18,7 @@ from stickslip_schemas.kinds import AnyJobSpec
 RELATIONS = (
     "low must be less than high",
     "start and stop must differ",
+    "must differ unless axes are zipped",
     "train + validation + test must be 1",
     "axes that are zipped must have one length",
     "a job has at most",
