@@ -93,9 +93,9 @@ def test_examples_are_specs(name: str, kind: type, count: int) -> None:
         (changed(RODS, "/axes/phi0", []), "/axes/phi0", "at least 1 item", "[]"),
         (
             changed(RODS, "/axes/phi0", [1, 2, 1.0]),
-            "",
-            "phi0 must differ unless axes are zipped, and 1.0 is there twice",
-            "",
+            "/axes/phi0",
+            "values must differ unless axes are zipped, and 1.0 is there twice",
+            "[1.0, 2.0, 1.0]",
         ),
         (changed(RODS, "/axes/gamma/num", 10**12), "/axes/gamma/num", "less than or equal to 1000000", str(10**12)),
         (changed(RODS, "/axes/gamma/num", 0), "/axes/gamma/num", "greater than or equal to 1", "0"),

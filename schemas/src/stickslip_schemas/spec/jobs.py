@@ -9,7 +9,8 @@ from functools import cached_property
 from math import prod
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base.document import Document, Float, Int
 from stickslip_schemas.base.keys import Sha256, content_key, derived_seed, placed
@@ -277,7 +278,10 @@ class JobSpec(Document):
         for name, axis in self.named_axes.items() if self.combine == "product" else ():
             if isinstance(axis, ListAxis) and len(set(axis.values)) < axis.num:
                 twice = next(value for value in axis.values if axis.values.count(value) > 1)
-                raise ValueError(f"values of {name} must differ unless axes are zipped, and {twice!r} is there twice")
+                rule = "values must differ unless axes are zipped, and {twice} is there twice"
+                broken = PydanticCustomError("value_error", rule, {"twice": repr(twice)})
+                details = InitErrorDetails(type=broken, loc=("axes", name), input=axis.values)
+                raise ValidationError.from_exception_data(type(self).__name__, [details])
         if self.sample_count > MAX_SAMPLES:
             raise ValueError(f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}")
         return self

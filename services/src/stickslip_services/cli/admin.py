@@ -146,7 +146,7 @@ def _limit(value: int | None) -> str:
 @shows_errors
 def create_webhook(
     url: Annotated[str, typer.Argument(help="receiver of the events: https://..., or http:// on this machine")],
-    project: Annotated[str, typer.Option(help="project whose jobs it is told of; default: jobs without one")] = "",
+    project: Annotated[str, typer.Option(help="project whose jobs it hears of; default: jobs without one")] = "",
     data: DataOption = DEFAULT_DATA,
     database: DatabaseOption = None,
 ) -> None:

@@ -39,7 +39,7 @@ def cancel_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> Jo
 
 
 def give_up_waiting(context: Context) -> None:
-    """Give up what is left of the waiting tasks of cancelled jobs, piece by piece, with pauses for other writers."""
+    """Give up the remaining waiting tasks of cancelled jobs, piece by piece, with pauses for other writers."""
     left = select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1)
     while not context.is_closing:
         with context.database.read() as connection:
