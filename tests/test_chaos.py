@@ -179,7 +179,7 @@ def test_ray_listens_on_loopback_and_is_replaced_at_once_when_it_dies(service: S
             new = session()
             return None if new == old else new
 
-        before = wait_for(f"a worker after the death of {part}", replaced, 30)
+        before = wait_for(f"a worker after the death of {part}", replaced, 45)
 
 
 RODS = 100

@@ -83,10 +83,10 @@ class Dispatcher:
         """Work until stopped."""
         try:
             begin, connected = time.monotonic(), in_thread(self._place.connect)
+            self._status.reason = lambda: f"waiting for Ray: {time.monotonic() - begin:.0f} s, {self._place.trouble()}"
             self._described = self._await(in_thread(lambda: find_builds(self._settings))) or {}
             if self._heartbeat is not None:
                 self._heartbeat.session_lost.set()  # now it can say what it makes
-            self._status.reason = lambda: f"waiting for Ray: {time.monotonic() - begin:.0f} s, {self._place.trouble()}"
             self._await(connected)
             if not self._stopping:
                 calls = self._calls = Calls(
