@@ -129,7 +129,7 @@ def test_runs_what_it_is_given_and_says_who_it_is(
     assert (store.dataset_path(made.publish_task.dataset, 1) / "manifest.json").exists()
     starting, registration = double.registrations
     assert (starting.builds, starting.condition.state) == ({}, "starting")
-    assert starting.condition.reason == "it looks for its builds"
+    assert starting.condition.reason.startswith("waiting for Ray: ")
     assert {name: builds.render for name, builds in registration.builds.items()} == {"rod_hang": fake_renderer.BUILD}
     assert double.condition.state == "ready"
     assert double.condition.slots == 2
