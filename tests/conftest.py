@@ -79,4 +79,4 @@ def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
         )
         database = connect(Settings.chosen(data=tmp_path, store=BUCKET), Role.visitor)
         stack.callback(database.close)
-        yield Lab(database, client)
+        yield Lab(database, client, tmp_path)

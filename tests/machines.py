@@ -90,9 +90,15 @@ class Machine:
         ip("link", "set", "eth0", "up", within=self._holder)
         stack.callback(self.kill)
 
-    def start(self, command: Collection[str], log: Path) -> None:
-        """Let the machine do something; what it says goes to a file. Files of /tmp/ray are its own."""
+    def start(self, command: Collection[str], log: Path, is_pod: bool = False) -> None:
+        """Let the machine do something; what it says goes to a file. Files of /tmp/ray are its own.
+
+        A pod starts again where its command ends, as Kubernetes starts its container again.
+        """
         inside = ["nsenter", f"--net=/proc/{self._holder}/ns/net", "--"]
+        if is_pod:
+            again = 'while :; do "$@"; sleep 2; done'
+            inside += ["unshare", "--pid", "--fork", "--kill-child", "sh", "-c", again, "pod"]
         alone = ["unshare", "--pid", "--mount", "--mount-proc", "--uts", "--fork", "--kill-child"]
         script = 'hostname "$0" && mkdir -p /tmp/ray && mount -t tmpfs tmpfs /tmp/ray && exec "$@"'
         named = ["sh", "-c", script, self.name]
@@ -133,7 +139,8 @@ def dispatch(name: str, place: Path) -> list[str]:
 class Lab:
     """What the test sees of the queue."""
 
-    def __init__(self, database: Database, client: httpx.Client) -> None:
+    def __init__(self, database: Database, client: httpx.Client, logs: Path) -> None:
+        self._logs = logs
         self._database = database
         self._http = client
         self.jobs: list[str] = []
@@ -187,7 +194,13 @@ class Lab:
             self.keep_busy()
             return True if is_so() else None
 
-        wait_for(what, probe, seconds)
+        try:
+            wait_for(what, probe, seconds)
+        except AssertionError as error:
+            for log in sorted(self._logs.glob("*.log")):
+                lines = log.read_text(errors="replace").splitlines()[-15:]
+                error.add_note("\n".join([f"{log.name}:", *(line[:200] for line in lines)]))
+            raise
         return time.monotonic() - begin
 
     def finished(self) -> list[str]:

@@ -101,8 +101,8 @@ def test_the_ray_cluster_of_the_chart_works(
                 command += [here, "--head", "--port=6379", *head]
             elif name == "driver":
                 command = [*container["command"], script.replace("ray start", f"ray start {here}")]
-            machine.start(command, tmp_path / f"{name}.log")
-        lab.wait("work of the cluster", lambda: lab.done("demo-ray") > 20)
+            machine.start(command, tmp_path / f"{name}.log", is_pod=True)
+        lab.wait("work of the cluster", lambda: lab.done("demo-ray") > 20, 400)
         # What `ray status` asks; this process is no node of the cluster.
         from ray._raylet import GcsClient  # type: ignore[attr-defined]
 
