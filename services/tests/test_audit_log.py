@@ -10,7 +10,7 @@ from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
 from stickslip_services.access.asker import NOBODY, Asker, asking
 from stickslip_services.access.audit_log import read_audit_log
-from stickslip_services.access.keys import create_key, revoke_key
+from stickslip_services.access.keys import create_key, revoke_key, sealer
 from stickslip_services.access.scopes import Scope
 from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
 from stickslip_services.app import make_app
@@ -69,7 +69,7 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
     with asking(Asker("user ada")), context.database.write() as connection:
         key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
         revoke_key(connection, key.id, 2.0)
-        hook, sign = create_webhook(connection, "https://example.org/hook", 3.0)
+        hook, sign = create_webhook(connection, sealer(context.settings), "https://example.org/hook", 3.0)
         retry_webhook(connection, hook.id, 4.0)
         delete_webhook(connection, hook.id, 5.0)
     found = lines(context)

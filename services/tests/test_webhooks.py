@@ -13,8 +13,11 @@ from typing import Any
 
 import httpx
 import pytest
+from cryptography.fernet import Fernet
+from sqlalchemy import select
 from standardwebhooks import Webhook as Verifier
 from stickslip_services.access import webhooks
+from stickslip_services.access.keys import sealer
 from stickslip_services.access.webhooks import (
     CLAIM_SECONDS,
     GIVE_UP_SECONDS,
@@ -25,6 +28,7 @@ from stickslip_services.access.webhooks import (
     retry_webhook,
 )
 from stickslip_services.cli import app
+from stickslip_services.database import tables
 from stickslip_services.errors import SettingsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.submit import submit_job
@@ -79,13 +83,13 @@ def receiver() -> Iterator[Receiver]:
 @pytest.fixture
 def messenger(context: Context, monkeypatch: pytest.MonkeyPatch) -> WebhookDelivery:
     monkeypatch.setattr(webhooks, "WAIT_SECONDS", 20.0)  # a busy machine must not leave a delivery for later
-    return WebhookDelivery(context.database, context.clock)
+    return WebhookDelivery(context.database, context.clock, sealer(context.settings))
 
 
 def made(context: Context, url: str) -> tuple[str, str]:
     """Make a webhook; return its id and its secret."""
     with context.database.write() as connection:
-        webhook, secret = create_webhook(connection, url, context.clock())
+        webhook, secret = create_webhook(connection, sealer(context.settings), url, context.clock())
     return webhook.id, secret
 
 
@@ -176,7 +180,7 @@ def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one
 ) -> None:
     made(context, receiver.url)
     run_job(context, worker, 1.0)
-    other = WebhookDelivery(context.database, context.clock)
+    other = WebhookDelivery(context.database, context.clock, sealer(context.settings))
     with messenger._claimed(1) as is_ours:  # and here it is killed
         assert is_ours
     other.run()
@@ -188,6 +192,30 @@ def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one
     for thread in threads:
         thread.join()
     assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+
+
+def test_a_copy_of_the_database_has_no_secret(
+    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
+) -> None:
+    name, secret = made(context, receiver.url)
+    with context.database.read() as connection:
+        sealed = connection.scalar(select(tables.webhooks.c.secret).where(tables.webhooks.c.id == name))
+    assert sealed is not None
+    assert secret.removeprefix("whsec_") not in sealed
+    assert sealer(context.settings).decrypt(sealed).decode() == secret
+    assert (context.settings.data / "secrets-key").stat().st_mode & 0o777 == 0o600
+    run_job(context, worker, 1.0)
+    WebhookDelivery(context.database, context.clock, Fernet(Fernet.generate_key())).run()
+    wait_until(lambda: "sealed with another secrets key" in fault_of(context, name), seconds=5)
+    assert receiver.told == []
+    clock.advance(WAITS[0])
+    messenger.run()
+    assert receiver.told != []
+
+
+def fault_of(context: Context, name: str) -> str:
+    with context.database.read() as connection:
+        return next(one.fault for one in list_webhooks(connection, context.clock()) if one.id == name)
 
 
 def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
@@ -222,11 +250,7 @@ def test_a_receiver_that_trickles_holds_up_no_other(
         wait_until(lambda: [one for one in receiver.told if one[1] != "queued"] == ONE_JOB, seconds=1)
         assert time.monotonic() - began < 1.4
 
-        def fault() -> str:
-            with context.database.read() as connection:
-                return next(one.fault for one in list_webhooks(connection, clock()) if one.id == slow_hook)
-
-        wait_until(lambda: "did not answer within 1.5 s" in fault(), seconds=5)
+        wait_until(lambda: "did not answer within 1.5 s" in fault_of(context, slow_hook), seconds=5)
 
 
 def trickle(server: socket.socket) -> None:

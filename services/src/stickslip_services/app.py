@@ -26,7 +26,7 @@ from starlette.staticfiles import StaticFiles
 from stickslip_schemas import tracing
 
 from stickslip_services import __version__
-from stickslip_services.access.keys import KeyRing, local_worker_key
+from stickslip_services.access.keys import KeyRing, sealer, secret_in
 from stickslip_services.access.webhooks import WebhookDelivery
 from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
@@ -74,12 +74,13 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     """Return the application; the database is migrated when it starts."""
     context = Context.open(settings, clock)
     metrics = Metrics(context)
+    sealing = sealer(settings)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(start, context)
         every = settings.sweep_seconds
-        delivery = WebhookDelivery(context.database, context.clock)
+        delivery = WebhookDelivery(context.database, context.clock, sealing)
         services: list[tuple[Callable[[], object], float]] = [
             (partial(sweep, context), every),
             (partial(check_made_datasets, context), every),
@@ -109,7 +110,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.context = context
     app.state.metrics = metrics
     app.state.feeds = Feeds(context)
-    app.state.worker_key = local_worker_key(settings.worker_key_path)
+    app.state.worker_key = secret_in(settings.worker_key_path)
     routers = [module.router for module in (jobs, uploads, datasets, certificates, workers, health, pages)]
     for router in routers:
         app.include_router(router)

@@ -24,6 +24,8 @@ class Settings(BaseSettings):
     """Place of the store, a directory or `s3://BUCKET/PREFIX`; null: `data/store`."""
     database: SecretStr | None = None
     """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`; null: a SQLite file in `data`."""
+    secrets_key: SecretStr | None = None
+    """Key that seals secrets in the database, 32 bytes in base64; null: that of the file `data/secrets-key`."""
     host: str = "127.0.0.1"
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
 

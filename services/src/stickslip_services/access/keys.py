@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from cryptography.fernet import Fernet
 from sqlalchemy import Connection, insert, select, update
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
@@ -21,7 +22,8 @@ from stickslip_services.access.scopes import Scope, check_project
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys
-from stickslip_services.errors import NotFoundError
+from stickslip_services.errors import NotFoundError, SettingsError
+from stickslip_services.settings import Settings
 
 LOCAL_WORKER = "local-worker"
 """Name of the key in the file `worker-key` of the data directory."""
@@ -78,23 +80,33 @@ def revoke_key(connection: Connection, key_id: str, now: float) -> None:
     note(connection, "key.revoke", key_id, now)
 
 
-def local_worker_key(path: Path) -> str:
-    """Return the secret in the key file of local workers; make the file where it is missing, readable by its owner."""
+def secret_in(path: Path) -> str:
+    """Return the secret in a key file; make the file where it is missing, readable by its owner alone."""
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_durably(path, f"{secrets.token_urlsafe(32)}\n".encode(), mode=0o600)
     return path.read_text(encoding="ascii").strip()
 
 
+def sealer(settings: Settings) -> Fernet:
+    """Return the cipher of secrets that the database keeps sealed; raise SettingsError for a key of another form."""
+    given = settings.secrets_key
+    key = secret_in(settings.data / "secrets-key") if given is None else given.get_secret_value()
+    try:
+        return Fernet(key.rstrip("=") + "=")
+    except ValueError:
+        raise SettingsError("the secrets key must be 32 bytes in base64, as `openssl rand -base64 32` makes") from None
+
+
 def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
     """Register the secret of the local workers as a key of the scope `work`; replace a revoked one."""
-    digest = sha256(local_worker_key(path).encode())
+    digest = sha256(secret_in(path).encode())
     row = connection.execute(select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)).one_or_none()
     if row is not None and row.revoked_at is not None:
         path.unlink()
         row = None
     if row is None:
-        _insert(connection, LOCAL_WORKER, (Scope.work,), local_worker_key(path), now)
+        _insert(connection, LOCAL_WORKER, (Scope.work,), secret_in(path), now)
 
 
 class KeyRing:

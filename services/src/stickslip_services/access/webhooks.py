@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 import httpx
+from cryptography.fernet import Fernet, InvalidToken
 from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select, update
 from standardwebhooks import Webhook as Signer
 from stickslip_schemas.documents.responses import EventName
@@ -68,8 +69,10 @@ class Webhook:
     is_given_up: bool
 
 
-def create_webhook(connection: Connection, url: str, now: float, *, project: str = "") -> tuple[Webhook, str]:
-    """Make a webhook for events of the jobs of a project from now on; return it and its secret.
+def create_webhook(
+    connection: Connection, sealing: Fernet, url: str, now: float, *, project: str = ""
+) -> tuple[Webhook, str]:
+    """Make a webhook for events of the jobs of a project from now on; return it and its secret, which is kept sealed.
 
     Raises SettingsError for a bad URL, ValueError for a bad project.
     """
@@ -82,7 +85,7 @@ def create_webhook(connection: Connection, url: str, now: float, *, project: str
             id=name,
             project=check_project(project),
             url=url,
-            secret=secret,
+            secret=sealing.encrypt(secret.encode()).decode(),
             position=last,
             next_at=now,
             failures=0,
@@ -129,9 +132,10 @@ def delete_webhook(connection: Connection, webhook_id: str, now: float) -> None:
 class WebhookDelivery:
     """Delivers messages; several coordinators may do so on one database."""
 
-    def __init__(self, database: Database, clock: Clock) -> None:
+    def __init__(self, database: Database, clock: Clock, sealing: Fernet) -> None:
         self._database = database
         self._clock = clock
+        self._sealing = sealing
         self._stopping = threading.Event()
 
     def stop(self) -> None:
@@ -181,7 +185,11 @@ class WebhookDelivery:
             with self._database.write() as connection:
                 connection.execute(place.values(next_at=self._clock()))
             return False
-        fault = _send(row.url, row.secret, f"msg_{row.id}_{message.event}", message.body, self._clock())
+        try:
+            secret = self._sealing.decrypt(row.secret.encode()).decode()
+            fault = _send(row.url, secret, f"msg_{row.id}_{message.event}", message.body, self._clock())
+        except InvalidToken:
+            fault = "its secret is damaged, or was sealed with another secrets key: make the webhook again"
         now = self._clock()
         if not fault:
             told = {"position": message.event, "failures": 0, "failing_since": None, "fault": ""}

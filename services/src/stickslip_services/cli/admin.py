@@ -152,9 +152,12 @@ def create_webhook(
 ) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
     with _visited(data, database) as connection:
+        from stickslip_services.access.keys import sealer
         from stickslip_services.access.webhooks import create_webhook
+        from stickslip_services.settings import Settings
 
-        webhook, secret = create_webhook(connection, url, time.time(), project=project)
+        sealing = sealer(Settings.chosen(data=data))
+        webhook, secret = create_webhook(connection, sealing, url, time.time(), project=project)
     typer.echo(secret)
     say(f"{webhook.id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
 

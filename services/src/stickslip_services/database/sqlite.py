@@ -48,7 +48,7 @@ class SqliteDatabase(Database):
 
 
 def _close_to_others(path: Path) -> None:
-    """Let nobody but the owner read the data directory and the database, which holds secrets of webhooks.
+    """Let nobody but the owner read the data directory and the database.
 
     SQLite gives its log the permissions of the database.
     """

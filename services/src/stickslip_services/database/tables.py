@@ -338,7 +338,7 @@ webhooks = Table(
     Column("id", String, nullable=False, unique=True),
     Column("project", String, nullable=False),
     Column("url", String, nullable=False),
-    Column("secret", String, nullable=False),  # signing needs it as it is
+    Column("secret", String, nullable=False),  # sealed (access/keys.py)
     Column("position", _Wide, nullable=False),  # id of the last event that was delivered, or needs no delivery
     Column("next_at", Float, nullable=False),  # when to try again; ahead, while a coordinator is at it
     Column("failures", Integer, nullable=False),  # tries in a row that failed

@@ -19,7 +19,7 @@ def locked(data: Path) -> Iterator[int]:
     Yield the file descriptor of the lock. Child processes inherit it, so the lock is held until the last one ends.
     Raise DatabaseRefusedError if another process holds it.
     """
-    data.mkdir(parents=True, exist_ok=True)
+    data.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = data / "lock"
     with path.open("a+") as file:
         deadline = time.monotonic() + 10

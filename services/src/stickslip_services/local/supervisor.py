@@ -23,7 +23,7 @@ from typing import IO
 import httpx
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.addresses import DATABASE_VARIABLE, PRIVATE_VARIABLES
 from stickslip_services.errors import SupervisorError
 from stickslip_services.local.process import listen, locked
 from stickslip_services.settings import Settings
@@ -58,8 +58,8 @@ class _Child:
     command: list[str]
     log: Path
     inherited: tuple[int, ...] = ()
-    database: str | None = None
-    """URL of the database with its password, passed in the environment of the process."""
+    private: dict[str, str] = field(default_factory=dict)
+    """Variables with secrets, for this process only."""
     process: subprocess.Popen[bytes] | None = None
     started_at: float = 0.0
     failed_starts: int = 0
@@ -67,9 +67,7 @@ class _Child:
 
     def start(self) -> None:
         """Start in a new session, so that Ctrl-C reaches only the supervisor, which stops children in order."""
-        environment = {name: value for name, value in os.environ.items() if name != DATABASE_VARIABLE}
-        if self.database is not None:
-            environment[DATABASE_VARIABLE] = self.database
+        others = {name: value for name, value in os.environ.items() if name not in PRIVATE_VARIABLES}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 self.command,
@@ -79,7 +77,7 @@ class _Child:
                 start_new_session=True,
                 preexec_fn=_die_with_parent,
                 pass_fds=self.inherited,
-                env=environment,
+                env=others | self.private,
             )
         self.started_at = time.monotonic()
 
@@ -155,7 +153,8 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
             _coordinator_command(settings, listener.fileno()),
             data / "logs" / "coordinator.log",
             (lock, listener.fileno()),
-            None if settings.database is None else settings.database.get_secret_value(),
+            {name: os.environ[name] for name in PRIVATE_VARIABLES if name in os.environ}
+            | ({} if settings.database is None else {DATABASE_VARIABLE: settings.database.get_secret_value()}),
         )
         ray = _Child("ray", _ray_command(service, data), data / "logs" / "ray.log")
         dispatcher = _Child("dispatcher", _dispatcher_command(service, settings), data / "logs" / "dispatcher.log")
