@@ -34,13 +34,12 @@ WhereOption = Annotated[
     list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
 ]
 
-app = typer.Typer(add_completion=False)
+datasets = typer.Typer(help="List datasets and their versions, newest first.")
 
 
-@app.callback(invoke_without_command=True)
+@datasets.callback(invoke_without_command=True)
 @shows_errors
-def datasets(context: typer.Context, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """List datasets and their versions, newest first."""
+def _list(context: typer.Context, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
     if context.invoked_subcommand is not None:
         return None
     with Client(url) as client:
@@ -103,7 +102,7 @@ def pull_dataset(
     say(f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}")
 
 
-@app.command("diff")
+@datasets.command("diff")
 @shows_errors
 def diff(
     a: Annotated[str, typer.Argument(metavar="A", help="DATASET[:vN], or a directory")],

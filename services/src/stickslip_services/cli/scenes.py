@@ -19,7 +19,7 @@ from stickslip_services.cli.specs import read_scene
 from stickslip_services.local import certifying, simulating
 from stickslip_services.units import size
 
-app = typer.Typer(help="Check and preview scenes.", no_args_is_help=True)
+scenes = typer.Typer(help="Check and preview scenes.", no_args_is_help=True)
 
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="a scene, YAML or JSON, or the name of a built-in one")
@@ -60,7 +60,7 @@ def simulate(
     raise typer.Exit(0 if result["valid"] else 1)
 
 
-@app.command()
+@scenes.command()
 @shows_errors
 def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
     """Check a scene and the files that it names; list its axes and the arrays of a dataset of it."""
@@ -103,7 +103,7 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
     return None
 
 
-@app.command()
+@scenes.command()
 @shows_errors
 def preview(
     scene: SceneArgument,
