@@ -28,10 +28,11 @@ HOST = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 @pytest.fixture
 def spans() -> Iterator[Any]:
     """The spans of this process, as they end."""
+    from opentelemetry.sdk.trace.export import SimpleSpanProcessor
     from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
     exporter = InMemorySpanExporter()
-    tracing.start("tests", exporter=exporter)
+    tracing.start("tests", processor=SimpleSpanProcessor(exporter))
     yield exporter
     tracing.stop()
 

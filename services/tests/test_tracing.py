@@ -21,7 +21,6 @@ def test_without_a_collector_nothing_is_traced(context: Context, worker: Pretend
     assert {lease.traceparent for lease in worker.lease()} == {None}
     with tracing.span("nothing", parent=HOST):
         assert tracing.traceparent() is None
-        tracing.note(job="none")
 
 
 @pytest.mark.real

@@ -59,9 +59,10 @@ def submit_job(
     IdempotencyKeyReusedError.
     """
     check_files(context.database, context.store, spec)
-    with collector_at_rest(), tracing.span("submit", parent=traceparent, kind=spec.kind, samples=spec.sample_count):
+    told = {"kind": spec.kind, "samples": spec.sample_count}
+    with collector_at_rest(), tracing.span("submit", parent=traceparent, **told) as span:
         answer = _submit(context, spec, idempotency_key, priority, tracing.traceparent())
-        tracing.note(job=answer.job_id if isinstance(answer, Replay) else answer.id)
+        span.set_attribute("stickslip.job", answer.job_id if isinstance(answer, Replay) else answer.id)
         return answer
 
 
