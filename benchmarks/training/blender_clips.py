@@ -38,6 +38,9 @@ def main() -> None:
     parser.add_argument("--held-out-textures", action="store_true")
     parser.add_argument("--held-out-viewpoints", action="store_true")
     parser.add_argument("--lighting", default="drawn", help="drawn or held-out")
+    parser.add_argument("--substrate", default="matt", help="floor: a built-in one")
+    parser.add_argument("--albedo", type=float, nargs=2, metavar=("LOW", "HIGH"), help="of a floor of one's own")
+    parser.add_argument("--grain", type=float, default=0.1, help="contrast of the marks on a floor of one's own")
     parser.add_argument("--segmentation", action="store_true", help="write the segmentation of every pixel, too")
     args = parser.parse_args()
     with np.load(args.runs) as file:
@@ -52,6 +55,10 @@ def main() -> None:
     views = HELD_OUT_VIEWPOINTS if args.held_out_viewpoints else TRAINING_VIEWPOINTS
     cameras = {camera.name: camera for camera in load_rig("drag")}
     random = np.random.default_rng(args.seed)
+    own = None
+    if args.albedo is not None:
+        own = {"albedo": tuple(args.albedo), "roughness": (0.4, 0.9), "grain": args.grain}
+    floor = {"substrate": args.substrate, "finish": own}
     renderer = ClothRenderer(triangles, rest, Holders)
     videos, seen, told = [], [], []
     try:
@@ -64,6 +71,7 @@ def main() -> None:
                     "texture": chosen[0],
                     "viewpoint": view,
                     "lighting": args.lighting,
+                    **floor,
                     "quality": Quality(args.quality),
                     "rig": "drag",
                     "rig_digest": "0" * 64,
@@ -77,7 +85,7 @@ def main() -> None:
             if args.segmentation:
                 seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
             for texture in chosen:
-                told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **about[run]})
+                told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **floor, **about[run]})
                 print(json.dumps(told[-1]), flush=True)
     finally:
         renderer.close()

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_training.arrays import Array, Floats, SingleFloats
+from stickslip_training.cloth.clips import RATE
 from stickslip_training.cloth.crop import holder_path
 from stickslip_training.cloth.runs import Runs
-from stickslip_training.cloth.video import RATE
 
 
 def meshes_at(run: Runs, seconds: Array) -> SingleFloats:

@@ -58,9 +58,6 @@ def test_train_and_evaluate(packed, tmp_path):
     assert "material not known" in judged.output
     records = [json.loads(line) for line in (out / "records.jsonl").read_text().splitlines()]
     assert json.loads((out / "report.json").read_text())["scores"]["blind"]["clips"] == len(records)
-    page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 2
-    assert "http" not in page.replace("http://www.w3.org", "")
 
 
 def test_predictions_of_a_dataset_are_a_list_that_can_be_scored(model, clips, tmp_path):
@@ -104,7 +101,7 @@ def test_what_cannot_be_measured_is_refused(model, clips, rods, make_clips):
         "predict", str(rods.root), "--model", str(model)
     )
     short = make_clips(frames=2)
-    assert "a clip must show the instant 60 of 300 to within 2" in refused(
+    assert "a clip must have a frame within 0.06 s of 25.00 s after the start; its nearest of 2 is" in refused(
         "predict", str(short.root), "--model", str(model)
     )
     assert "split must be one of train, validation, test, and is 'all'" in refused(

@@ -103,3 +103,11 @@ def test_a_file_of_predictions_is_checked(change, message):
     change(told)
     with pytest.raises(ValueError, match=message):
         score_predictions(told, ("a", "b", "c"), [4, 7, 9], truth([0.5] * 3))
+
+
+def test_an_interval_that_reaches_the_largest_known_mu_says_above():
+    joint = np.zeros((2, 1, 64))
+    joint[0, 0, 60:] = 0.25
+    joint[1, 0, 30:34] = 0.25
+    told = predictions(Posterior(("cloth",), BINS, joint), [0, 1])
+    assert [answer["mu"]["above"] for answer in told] == [1.6, None]

@@ -193,11 +193,18 @@ def test_a_model_of_another_size_is_no_start(few):
 
 def file_of_clips(path, run, size=224):
     video = np.random.default_rng(0).integers(0, 255, (len(run), 6, size, size, 3), dtype=np.uint8)
+    classes = np.random.default_rng(1).integers(0, 4, video.shape[:-1], dtype=np.uint8)
     about = [
         {"run": number, "material": "gray-interlock", "mu": 0.5, "landed_side": 1, "viewpoint": "calibrated"}
         for number in run
     ]
-    np.savez(path, video=video, instants=np.array(INSTANTS), about=[json.dumps(clip) for clip in about])
+    np.savez(
+        path,
+        video=video,
+        segmentation=classes,
+        instants=np.array(INSTANTS),
+        about=[json.dumps(clip) for clip in about],
+    )
 
 
 def test_a_file_of_clips_is_read_and_its_test_simulations_are_refused(runs, packed, tmp_path):

@@ -12,7 +12,7 @@ from stickslip_training.cloth.runs import split_runs
 def test_friction_of_unseen_simulations_is_learned_from_clips(runs):
     train, validation, test = split_runs(runs, (0.1, 0.22), 0)
     assert 65 <= len(train) <= 70
-    model = train_friction(train, validation, ClothTraining(steps=900), epoch=150)
+    model = train_friction(train, validation, ClothTraining(steps=900, worlds=False), epoch=150)
     clips = render_clips(test, 6, 99)
     scores = score(model.estimate(clips)[0], clips)
     assert scores.blind.simulations >= 20

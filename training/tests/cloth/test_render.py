@@ -1,16 +1,21 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from stickslip_testing.cameras import looking_at
-from stickslip_training.cloth.clips import INSTANTS, frames_at, training_cameras
+from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, frames_at, training_cameras
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
 from stickslip_training.cloth.render import (
     POINTS,
     _refined,
+    draw_style,
     draw_textures,
+    render_crops,
     splat,
     turned,
 )
+from stickslip_training.cloth.world import coded, draw_world
 
 RIG = training_cameras()
 FACING = looking_at(
@@ -113,10 +118,53 @@ def test_frames_are_found_by_their_instants():
     frames, instants = frames_at(tuple(range(0, 300, 10)))
     assert instants == INSTANTS
     assert frames == [6, 8, 13, 15, 21, 22]
-    with pytest.raises(ValueError, match="a clip must show the instant 60 of 300 to within 2; its nearest is 0"):
+    with pytest.raises(ValueError, match=r"must have a frame within 0\.06 s of 25\.00 s .* of 2 is at 0\.00 s"):
         frames_at((0, 150))
+
+
+@pytest.mark.parametrize("count", [24, 30, 75, 150, 300, 375, 400])
+@pytest.mark.parametrize("cut", [0.0, 0.5])
+def test_any_clip_is_read_at_the_right_times_or_refused(count, cut):
+    times = cut + np.arange(count) * (125.0 - 2 * cut) / count
+    late = max(np.abs(times - instant / RATE).min() for instant in INSTANTS)
+    if late > LATE_MAX:
+        with pytest.raises(ValueError, match="must have a frame within"):
+            frames_at(times * RATE)
+    else:
+        assert np.abs(np.subtract(frames_at(times * RATE)[1], INSTANTS)).max() <= LATE_MAX * RATE
 
 
 def test_grey_levels():
     video = torch.tensor([[[[255, 255, 255], [0, 0, 0], [255, 0, 0]]]], dtype=torch.uint8)
     assert grey(video).flatten().tolist() == pytest.approx([1.0, 0.0, 0.299], abs=1e-6)
+
+
+def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
+    frames, instants = frames_at(runs.instants)
+    meshes = torch.from_numpy(runs.positions[:3, frames])
+    cameras = Cameras.of(RIG)
+
+    def seen(seed, drawn=True):
+        generator = torch.Generator().manual_seed(seed)
+        style, world = draw_style(3, 6, generator), draw_world(3, generator) if drawn else None
+        return render_crops(meshes, cameras, instants, style, generator, world)
+
+    first, again, other, dark = seen(1), seen(1), seen(2), seen(1, drawn=False)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first[0], other[0])
+    behind = (first[1] == 0) & (dark[1] == 0)
+    assert first[0][behind].mean() > dark[0][behind].mean() + 0.1
+    assert 0 <= first[0].min() <= first[0].max() <= 1
+    assert (first[1] - dark[1]).abs().mean() < 0.05  # the camera is off by 3 % and 1.5 degrees at most
+
+
+def test_a_codec_keeps_what_is_smooth():
+    world = draw_world(2, torch.Generator().manual_seed(0))
+    world.there["codec"][:] = torch.tensor([1.0, 0.0])
+    world.drawn["codec"][:] = 0.1
+    ramp = torch.linspace(0, 1, WIDTH).expand(2, 1, HEIGHT, WIDTH) + 0.02 * torch.randn(2, 1, HEIGHT, WIDTH)
+    kept = coded(ramp, world)
+    assert torch.equal(kept[1], ramp[1])
+    assert 0.001 < (kept[0] - ramp[0]).abs().mean() < 0.03
+    exact = world.drawn | {"codec": torch.full((2,), 1e-4)}
+    assert torch.allclose(coded(ramp, replace(world, drawn=exact)), ramp, atol=1e-3)

@@ -1,7 +1,7 @@
 """The commands `stickslip-train cloth ...`: friction and material of dragged cloth from video."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,6 @@ from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
     from stickslip_training.cloth.evaluation import Errors, Scores
-    from stickslip_training.cloth.fabric import FabricErrors
 
 cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
 
@@ -38,9 +37,6 @@ def train(
         typer.Option(help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"),
     ] = None,
     start: Annotated[Path | None, typer.Option(help="a friction.safetensors whose weights are the first")] = None,
-    fabric: Annotated[
-        bool, typer.Option("--fabric", help="also learn mass per area, bending rigidity and bending length")
-    ] = False,
     rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
@@ -60,11 +56,9 @@ def train(
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
     with readable_errors(), joined(device) as own_device:
-        settings = ClothTraining(
-            steps=steps, learning_rate=rate, fabric=fabric, seed=seed, threads=threads, device=own_device
-        )
+        settings = ClothTraining(steps=steps, learning_rate=rate, seed=seed, threads=threads, device=own_device)
         first = None if start is None else load_friction(start)
-        if first is not None and bool(first.quantities) == fabric:
+        if first is not None:
             # The network knows the order of mu: its targets are as narrow as at the end.
             settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
         source, parts = training_runs(runs, split_seed)
@@ -94,55 +88,35 @@ def train(
 def evaluate(
     model: ModelArgument,
     runs: RunsArgument,
-    out: Annotated[Path, typer.Option(help="directory for report.html, report.json and records.jsonl")],
+    out: Annotated[Path, typer.Option(help="directory for report.json and records.jsonl")],
     split: Annotated[str, typer.Option(help="train, validation, test, or all clips of a dataset")] = "test",
     renders: Annotated[int, typer.Option(help="clips of each simulation of a packed file")] = 6,
     seed: Annotated[int, typer.Option(help="of the looks of clips of a packed file")] = 99,
     split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
 ) -> None:
-    """Measure the errors of a model on simulations that it was not trained on, and write a page about them."""
-    import numpy as np
-
+    """Measure the errors of a model on simulations that it was not trained on, and write them down."""
     from stickslip_training.cloth.clips import read_clips, render_clips, training_runs
     from stickslip_training.cloth.evaluation import predictions, score
-    from stickslip_training.cloth.fabric import score_fabric
     from stickslip_training.cloth.model import load_friction
-    from stickslip_training.cloth.report import write_html
 
     with readable_errors():
         friction = load_friction(model)
         if runs.endswith(".npz"):
             source, parts = training_runs(runs, split_seed)
             clips, slots = render_clips(parts[_split(split)].named(friction.materials), renders, seed), None
-            notes = [
-                f"Pictures were rendered by the renderer that the network was trained with, {renders} a simulation."
-            ]
         else:
             with DatasetReader(runs) as reader:
                 source = {"manifest": reader.manifest_digest}
                 chosen = None if split == "all" else _split(split)
                 clips, slots = read_clips(reader, chosen, friction.materials)
-            notes = [f"Clips of the split {split} of dataset {source['manifest'][:12]}."]
         if (clips.material < 0).any():
             raise ValueError(
                 f"materials of the clips must be known to the model: it knows {', '.join(friction.materials)}"
             )
         posterior, _ = friction.estimate(clips)
         scores = score(posterior, clips)
-        fabric = (
-            {}
-            if np.isnan(clips.fabric).any()
-            else score_fabric(friction.quantities, friction.fabric(clips), clips.fabric, clips.material, clips.run)
-        )
         out.mkdir(parents=True, exist_ok=True)
-        write_html(out / "report.html", "Friction from video", scores, posterior, clips, notes)
-        report = {
-            "source": source,
-            "split": split,
-            "scores": scores.as_dict(),
-            "fabric": {name: asdict(errors) for name, errors in fabric.items()},
-            "notes": notes,
-        }
+        report = {"source": source, "split": split, "renders": renders, "scores": scores.as_dict()}
         (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         numbers = range(len(clips)) if slots is None else slots.tolist()
         lines = [
@@ -154,66 +128,52 @@ def evaluate(
         (out / "records.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     console = Console()
     console.print(_scores(scores))
-    if fabric:
-        console.print(_fabric(fabric))
-    console.print(f"{out}: report.html, report.json, records.jsonl", soft_wrap=True)
+    console.print(f"{out}: report.json, records.jsonl", soft_wrap=True)
 
 
-@cloth.command("import")
-def import_(
-    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="of the drag scene, from before the holders move")],
-    camera: Annotated[Path, typer.Option(help="the calibrated camera, TOML: see the README of training")],
-    out: Annotated[Path, typer.Option(help="file for the clip (.npz), for `cloth predict`")],
-    start: Annotated[str, typer.Option(help="when the holders start in the video [s], or auto")] = "auto",
+@cloth.command()
+def predict(
+    source: Annotated[str, typer.Argument(metavar="DATASET_OR_VIDEO", help="a dataset, or a video with --camera")],
+    model: Annotated[
+        Path | None, typer.Option(help="friction.safetensors of `cloth train`; that of the package if not given")
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="calibrated camera of a video, TOML: see the README of training")
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option(help="when the holders start in a video [s]; found if not given")
+    ] = None,
+    frame_rate: Annotated[float | None, typer.Option(help="of a video [1/s]; its own times if not given")] = None,
     holders: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
             help="column and row of the middles of both held patches in the first frame [px], smaller y first"
         ),
     ] = None,
-) -> None:
-    """Align your own video with the clock of the drag scene, and register it to the holders."""
-    from stickslip_training.cloth.video import import_video, load_calibration, save_clip
-
-    with readable_errors():
-        try:
-            began = None if start == "auto" else float(start)
-        except ValueError as error:
-            raise ValueError(f"start must be auto or seconds, and is {start!r}") from error
-        calibration = load_calibration(camera)
-        crops, instants, found = import_video(video, calibration, start=began, holders=holders)
-        save_clip(out, crops, instants, calibration, found)
-    Console().print(
-        f"The holders start at {found.start:.2f} s (the halves differ by {found.timing:.2f} s); the holders are "
-        f"({found.offset[0]:+.1f}, {found.offset[1]:+.1f}) px from the calibration, the camera shakes by "
-        f"{found.shake:.2f} px, the residual is {found.residual:.2f} px.\n{out}: {len(instants)} pictures",
-        soft_wrap=True,
-    )
-
-
-@cloth.command()
-def predict(
-    dataset: Annotated[str, typer.Argument(metavar="DATASET_OR_CLIP", help="a dataset, or what `cloth import` wrote")],
-    model: Annotated[
-        Path | None, typer.Option(help="friction.safetensors of `cloth train`; that of the package if not given")
-    ] = None,
-    split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
 ) -> None:
     """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your own video."""
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
-    from stickslip_training.cloth.fabric import fabric_intervals
     from stickslip_training.cloth.model import WEIGHTS, load_friction
-    from stickslip_training.cloth.video import load_clip
+    from stickslip_training.cloth.video import import_video, load_calibration
 
     with readable_errors():
         friction = load_friction(model or WEIGHTS)
         true: list[str] = []
-        if dataset.endswith(".npz"):
-            clips, slots = load_clip(dataset), [0]
+        if camera is not None:
+            if split is not None:
+                raise ValueError(f"split must not be given with camera: a video has none, and it is {split!r}")
+            calibration = load_calibration(camera)
+            clips, found_in = import_video(source, calibration, start=start, frame_rate=frame_rate, holders=holders)
+            Console(stderr=True).print(f"the video: {found_in}", soft_wrap=True)
+            slots = [0]
         else:
-            with DatasetReader(dataset) as reader:
+            for name, value in (("start", start), ("frame_rate", frame_rate), ("holders", holders)):
+                if value is not None:
+                    raise ValueError(f"{name} must come with --camera: clips of a dataset have times; it is {value}")
+            with DatasetReader(source) as reader:
                 clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
                 names = reader.categories("material")
                 fabrics = [names[code] for code in reader.label("material")[found].tolist()]
@@ -223,9 +183,6 @@ def predict(
         answers = predictions(posterior, slots)
         for answer, far in zip(answers, ood_score.tolist(), strict=True):
             answer["ood_score"] = round(far, 3)
-        for name, intervals in fabric_intervals(friction.quantities, friction.fabric(clips)).items():
-            for answer, interval in zip(answers, intervals, strict=True):
-                answer.setdefault("fabric", {})[name] = interval
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
         return
@@ -235,7 +192,7 @@ def predict(
     for place, answer in enumerate(answers):
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
-        bounds = f"{mu['low']:.2f} to {mu['high']:.2f}"
+        bounds = f"{mu['low']:.2f} to " + (f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}")
         cells = [str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
         table.add_row(*cells, *true[place : place + 1], _warning(answer))
     Console().print(table)
@@ -271,17 +228,6 @@ def _split(name: str) -> Any:
     if name not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")
     return name
-
-
-def _fabric(found: "dict[str, FabricErrors]") -> Table:
-    table = Table(title="the fabric", caption="Errors are |ln(estimate / truth)|.", caption_justify="left")
-    table.add_column("")
-    for title in ("mean error", "knowing only the material", "in 80 %", "width of the interval"):
-        table.add_column(title, justify="right")
-    for name, part in found.items():
-        shown = str(part.error), str(part.guess), f"{part.coverage.value:.1%}", f"{part.width.value:.2f}"
-        table.add_row(name.replace("_", " "), *shown)
-    return table
 
 
 def _scores(scores: "Scores") -> Table:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
-from stickslip_training.cloth.fabric import Quantity
 from stickslip_training.cloth.posterior import SHARE, Bins, Posterior, estimates, softmax
 
 ALARMS = 0.05
@@ -27,14 +26,12 @@ ALARMS = 0.05
 _SHRUNK = 0.05  # of the covariance's mean eigenvalue is added: a few hundred clips do not fill every direction
 
 
-def likeliest_temperature(log_p: SingleFloats, place: Integers) -> tuple[float, float]:
-    """Return the temperature of histograms (clips, bins) at which the true bins `place` (clips,) are the most likely,
-    and the mean of -log p there."""
+def likeliest_temperature(log_p: SingleFloats, place: Integers) -> float:
+    """Return the temperature of histograms (clips, bins) at which the true bins `place` (clips,) are likeliest."""
     tried = np.geomspace(0.4, 4.0, 47)
     rows = np.arange(len(place))
     losses = [float(-np.log(softmax(log_p / t)[rows, place] + 1e-12).mean()) for t in tried]
-    best = int(np.argmin(losses))
-    return float(tried[best]), losses[best]
+    return float(tried[int(np.argmin(losses))])
 
 
 def likeliest_temperatures(
@@ -43,15 +40,7 @@ def likeliest_temperatures(
     """Return the temperatures of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at which the truth is the most
     likely."""
     given = mu[np.arange(len(true_mu)), true_material]
-    return likeliest_temperature(material, true_material)[0], likeliest_temperature(given, bins.place(true_mu))[0]
-
-
-def quantity_temperatures(
-    quantities: tuple[Quantity, ...], log_p: tuple[SingleFloats, ...], truth: Floats
-) -> tuple[float, ...]:
-    """Return the likeliest temperature of each quantity; `truth` is log10 of `FABRIC`, (clips, 3)."""
-    places = [quantity.bins.place(truth[:, i]) for i, quantity in enumerate(quantities)]
-    return tuple(likeliest_temperature(each, place)[0] for each, place in zip(log_p, places, strict=True))
+    return likeliest_temperature(material, true_material), likeliest_temperature(given, bins.place(true_mu))
 
 
 def covering_temperature(

@@ -5,6 +5,7 @@ They are rendered from simulations (`render_clips`), or read from a dataset (`re
 """
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,14 +15,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.kinds.cloth.spec import SEGMENTS
 from stickslip_schemas.spec.cameras import Camera, load_rig
 
 from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
-from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, landed_side, load_runs, runs_of_dataset, split_of_runs, split_runs
+from stickslip_training.cloth.world import draw_world
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
 from stickslip_training.engine.fit import seed_of_step
@@ -37,6 +39,13 @@ INSTANTS = (60, 80, 130, 150, 210, 220)
 By then the cloth slides steadily: leave-one-out, a mesh between two neighbours in mu is 0.03 mm from the simulation
 there, and 18 mm at instant 20, where the side of the drop still shows.
 """
+
+RATE = 2.4
+"""Instants a second [thesis, 4.2.3]."""
+
+LATE_MAX = 0.06
+"""Largest distance of a frame from its instant [s]. It moves mu by less than 0.01, and 0.4 s by up to 0.05; a blend of
+the frames before and after is no better."""
 
 CHUNK = 32
 """Clips that are rendered or estimated at once outside of training."""
@@ -60,8 +69,8 @@ class Clips(Truth):
     """(clips, F, 72, 88)"""
     direction: torch.Tensor
     """(clips, 3): of view."""
-    fabric: Floats
-    """(clips, 3): log10 of `fabric.FABRIC`; NaN where they are not known."""
+    cover: torch.Tensor
+    """(clips, F, 72, 88): share of each pixel that cloth covers; NaN where it is not known."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -87,9 +96,10 @@ class Clips(Truth):
 
 @dataclass(frozen=True, eq=False)
 class RenderedClips:
-    """Clips of another renderer to train on besides the pictures that are rendered while training.
+    """Clips of another renderer, over dark floors, to train on besides the pictures that are rendered while training.
 
-    Half of each batch is then of `train`; `validation` chooses the weights and the temperature.
+    Half of each batch is then of `train`, with worlds drawn about their cloth; `validation` chooses the weights and the
+    temperature.
     """
 
     train: Clips
@@ -100,24 +110,28 @@ class RenderedClips:
             part: Clips = getattr(self, name)
             if not len(part) or (part.material < 0).any():
                 raise ValueError(f"the clips for {name} must be some, and of materials of the runs: {len(part)} clips")
+        if self.train.cover.isnan().any():
+            raise ValueError("the clips for train must have a segmentation: other floors are drawn under their cloth")
         if shared := set(self.train.run.tolist()) & set(self.validation.run.tolist()):
             raise ValueError(f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}")
 
 
 def frames_at(
-    instants: tuple[int, ...], wanted: tuple[int, ...] = INSTANTS, off: int = 2
-) -> tuple[list[int], tuple[int, ...]]:
-    """Return the frames that are nearest to the instants that a network sees, and their instants.
+    instants: Sequence[float] | Floats, wanted: tuple[int, ...] = INSTANTS
+) -> tuple[list[int], tuple[float, ...]]:
+    """Return the frames that are nearest to the instants that a network sees, and their own instants.
 
-    Raises ValueError where one is more than `off` instants from any frame.
+    Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX` from any frame.
     """
-    frames = [int(np.abs(np.asarray(instants) - instant).argmin()) for instant in wanted]
+    shown = np.asarray(instants, dtype=np.float64)
+    frames = [int(np.abs(shown - instant).argmin()) for instant in wanted]
     for frame, instant in zip(frames, wanted, strict=True):
-        if abs(instants[frame] - instant) > off:
+        if abs(shown[frame] - instant) > LATE_MAX * RATE:
             raise ValueError(
-                f"a clip must show the instant {instant} of 300 to within {off}; its nearest is {instants[frame]}"
+                f"a clip must have a frame within {LATE_MAX:g} s of {instant / RATE:.2f} s after the start; its "
+                f"nearest of {len(shown)} is at {shown[frame] / RATE:.2f} s"
             )
-    return frames, tuple(instants[frame] for frame in frames)
+    return frames, tuple(shown[frames].tolist())
 
 
 def training_cameras() -> tuple[Camera, ...]:
@@ -126,16 +140,23 @@ def training_cameras() -> tuple[Camera, ...]:
 
 
 def render_clips(
-    runs: Runs, renders: int, seed: int, *, spread: float = 0.0, wanted: tuple[int, ...] = INSTANTS
+    runs: Runs,
+    renders: int,
+    seed: int,
+    *,
+    spread: float = 0.0,
+    wanted: tuple[int, ...] = INSTANTS,
+    drawn_world: bool = False,
 ) -> Clips:
     """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
 
-    `spread` is the standard deviation of random turns of the cameras [degree].
+    `spread` is the standard deviation of random turns of the cameras [degree]; with `drawn_world` each picture has a
+    world of its own, and a dark floor without.
     """
     frames, instants = frames_at(runs.instants, wanted)
     rig = training_cameras()
     number = np.repeat(np.arange(len(runs)), renders)
-    crops, directions = [], []
+    crops, covers, directions = [], [], []
     for start in range(0, len(number), CHUNK):
         chosen = number[start : start + CHUNK]
         generator = torch.Generator().manual_seed(seed_of_step(seed, VALIDATION, start))
@@ -143,7 +164,10 @@ def render_clips(
         seen = randomly_turned(Cameras.of(views), spread, generator)
         looks = draw_style(len(chosen), len(frames), generator)
         meshes = torch.from_numpy(runs.positions[chosen][:, frames])
-        crops.append(render_crops(meshes, seen, instants, looks, generator))
+        world = draw_world(len(chosen), generator) if drawn_world else None
+        picture, cover = render_crops(meshes, seen, instants, looks, generator, world)
+        crops.append(picture)
+        covers.append(cover)
         directions.append(seen.rotation[:, 2])
     shown = runs[number]
     return Clips(
@@ -153,7 +177,7 @@ def render_clips(
         mu=shown.mu,
         landed=shown.landed,
         run=number,
-        fabric=shown.fabric,
+        cover=torch.cat(covers),
     )
 
 
@@ -190,11 +214,15 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
     cameras = {camera.name: camera for camera in reader.manifest.cameras}
     views = [cameras[names[code]] for code in reader.label("viewpoint")[slots].tolist()]
     seen = Cameras.of(views)
-    crops = []
+    crops, covers = [], []
     for start in range(0, len(slots), _READ_CHUNK):
-        video = torch.from_numpy(reader.read("video", slots[start : start + _READ_CHUNK])[:, frames])
+        some = slots[start : start + _READ_CHUNK]
         place = holder_crops(seen[start : start + _READ_CHUNK], instants)
-        crops.append(cut(grey(video), place))
+        crops.append(cut(grey(torch.from_numpy(reader.read("video", some)[:, frames])), place))
+        if "segmentation" in reader.arrays:
+            covers.append(cut(_is_cloth(reader.read("segmentation", some)[:, frames]), place))
+        else:
+            covers.append(torch.full_like(crops[-1], math.nan))
     known = np.array([materials.index(name) if name in materials else -1 for name in reader.categories("material")])
     clips = Clips(
         crops=torch.cat(crops),
@@ -203,7 +231,7 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
         mu=reader.label("mu")[slots].astype(np.float64),
         landed=_landed(reader, slots),
         run=simulations(reader, slots),
-        fabric=fabric_numbers(*(reader.label(name)[slots] for name in ("areal_density", "bending_rigidity"))),
+        cover=torch.cat(covers),
     )
     return clips, slots
 
@@ -214,17 +242,20 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
     `Clips.run` is the number of the simulation in the packed file that the clips are of.
     """
     with np.load(path) as file:
-        if not {"video", "instants", "about"} <= set(file.files):
-            raise ValueError(f"{path} must be a file of clips with video, instants and about: it has {file.files}")
-        video, shown = file["video"], tuple(map(int, file["instants"]))
+        if not {"video", "segmentation", "instants", "about"} <= set(file.files):
+            raise ValueError(
+                f"{path} must be a file of clips with video, segmentation, instants and about: it has {file.files}"
+            )
+        video, classes, shown = file["video"], file["segmentation"], tuple(map(int, file["instants"]))
         about = [json.loads(str(line)) for line in file["about"]]
     frames, instants = frames_at(shown)
     named = {camera.name: camera for camera in load_rig(RIG)}
     seen = Cameras.of([named[clip["viewpoint"]] for clip in about])
-    crops = [
-        cut(grey(torch.from_numpy(video[i : i + 1, frames])), holder_crops(seen[i : i + 1], instants))
-        for i in range(len(video))
-    ]
+    crops, covers = [], []
+    for clip in range(len(video)):
+        place = holder_crops(seen[clip : clip + 1], instants)
+        crops.append(cut(grey(torch.from_numpy(video[clip : clip + 1, frames])), place))
+        covers.append(cut(_is_cloth(classes[clip : clip + 1, frames]), place))
     known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
     mu, landed, run = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
     clips = Clips(
@@ -234,7 +265,7 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
         mu=mu,
         landed=landed,
         run=run,
-        fabric=numbers_of_runs(about),
+        cover=torch.cat(covers),
     )
     return clips, about
 
@@ -302,6 +333,10 @@ def truth_of_slots(reader: DatasetReader, slots: Integers) -> Truth:
         landed=np.zeros(len(slots), np.int64),
         run=simulations(reader, slots),
     )
+
+
+def _is_cloth(classes: Array) -> torch.Tensor:
+    return torch.from_numpy((classes == SEGMENTS.index("cloth")).astype(np.float32))
 
 
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:

@@ -85,7 +85,7 @@ class Crops:
         return (pixels - origin) * self.scale.reshape(*self.scale.shape, *extra, 1) + anchor
 
 
-def holder_path(instants: Sequence[int] | Array) -> tuple[torch.Tensor, torch.Tensor]:
+def holder_path(instants: Sequence[float] | Array) -> tuple[torch.Tensor, torch.Tensor]:
     """Return where the middle of the holders is at instants, of 2.4 a second and whole or not: x and z (F,) [m]
     [thesis, 4.2.3].
 
@@ -105,7 +105,7 @@ def holder_path(instants: Sequence[int] | Array) -> tuple[torch.Tensor, torch.Te
     return torch.tensor(x, dtype=torch.float32), torch.tensor(z, dtype=torch.float32)
 
 
-def holder_crops(cameras: Cameras, instants: Sequence[int]) -> Crops:
+def holder_crops(cameras: Cameras, instants: Sequence[float]) -> Crops:
     """Return where the crops of clips by `cameras` lie, at each of the instants."""
     x, z = holder_path(instants)
     middle = torch.stack([x, torch.zeros_like(x), z], dim=-1).expand(len(cameras.focal), -1, -1)

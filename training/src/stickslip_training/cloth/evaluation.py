@@ -149,16 +149,26 @@ def measure(values: Floats, run: Integers) -> Measure:
 
 
 def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, Any]]:
-    """Return answers as `stickslip-train cloth predict --json` prints them."""
+    """Return answers as `stickslip-train cloth predict --json` prints them.
+
+    `above` is the largest known mu where the last bin has as much probability as lies above an interval about the
+    median: mu may be larger. Elsewhere it is None.
+    """
     found = estimates(posterior.mu, posterior.bins, SHARE)
+    at_end = posterior.mu[:, -1] >= (1.0 - SHARE) / 2
     return [
         {
             "slot": int(slot),
             "material": {name: round(float(p), 6) for name, p in zip(posterior.materials, row, strict=True)},
-            "mu": {"median": round(float(median), 6), "low": round(float(low), 6), "high": round(float(high), 6)},
+            "mu": {
+                "median": round(float(median), 6),
+                "low": round(float(low), 6),
+                "high": round(float(high), 6),
+                "above": posterior.bins.high if ends else None,
+            },
         }
-        for slot, row, median, low, high in zip(
-            slots, posterior.material, found.median, found.low, found.high, strict=True
+        for slot, row, median, low, high, ends in zip(
+            slots, posterior.material, found.median, found.low, found.high, at_end, strict=True
         )
     ]
 

@@ -13,27 +13,26 @@ from torch import nn
 from stickslip_training.cloth.calibration import (
     TrainingFeatures,
     covering_temperature,
-    likeliest_temperature,
     likeliest_temperatures,
-    quantity_temperatures,
 )
 from stickslip_training.cloth.clips import (
     INSTANTS,
     TRAINING,
     VALIDATION,
+    Clips,
     RenderedClips,
     frames_at,
     jittered,
     render_clips,
     training_cameras,
 )
-from stickslip_training.cloth.crop import Cameras
-from stickslip_training.cloth.fabric import FABRIC
-from stickslip_training.cloth.model import FrictionModel, features, log_histograms, quantity_log_histograms
+from stickslip_training.cloth.crop import Cameras, holder_crops
+from stickslip_training.cloth.model import FrictionModel, features, log_histograms
 from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
-from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
+from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, between
+from stickslip_training.cloth.world import cloth_of_clip, draw_world
 from stickslip_training.engine.fit import (
     EpochReport,
     FitSettings,
@@ -67,11 +66,10 @@ class ClothTraining:
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    worlds: bool = True
+    """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows dark floors only."""
     instants: tuple[int, ...] = INSTANTS
     """Of the frames that the network sees, of 300."""
-    fabric: bool = False
-    """Also learn the numbers of the fabric, `fabric.FABRIC`. There are no meshes between neighbours in mu then: two
-    fabrics do not make a third."""
     seed: int = 0
     width: int = 96
     threads: int = 1
@@ -157,17 +155,20 @@ class FrictionLearner(Learner):
         self.train = train
         self.validation_runs = len(validation)
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
-        self.quantities = FABRIC if settings.fabric else ()
-        for runs in (train, validation) if settings.fabric else ():
-            _check_fabric(runs)
-        gap = 0.0 if settings.fabric else settings.gap
-        self.pairs = np.array(between(train, gap) + [(run, run) for run in range(len(train))])
+        self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
         widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
         self.rig = training_cameras()
         self.clips = clips
         self.validation = (
-            render_clips(validation, 6, settings.seed, spread=settings.turn, wanted=settings.instants)
+            render_clips(
+                validation,
+                6,
+                settings.seed,
+                spread=settings.turn,
+                wanted=settings.instants,
+                drawn_world=self.settings.worlds,
+            )
             if clips is None
             else clips.validation
         )
@@ -178,7 +179,6 @@ class FrictionLearner(Learner):
                 bins=MU_BINS.count,
                 frames=len(self.frames),
                 width=settings.width,
-                quantities=[quantity.bins.count for quantity in self.quantities],
             )
         if start is not None:
             if start.materials != train.materials or start.net.sizes != self.net.sizes:
@@ -204,7 +204,7 @@ class FrictionLearner(Learner):
 
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
         assert isinstance(net, PosteriorNet)
-        crops, direction, material, mu, fabric = self.batch(step)
+        crops, direction, material, mu, _ = self.batch(step)
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
         target = _blurred(self.centers, mu, deviation)
@@ -213,16 +213,10 @@ class FrictionLearner(Learner):
         log_material, log_mu = net.read(seen)
         rows = torch.arange(len(mu), device=device)
         given = log_mu[rows, material.to(device)]
-        loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
-        for place, (quantity, log_p) in enumerate(zip(self.quantities, net.read_quantities(seen), strict=True)):
-            bins = quantity.bins
-            wide = deviation * (bins.high - bins.low) / (MU_BINS.high - MU_BINS.low)
-            centers = torch.from_numpy(bins.centers.astype(np.float32))
-            loss = loss - (_blurred(centers, fabric[:, place], wide).to(device) * log_p).sum(dim=1).mean()
-        return torch.as_tensor(loss)
+        return -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
 
     def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the crops, directions of view, materials, mu and fabrics of this process's share of a step."""
+        """Return the crops, directions of view, materials, mu and coverage of this process's share of a step."""
         seeds = (self.settings.seed, TRAINING, step, *self.rank.seeds)
         random = np.random.default_rng(seeds)
         generator = torch.Generator().manual_seed(seed_of_step(*seeds))
@@ -236,25 +230,31 @@ class FrictionLearner(Learner):
         views = [self.rig[place] for place in random.integers(len(self.rig), size=count)]
         cameras = randomly_turned(Cameras.of(views), self.settings.turn, generator)
         looks = draw_style(count, len(self.frames), generator)
-        crops = render_crops(meshes, cameras, self.instants, looks, generator)
+        world = draw_world(count, generator) if self.settings.worlds else None
+        crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
         first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
         mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32))
-        near, far = (self.train.fabric[chosen[:, place]] for place in (0, 1))
-        fabric = torch.from_numpy((near + share[:, None] * (far - near)).astype(np.float32))
-        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, fabric
+        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, cover
         if self.clips is None:
             return rendered
         some = self.clips.train[random.integers(len(self.clips.train), size=count // 2)]
-        given = (
-            jittered(some.crops, generator),
-            some.direction,
-            torch.from_numpy(some.material),
-            torch.from_numpy(some.mu.astype(np.float32)),
-            torch.from_numpy(some.fabric.astype(np.float32)),
-        )
-        both = zip(rendered, given, strict=True)
-        a, b, c, d, e = (torch.cat([first[: count - len(some)], second]) for first, second in both)
+        given = self.elsewhere(some, generator)
+        kept = count - len(some)
+        a, b, c, d, e = (torch.cat([first[:kept], second]) for first, second in zip(rendered, given, strict=True))
         return a, b, c, d, e
+
+    def elsewhere(
+        self, clips: Clips, generator: torch.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return clips over dark floors as part of a batch: each in a world that is drawn about its cloth."""
+        looks = draw_style(len(clips), len(self.frames), generator)
+        cloth, world = cloth_of_clip(clips.crops, clips.cover, looks, draw_world(len(clips), generator), generator)
+        axes = torch.stack([torch.tensor(camera.rotation[2]) for camera in self.rig])
+        near = torch.cdist(clips.direction, axes).argmin(dim=1)
+        cameras = Cameras.of([self.rig[place] for place in near.tolist()])
+        crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)
+        mu = torch.from_numpy(clips.mu.astype(np.float32))
+        return crops, clips.direction, torch.from_numpy(clips.material), mu, cloth.alpha
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
@@ -263,10 +263,7 @@ class FrictionLearner(Learner):
         # Overconfidence does not count: temperatures correct it in the end.
         temperature = likeliest_temperatures(*log_p, clips.material, clips.mu, MU_BINS)
         posterior = Posterior.of(*log_p, self.train.materials, MU_BINS, temperature)
-        loss = -float(posterior.log_likelihood(clips.material, clips.mu).mean())
-        for place, (quantity, each) in enumerate(zip(self.quantities, quantity_log_histograms(net, seen), strict=True)):
-            loss += likeliest_temperature(each, quantity.bins.place(clips.fabric[:, place]))[1]
-        return loss
+        return -float(posterior.log_likelihood(clips.material, clips.mu).mean())
 
     def calibrated(self, fitted: Fitted) -> FrictionModel:
         """Return the model of a trained network, calibrated on the clips for validation."""
@@ -279,7 +276,14 @@ class FrictionLearner(Learner):
         generator = torch.Generator().manual_seed(seed_of_step(settings.seed, VALIDATION, 1))
         log_p = log_histograms(net, features(net, replace(clips, crops=jittered(clips.crops, generator))))
         of_mu = covering_temperature(*log_p, clips.mu, MU_BINS, of_material)
-        known = render_clips(train, 6, settings.seed + 1, spread=settings.turn, wanted=settings.instants)
+        known = render_clips(
+            train,
+            6,
+            settings.seed + 1,
+            spread=settings.turn,
+            wanted=settings.instants,
+            drawn_world=settings.worlds,
+        )
         card = {
             "settings": asdict(settings),
             "training_runs": len(train),
@@ -299,10 +303,6 @@ class FrictionLearner(Learner):
             temperature=(of_material, of_mu),
             training_features=TrainingFeatures.of(features(net, known), known.material, seen, len(train.materials)),
             card=card,
-            quantities=self.quantities,
-            quantity_temperatures=quantity_temperatures(
-                self.quantities, quantity_log_histograms(net, seen), clips.fabric
-            ),
         )
 
 
@@ -310,13 +310,3 @@ def _blurred(centers: torch.Tensor, truth: torch.Tensor, deviation: float) -> to
     """Return histograms (B, bins) of this deviation about the truth, (B,)."""
     target = torch.exp(-0.5 * ((centers - truth[:, None]) / deviation) ** 2)
     return target / target.sum(dim=1, keepdim=True)
-
-
-def _check_fabric(runs: Runs) -> None:
-    for column, quantity in zip(runs.fabric.T, FABRIC, strict=True):
-        low, high = quantity.bins.low, quantity.bins.high
-        if not ((low <= column) & (column <= high)).all():
-            raise ValueError(
-                f"{quantity.name} of the runs must be known, from {10**low:.2g} to {10**high:.2g} {quantity.unit}: it "
-                f"is from {10 ** column.min():.3g} to {10 ** column.max():.3g}"
-            )

@@ -14,9 +14,8 @@ from stickslip_schemas.store import write_durably
 from stickslip_training.arrays import Floats, SingleFloats
 from stickslip_training.cloth.calibration import TrainingFeatures
 from stickslip_training.cloth.clips import CHUNK, Clips
-from stickslip_training.cloth.fabric import FABRIC, Quantity
 from stickslip_training.cloth.nets import PosteriorNet
-from stickslip_training.cloth.posterior import Bins, Posterior, softmax
+from stickslip_training.cloth.posterior import Bins, Posterior
 
 WEIGHTS = Path(__file__).with_name("friction.safetensors")
 """A trained model that comes with the package; its card names its training data and its errors."""
@@ -28,30 +27,19 @@ class FrictionModel:
 
     net: PosteriorNet
     materials: tuple[str, ...]
-    instants: tuple[int, ...]
+    instants: tuple[float, ...]
     bins: Bins
     temperature: tuple[float, float]
     """Of the histograms of material and of mu: see `calibration`."""
     training_features: TrainingFeatures
     card: dict[str, Any]
     """Training runs, settings, measured errors and limits."""
-    quantities: tuple[Quantity, ...] = ()
-    """Numbers of the fabric that the network estimates, too."""
-    quantity_temperatures: tuple[float, ...] = ()
 
     def estimate(self, clips: Clips) -> tuple[Posterior, Floats]:
         """Return the posterior and the OOD score of every clip."""
         seen = features(self.net, clips)
         posterior = Posterior.of(*log_histograms(self.net, seen), self.materials, self.bins, self.temperature)
         return posterior, self.training_features.ood_score(seen)
-
-    def fabric(self, clips: Clips) -> dict[str, Floats]:
-        """Return the histogram of each quantity by name, (clips, bins)."""
-        log_p = quantity_log_histograms(self.net, features(self.net, clips))
-        return {
-            quantity.name: softmax(each / temperature)
-            for quantity, each, temperature in zip(self.quantities, log_p, self.quantity_temperatures, strict=True)
-        }
 
 
 def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
@@ -75,13 +63,6 @@ def log_histograms(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats,
     return material.cpu().numpy(), mu.cpu().numpy()
 
 
-def quantity_log_histograms(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, ...]:
-    """Return log p(q), (clips, bins), of each quantity, of features (clips, n)."""
-    with torch.inference_mode():
-        log_p = net.read_quantities(torch.from_numpy(seen).to(next(net.parameters()).device))
-    return tuple(each.cpu().numpy() for each in log_p)
-
-
 def save_friction(path: Path, model: FrictionModel) -> None:
     """Write the model as safetensors, with its card; `load_friction` reads it."""
     tensors = {f"net.{name}": tensor.contiguous() for name, tensor in model.net.state_dict().items()}
@@ -94,8 +75,6 @@ def save_friction(path: Path, model: FrictionModel) -> None:
         "bins": asdict(model.bins),
         "temperature": model.temperature,
         "limit": model.training_features.limit,
-        "quantities": [quantity.name for quantity in model.quantities],
-        "quantity_temperatures": model.quantity_temperatures,
         "card": model.card,
     }
     write_durably(path, safetensors.torch.save(tensors, {"friction": json.dumps(about)}))
@@ -107,8 +86,7 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
         with safetensors.safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {})["friction"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        quantities = tuple(quantity for quantity in FABRIC if quantity.name in about["quantities"])
-        net = PosteriorNet(**about["sizes"], quantities=[quantity.bins.count for quantity in quantities])
+        net = PosteriorNet(**about["sizes"])
         net.load_state_dict({name: tensors[f"net.{name}"] for name in net.state_dict()})
         means, precision = (tensors[f"features.{name}"].numpy() for name in ("means", "precision"))
         of_material, of_mu = about["temperature"]
@@ -120,8 +98,6 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             temperature=(of_material, of_mu),
             training_features=TrainingFeatures(means, precision, about["limit"]),
             card=about["card"],
-            quantities=quantities,
-            quantity_temperatures=tuple(about["quantity_temperatures"]),
         )
     except (safetensors.SafetensorError, KeyError, RuntimeError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} must be a model of `stickslip-train cloth train`: {error}") from error

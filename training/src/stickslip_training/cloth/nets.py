@@ -1,6 +1,5 @@
 """The network that measures friction."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -11,19 +10,16 @@ from stickslip_training.cloth.crop import HEIGHT, WIDTH
 
 class PosteriorNet(nn.Module):
     """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and log p(mu | m), (B,
-    M, K); with `quantities`, the bins of each, also to histograms of these: see `fabric`.
+    M, K).
 
     Every frame goes through the same four convolutions and keeps its places: friction shows in
     where an edge lies, to a part of a pixel. Frames are at fixed phases of the path of the holders, so each has a place
     of its own in the layer that joins them.
     """
 
-    def __init__(
-        self, *, materials: int, bins: int, frames: int, width: int = 96, quantities: Sequence[int] = ()
-    ) -> None:
+    def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96) -> None:
         super().__init__()
         self.sizes = {"materials": materials, "bins": bins, "frames": frames, "width": width}
-        self.quantity_bins = list(quantities)
         channels = (1, 16, 32, 48, 64)
         layers: list[nn.Module] = []
         for before, after in pairwise(channels):
@@ -45,7 +41,6 @@ class PosteriorNet(nn.Module):
         )
         self.material = nn.Linear(2 * width, materials)
         self.mu = nn.Linear(2 * width, materials * bins)
-        self.quantities = nn.ModuleList(nn.Linear(2 * width, count) for count in quantities)
 
     def features(self, crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
         """Return what material and mu are read off, (B, 2 width)."""
@@ -59,10 +54,6 @@ class PosteriorNet(nn.Module):
         """Return log p(m) and log p(mu | m) of features."""
         mu = self.mu(features).reshape(len(features), self.sizes["materials"], self.sizes["bins"])
         return torch.log_softmax(self.material(features), dim=1), torch.log_softmax(mu, dim=2)
-
-    def read_quantities(self, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return log p(q), (B, bins), of each quantity."""
-        return tuple(torch.log_softmax(head(features), dim=1) for head in self.quantities)
 
     def forward(self, crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return log p(m) and log p(mu | m)."""

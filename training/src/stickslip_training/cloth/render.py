@@ -6,8 +6,8 @@ brightness to the four pixels about it, with bilinear weights and in the measure
     alpha = min(1, sum_i w_i a_i),   picture = sum_i w_i a_i c_i / sum_i w_i a_i  over the background by alpha
 
 so an edge moves through a pixel as smoothly as it does in a photograph. A point is visible where nothing on its pixel
-is nearer by more than `LAYER`. Light is one distant lamp and some from all around; there are no shadows: the floor is
-dark.
+is nearer by more than `LAYER`. Light is one distant lamp and some from all around. What is about the cloth is in
+`world`.
 """
 
 import math
@@ -19,6 +19,7 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
+from stickslip_training.cloth.world import Cloth, World, blurred, coded, light_of
 
 POINTS = 56
 """Points along a side of the refined mesh."""
@@ -136,31 +137,54 @@ def randomly_turned(cameras: Cameras, deviation: float, generator: torch.Generat
 def render_crops(
     positions: torch.Tensor,
     cameras: Cameras,
-    instants: tuple[int, ...],
+    instants: tuple[float, ...],
     style: Style,
     generator: torch.Generator | None = None,
-) -> torch.Tensor:
-    """Render the holder-registered crops, grey levels (B, F, 72, 88), of meshes (B, F, side, side, 3) [m].
+    world: World | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Render the holder-registered crops of meshes (B, F, side, side, 3) [m], and how much of each pixel cloth covers.
 
-    `generator` draws the noise; without it there is none.
+    Both are (B, F, 72, 88), grey levels and shares. `cameras` register the crops; `world` says how the true ones
+    differ, and what else is in the picture: without it, nothing but a dark floor. `generator` draws the noise; without
+    it there is none.
     """
     crops = holder_crops(cameras, instants)
-    shade = shading(positions, cameras, style) * style.exposure[:, None, None, None]
-    pictures = []
+    true = cameras if world is None else world.seen_by(cameras)
+    shade = shading(positions, true, style)
+    parts = []
     for clip in range(len(positions)):  # one clip's points fit into a processor's cache, a batch's do not
         one = slice(clip, clip + 1)
         fine = _refined(torch.cat([positions[one], shade[one, ..., None]], dim=-1), POINTS)
-        colors = fine[..., 3] * style.texture[one, None]
-        shift, stretch = style.shift[one], style.stretch[one]
-        pictures.append(splat(fine[..., :3], colors, cameras[one], crops[one], shift=shift, stretch=stretch))
-    alpha, color = (torch.cat(parts) for parts in zip(*pictures, strict=True))
-    floor = style.floor[:, None, None, None]
-    light = alpha * color + (1.0 - alpha) * floor
+        points, colors = fine[..., :3], fine[..., 3] * style.texture[one, None]
+        place = true[one], crops[one].off_by(style.shift[one], style.stretch[one])
+        lamp = style.lamp[one][:, None, None, None]
+        fallen = points - lamp * (points[..., 2:] / lamp[..., 2:])
+        shadow = torch.zeros(1) if world is None else splat(fallen, torch.ones_like(colors), *place)[0]
+        parts.append((*splat(points, colors, *place), shadow))
+    cloth = Cloth(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    return pictured(cloth, true, crops, instants, style, generator, world), cloth.alpha
+
+
+def pictured(
+    cloth: Cloth,
+    cameras: Cameras,
+    crops: Crops,
+    instants: tuple[float, ...],
+    style: Style,
+    generator: torch.Generator | None,
+    world: World | None,
+) -> torch.Tensor:
+    """Return the grey levels of cloth in a world, or over the dark floor of `style`, (B, F, 72, 88)."""
+    if world is None:
+        floor = style.floor[:, None, None, None]
+        light = style.exposure[:, None, None, None] * cloth.alpha * cloth.light + (1.0 - cloth.alpha) * floor
+    else:
+        light = light_of(cloth, cameras, crops, instants, style, world).clamp(max=1.0)
     picture = light.clamp(min=1e-5) ** style.gamma[:, None, None, None]
-    picture = _blurred(picture, style.blur)
+    picture = blurred(picture, style.blur)
     if generator is not None:
         picture = picture + style.noise[:, None, None, None] * torch.randn(picture.shape, generator=generator)
-    return picture.clamp(0.0, 1.0)
+    return (picture if world is None else coded(picture, world)).clamp(0.0, 1.0)
 
 
 def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
@@ -197,18 +221,11 @@ def splat(
     crops: Crops,
     *,
     size: tuple[int, int] = (HEIGHT, WIDTH),
-    shift: torch.Tensor | None = None,
-    stretch: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return coverage and colour of each pixel, (B, F, *size), of points (B, F, N, N, 3) with colours (B, F, N, N).
-
-    `shift` (B, F, 2) and `stretch` (B,) are errors of the registration: see `Style`.
-    """
+    """Return coverage and colour of each pixel, (B, F, *size), of points (B, F, N, N, 3) with colours (B, F, N, N)."""
     clips, frames = points.shape[:2]
     height, width = size
     pixels, depth = cameras.project(points)
-    if shift is not None and stretch is not None:
-        crops = crops.off_by(shift, stretch)
     places = crops.of_pixels(pixels)
     area = _areas(places)
     # A border takes what is out of sight: one pixel before the picture, two after it.
@@ -244,17 +261,3 @@ def _areas(places: torch.Tensor) -> torch.Tensor:
     edge = torch.ones(places.shape[2])
     edge[0] = edge[-1] = 0.5
     return area * edge[:, None] * edge
-
-
-def _blurred(pictures: torch.Tensor, deviation: torch.Tensor) -> torch.Tensor:
-    """Blur pictures (B, F, H, W), each clip by its own Gaussian of at most 1 px or so."""
-    x = torch.arange(-2.0, 3.0)
-    kernel = torch.exp(-0.5 * (x / deviation.clamp(min=1e-2)[:, None]) ** 2)
-    kernel = kernel / kernel.sum(dim=1, keepdim=True)
-    clips = len(pictures)
-    flat = pictures.permute(1, 0, 2, 3)
-    for shape in ((clips, 1, 5, 1), (clips, 1, 1, 5)):
-        padding = (0, 0, 2, 2) if shape[2] == 5 else (2, 2, 0, 0)
-        padded = torch.nn.functional.pad(flat, padding, mode="replicate")
-        flat = torch.nn.functional.conv2d(padded, kernel.reshape(shape), groups=clips)
-    return flat.permute(1, 0, 2, 3)

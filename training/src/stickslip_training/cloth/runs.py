@@ -15,7 +15,6 @@ from zipfile import BadZipFile
 import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
-from stickslip_training.cloth.fabric import fabric_numbers, numbers_of_runs
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
 
@@ -43,15 +42,13 @@ class Runs:
     """(runs,)"""
     landed: Integers
     """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on the first leg."""
-    fabric: Floats
-    """(runs, 3): log10 of `fabric.FABRIC`; NaN where they are not known."""
 
     def __len__(self) -> int:
         return len(self.mu)
 
     def __getitem__(self, chosen: Array) -> "Runs":
         """Return some of the runs."""
-        names = ("positions", "material", "mu", "landed", "fabric")
+        names = ("positions", "material", "mu", "landed")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def named(self, materials: tuple[str, ...]) -> "Runs":
@@ -85,7 +82,7 @@ def _load(path: str | Path) -> Runs:
     materials = tuple(sorted({run["material"] for run in about}))
     material = np.array([materials.index(run["material"]) for run in about])
     mu = np.array([run["mu"] for run in about])
-    return _runs(positions, rest, instants, materials, material, mu, numbers_of_runs(about))
+    return _runs(positions, rest, instants, materials, material, mu)
 
 
 def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
@@ -111,9 +108,8 @@ def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequen
     rest = reader.read("rest", chosen[:1])[0]
     material = reader.label("material")[chosen].astype(np.int64)
     materials = reader.categories("material")
-    fabric = fabric_numbers(*(reader.label(name)[chosen] for name in ("areal_density", "bending_rigidity")))
     mu = reader.label("mu")[chosen]
-    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, mu, fabric), chosen
+    return _runs(np.stack(meshes), rest, tuple(instants), materials, material, mu), chosen
 
 
 def split_runs(runs: Runs, shares: tuple[float, float], seed: int) -> tuple[Runs, Runs, Runs]:
@@ -146,11 +142,10 @@ def _runs(
     materials: tuple[str, ...],
     material: Integers,
     mu: Floats,
-    fabric: Floats,
 ) -> Runs:
     grid = positions[:, :, grid_order(rest)].astype(np.float32)
     landed = _landed(grid[:, _first(instants)])
-    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed, fabric)
+    return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:

@@ -10,12 +10,10 @@ gives the start t0 of the path and o. The common motion w(t) of both holders is 
 removed from every frame. The difference between the two holders is the residual.
 """
 
-import io
-import json
 import math
 import tomllib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,20 +22,14 @@ import torch
 from pydantic import ValidationError
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_schemas.spec.cameras import Camera
-from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Floats
-from stickslip_training.cloth.clips import INSTANTS, Clips, frames_at
+from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, Clips, frames_at
 from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, holder_path
-from stickslip_training.cloth.fabric import FABRIC
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-FRAMES, ALL_INSTANTS, RATE = 30, 300, 2.4
-"""Pictures of a clip, instants of the motion, and instants a second [thesis, 4.2.3]."""
 
 PATCH = 0.095
 """y of the middle of the held patches [m]; they are 1 cm wide."""
@@ -61,8 +53,8 @@ TIMING_MAX = 0.1
 TILT_MAX = 5.0
 """Angle between the line of the holders in the video and in the calibrated camera [degree]."""
 
-LATE_MAX = 0.1
-"""Largest distance of a frame from its instant [s]."""
+CUT_MAX = 1.0
+"""Latest time at which a video may begin after the start [s]: the holders have come 5 mm down by then."""
 
 
 class VideoError(ValueError):
@@ -150,67 +142,46 @@ def import_video(
     calibration: Calibration,
     *,
     start: float | None = None,
+    frame_rate: float | None = None,
     holders: tuple[float, float, float, float] | None = None,
-) -> tuple[torch.Tensor, tuple[int, ...], Registration]:
-    """Return crops (F, 72, 88) of a video, their instants and the registration.
+) -> tuple[Clips, Registration]:
+    """Return the clip of a video, of which nothing is known to be true, and the registration.
 
     Args:
-        path: The video, which must begin before the holders start.
+        path: The video; it may begin up to `CUT_MAX` after the holders start.
         calibration: The camera.
-        start: Time at which the holders start [s]; by default it is found.
+        start: Time in the video at which the holders start [s]; by default it is found.
+        frame_rate: Frames a second; by default the video has the time of every frame.
         holders: Column and row of the middle of each held patch in the first frame, smaller y first [px]; by default
             those of the calibration.
 
     Raises:
         VideoError: The video cannot be measured.
     """
-    times, tracks = _follow(path, calibration, holders)
-    camera = calibration.camera
-    last = frames_at(tuple(range(ALL_INSTANTS)))[1][-1] / RATE
+    if frame_rate is not None and not 0 < frame_rate < math.inf:
+        raise VideoError(f"frame_rate must be more than 0 frames a second and finite, and is {frame_rate:g}")
+    times, tracks = _follow(path, calibration, holders, frame_rate)
+    last = INSTANTS[-1] / RATE - CUT_MAX
     if times[-1] - times[0] < last:
-        raise VideoError(f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.0f} s")
-    registration, wanders = _register(times, tracks, camera, start)
+        raise VideoError(f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.1f} s")
+    if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
+        raise VideoError(f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}")
+    registration, wanders = _register(times, tracks, calibration.camera, start)
     if reasons := registration.refusals():
         raise VideoError("; ".join(reasons))
-    instants, chosen = _frames_of(times, registration.start)
-    crops = _cut(path, calibration, chosen, instants, np.asarray(registration.offset) + wanders[chosen])
-    return crops, instants, registration
-
-
-def save_clip(
-    path: Path, crops: torch.Tensor, instants: tuple[int, ...], calibration: Calibration, registration: Registration
-) -> None:
-    """Write what `import_video` returned; `load_clip` reads it."""
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        crops=np.round(crops.numpy() * 255).astype(np.uint8),
-        instants=np.array(instants),
-        direction=np.asarray(calibration.camera.rotation[2], dtype=np.float32),
-        registration=np.array(json.dumps(asdict(registration))),
-    )
-    write_durably(path, buffer.getvalue())
-
-
-def load_clip(path: str | Path) -> Clips:
-    """Read an imported clip, of which nothing is known to be true."""
-    try:
-        with np.load(path) as file:
-            frames, _ = frames_at(tuple(file["instants"].tolist()))
-            crops = torch.from_numpy(file["crops"][frames].astype(np.float32) / 255)[None]
-            direction = torch.from_numpy(file["direction"])[None]
-    except (KeyError, OSError, ValueError) as error:
-        raise ValueError(f"{path} must be a clip that `cloth import` wrote: {error}") from error
+    chosen, instants = frames_at((times - registration.start) * RATE)
+    crops = _cut(path, calibration, chosen, instants, np.asarray(registration.offset) + wanders[chosen])[None]
     unknown = np.array([-1])
-    return Clips(
+    clip = Clips(
         crops=crops,
-        direction=direction,
+        direction=torch.tensor(calibration.camera.rotation[2])[None],
         material=unknown,
         mu=np.array([math.nan]),
         landed=unknown,
         run=np.array([0]),
-        fabric=np.full((1, len(FABRIC)), math.nan),
+        cover=torch.full_like(crops, math.nan),
     )
+    return clip, registration
 
 
 # --- following the holders -------------------------------------------------------------------------------------
@@ -245,7 +216,10 @@ def holder_points(instants: Array) -> Floats:
 
 
 def _follow(
-    path: str | Path, calibration: Calibration, holders: tuple[float, float, float, float] | None
+    path: str | Path,
+    calibration: Calibration,
+    holders: tuple[float, float, float, float] | None,
+    frame_rate: float | None,
 ) -> tuple[Floats, Floats]:
     """Return times (N,), and places (N, 2, 2) of the held patches without distortion [px]."""
     try:
@@ -268,7 +242,8 @@ def _follow(
     places: list[Any] = []
     before = kept = None
     place = kept_place = seen.astype(np.float32)[:, None]
-    for time, picture in _frames(path):
+    for number, (shown, picture) in enumerate(_frames(path)):
+        time = shown if frame_rate is None else number / frame_rate
         height, width = picture.shape
         if (width, height) != (camera.width, camera.height):
             raise VideoError(
@@ -331,9 +306,7 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
         return float(fit.x[0])
 
     if start is None:
-        coarse = np.arange(times[0], times[-1] - 30.0, 0.5)
-        if not len(coarse):
-            raise VideoError(f"the video must last more than 30 s, and lasts {times[-1] - times[0]:.0f} s")
+        coarse = np.arange(times[0] - CUT_MAX, times[-1] - 30.0, 0.5)
         every = slice(None, None, max(1, len(times) // 600))
         near = float(coarse[np.argmin([np.abs(off(t, every)).sum() for t in coarse])])
         t0 = found(slice(None), near)
@@ -364,43 +337,26 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
     )
 
 
-def _frames_of(times: Floats, start: float) -> tuple[tuple[int, ...], "NDArray[np.int64]"]:
-    """Return the instants of a clip that the video shows, and the frame that is nearest to each."""
-    instants = np.array(shown_frames(FRAMES, ALL_INSTANTS))
-    wanted = start + instants / RATE
-    shown = wanted <= times[-1] + LATE_MAX
-    frames = np.array([int(np.abs(times - time).argmin()) for time in wanted[shown]])
-    late = np.abs(times[frames] - wanted[shown])
-    for instant in INSTANTS:
-        place = np.flatnonzero(instants[shown] == instant)
-        if not len(place) or late[place[0]] > LATE_MAX:
-            raise VideoError(
-                f"the video must have a frame within {LATE_MAX:g} s of {start + instant / RATE:.1f} s, and has none"
-            )
-    return tuple(instants[shown].tolist()), frames
-
-
 def _cut(
     path: str | Path,
     calibration: Calibration,
-    chosen: "NDArray[np.int64]",
-    instants: tuple[int, ...],
+    chosen: list[int],
+    instants: tuple[float, ...],
     off: Floats,
 ) -> torch.Tensor:
     """Return the crops of some frames, whose holders are `off` (F, 2) [px]."""
     import cv2
 
     camera = calibration.camera
-    wanted = set(chosen.tolist())
     pictures = {}
     for number, (_, picture) in enumerate(_frames(path)):
-        if number in wanted:
+        if number in chosen:
             flat = cv2.undistort(picture, _intrinsics(camera), np.array(calibration.distortion or (0.0,) * 4))
             pictures[number] = torch.from_numpy(flat.astype(np.float32) / 255)
     crops = holder_crops(Cameras.of([camera]), instants)
     place = Crops(crops.origin + torch.from_numpy(off.astype(np.float32))[None], crops.scale)
     parts = [
         cut(pictures[number][None, None], Crops(place.origin[:, frame : frame + 1], place.scale[:, frame : frame + 1]))
-        for frame, number in enumerate(chosen.tolist())
+        for frame, number in enumerate(chosen)
     ]
     return torch.cat(parts, dim=1)[0]
