@@ -20,8 +20,8 @@ Parts = list[list[Lease]]
 RENDERS_TOGETHER = 12
 """Renders of one shading that one call makes at most; so many are leased ahead, for they cost little more than one."""
 
-SHORT_SECONDS = 0.5
-"""Renders that share no shading are one call, if they take so long together [s]: a call costs some milliseconds."""
+SHORT_SECONDS = 1.0
+"""Renders that share no shading are one call, if they take so long together [s]: a call costs 10 ms."""
 
 MOST_TOGETHER = 16
 """Renders that share no shading in one call, and calls that wait here for each CPU, are no more than so many."""

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ LOOK_SECONDS = 2.0
 
 AHEAD_SHARE, LEAST_AHEAD = 0.5, 4
 """Calls that wait in Ray: so many for each CPU, and so many at least. An autoscaler adds nodes for what waits."""
+
+WARM_UP_SECONDS = 10.0
+"""The first tasks wait so long for processes to start [s]."""
 
 CALLS_PER_PROCESS = 1000
 """Calls after which a process gives way to a fresh one: Blender's memory grows slowly."""
@@ -80,6 +84,8 @@ class Calls:
         self._builds = builds
         self._calls: dict[Any, Call] = {}
         self._foreign: set[str] = set()
+        self._warm: set[str] = set()
+        """Nodes on which processes were started."""
         self._next_look = 0.0
         self.cpus = 0.0
         """CPUs that calls may use, of the nodes that are there now."""
@@ -95,9 +101,8 @@ class Calls:
             ),
         }
         list(self._look())
-        for _ in range(int(self.cpus)):  # the first job should not have to wait for Blender
-            for stage in (Stage.render, Stage.simulate):
-                self.give([], stage)
+        if self._calls:  # tasks that come while processes start would start more
+            ray.wait(list(self._calls), num_returns=len(self._calls), timeout=WARM_UP_SECONDS)
 
     def __iter__(self) -> Iterator[Call]:
         return iter(list(self._calls.values()))
@@ -113,16 +118,16 @@ class Calls:
         long = sum(one.runs_longer_than(self._settings.clog_seconds) and not one.is_express for one in self)
         return 0 < self.cpus <= long
 
-    def give(self, parts: Parts, stage: Stage, *, is_express: bool = False) -> None:
+    def give(self, parts: Parts, stage: Stage, *, is_express: bool = False, node: str = "") -> None:
         """Give a call to Ray, without tasks only to start a process. An express one needs no free CPU."""
         renders = stage is Stage.render
         settings = self._settings
         options: dict[str, Any] = {"num_cpus": 0 if is_express else 1, "memory": memory_bytes(stage, parts)}
-        if self._foreign:
-            options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self._foreign))})"}
+        if node or self._foreign:
+            options["label_selector"] = {"ray.io/node-id": node or f"!in({','.join(sorted(self._foreign))})"}
         reference = (
             self._remote[renders]
-            .options(name=stage.value, **options)
+            .options(name=stage.value if parts else "warm-up", **options)
             .remote(
                 settings.render_actor if renders else STAGES,
                 settings.store,
@@ -185,6 +190,11 @@ class Calls:
         cpus = sum(node["Resources"].get("CPU", 0) for name, node in nodes.items() if name not in self._foreign)
         self.cpus = min(cpus, self._settings.max_cpus or math.inf)
         self._next_look = time.monotonic() + LOOK_SECONDS
+        for name in nodes.keys() - self._warm:  # its first tasks should not have to wait for Blender
+            self._warm.add(name)
+            for _ in range(min(int(nodes[name]["Resources"].get("CPU", 0)), self._settings.max_cpus or sys.maxsize)):
+                for stage in (Stage.simulate, Stage.render):
+                    self.give([], stage, is_express=True, node=name)
         for reference, one in list(self._calls.items()):
             if one.node and one.node not in nodes:
                 del self._calls[reference]

@@ -88,10 +88,10 @@ class Dispatcher:
             if self._heartbeat is not None:
                 self._heartbeat.session_lost.set()  # now it can say what it makes
             self._await(connected)
+            builds = {who: said["builds"] for who, said in self._described.items()}
             if not self._stopping:
-                calls = self._calls = Calls(
-                    self._settings, {who: said["builds"] for who, said in self._described.items()}
-                )
+                calls = self._calls = self._await(in_thread(lambda: Calls(self._settings, builds)))
+            if not self._stopping:
                 self._status.state, self._status.reason = "ready", calls.trouble
                 self._status.slots = int(calls.cpus)
                 self._tell()
@@ -241,7 +241,7 @@ class Dispatcher:
         for stage in self._pace.order():
             while self._queues[stage] and calls.room(is_long=self._pace.is_long()) > 0:
                 calls.give(self._pace.next_parts(self._queues[stage], self._alone), stage)
-        if (short := self._express(calls)) and not any(one.is_express for one in calls):
+        if (short := self._express(calls)) and not any(one.is_express and one.parts for one in calls):
             stage = Stage(short[0].task.stage)
             calls.give(self._pace.next_parts(short, self._alone), stage, is_express=True)
 
@@ -298,7 +298,7 @@ class Dispatcher:
         """Return how many tasks to ask for: little more than what can run, so that a kill gives little back."""
         pace = self._pace
         if calls.is_clogged():
-            is_free = not (self._express(calls) or any(one.is_express for one in calls))
+            is_free = not (self._express(calls) or any(one.is_express and one.parts for one in calls))
             return {stage: LARGEST_BATCH if stage is Stage.simulate else 1 for stage in Stage} if is_free else {}
         queued = sum(pace.calls(stage, queue) for stage, queue in self._queues.items())
         room = max(calls.room(is_long=pace.is_long()), 0)

@@ -29,6 +29,8 @@ SETTINGS = {
     "RAY_event_stats": "0",
     "RAY_task_events_report_interval_ms": "0",  # nobody reads the history of tasks
     "RAY_prestart_worker_first_driver": "0",
+    "RAY_num_workers_soft_limit": "0",  # Ray also starts so many for calls that wait, and they come too late
+    "RAY_idle_worker_killing_time_threshold_ms": "86400000",  # Blender takes seconds to start: idle processes stay
     "RAY_raylet_report_resources_period_milliseconds": "1000",  # small tasks cost less where Ray looks seldom
     "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
     "RAY_memory_monitor_refresh_ms": "1000",
@@ -54,9 +56,7 @@ def main(directory: Path, cpus: int | None) -> None:
     (directory / "token").touch(mode=0o600)
     (directory / "token").write_text(secrets.token_hex(32))
     cpus = cpus or len(os.sched_getaffinity(0))
-    # Idle processes stay, one of each interpreter and CPU and some more: Blender takes seconds to start.
-    os.environ |= SETTINGS | {"RAY_num_workers_soft_limit": str(max(16, 3 * cpus))}
-    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(directory / "token")}
+    os.environ |= SETTINGS | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(directory / "token")}
     from ray._private import services
     from ray.scripts.scripts import main as ray
 
