@@ -88,8 +88,7 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
         for upload in uploads
     ]
-    lost = f"/v1/datasets/{dataset.dataset}/versions/{dataset.version}/page"
-    return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs", lost]
+    return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs"]
 
 
 def certificate(extent: Literal["full", "quick"]) -> CertificateUpload:

@@ -119,7 +119,12 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     assert "it fell &lt;b&gt;off&lt;/b&gt;" in page
     path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)
     assert path is not None
-    assert "(50.0 %)" in read(client, path[0])
+    dataset = read(client, path[0])
+    assert "(50.0 %)" in dataset
+    assert "<td>50.00 %</td>" in dataset
+    assert "gamma 1, phi1 1: 0 of 1 done, 1 lost" in dataset
+    assert "gamma 2, phi1 1: 1 of 1 done<" in dataset
+    assert "it fell &lt;b&gt;off&lt;/b&gt;" in dataset
     assert "This sample was rejected: solver diverged" in read(client, f"{path[0]}/samples/0")
 
 
@@ -214,3 +219,31 @@ def test_a_scene_of_a_job_is_listed(app: FastAPI, client: httpx.Client) -> None:
     found = re.search(r'href="(/scenes/[0-9a-f]{64})">my-ball<', read(client, "/scenes"))
     assert found
     assert "&lt;b&gt;mine&lt;/b&gt;" in read(client, found[1])
+
+
+def test_jobs_are_searched_filtered_and_ordered(client: httpx.Client, app: FastAPI) -> None:
+    first, second = submit(client, name="first"), submit(client, name="second", gamma=(3.0,))
+    client.post(f"/ui/jobs/{second}/cancel")
+
+    def shown(query: str) -> list[str]:
+        return re.findall(r'<a href="/jobs/(job-[0-9a-z]+)">', read(client, f"/ui/jobs?{query}"))
+
+    assert shown("") == [second, first]
+    assert shown("order=oldest") == [first, second]
+    assert shown("search=SECO") == shown("state=cancelled") == [second]
+    assert shown(f"search={first[-6:]}&state=&project=") == [first]
+    assert shown("search=%25") == []
+    assert "No job fits" in read(client, "/?search=third")
+    assert 'value="cancelled" selected' in read(client, "/?state=cancelled")
+    assert client.get("/?state=odd").status_code == 422
+    found = client.get("/v1/jobs", params={"search": "first", "state": "queued"}).json()["items"]
+    assert [job["id"] for job in found] == [first]
+
+
+def test_a_browser_gets_errors_as_a_page(client: httpx.Client) -> None:
+    page = client.get("/jobs/<b>", headers={"Accept": "text/html,*/*"})
+    assert (page.status_code, page.headers["content-type"]) == (404, "text/html; charset=utf-8")
+    assert "there is no job &#39;&lt;b&gt;&#39;" in page.text
+    assert client.get("/nowhere", headers={"Accept": "text/html"}).text.startswith("<!doctype html>")
+    for path in ("/jobs/nothing", "/v1/jobs/nothing"):
+        assert client.get(path).headers["content-type"] == "application/problem+json"

@@ -65,7 +65,8 @@ def is_on() -> bool:
 
 def span(name: str, *, parent: str | None, **attributes: Any) -> AbstractContextManager[Span]:
     """Open a span below `parent`, a traceparent; one that is no traceparent counts as none."""
-    return use_span(_started(name, parent, attributes), end_on_exit=True)
+    opened: AbstractContextManager[Span] = use_span(_started(name, parent, attributes), end_on_exit=True)
+    return opened
 
 
 def traceparent() -> str | None:

@@ -12,6 +12,7 @@ from starlette.routing import Match, Route
 from stickslip_schemas.documents.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
 
 from stickslip_services import errors
+from stickslip_services.api.html import html_page
 
 logger = logging.getLogger(__name__)
 
@@ -106,6 +107,9 @@ def install(app: FastAPI) -> None:
 
 def _answer(request: Request, status: int, code: ProblemCode, detail: str, **rest: Any) -> Response:
     request_id = getattr(request.state, "request_id", None)
+    if "text/html" in request.headers.get("accept", "") and not request.url.path.startswith("/v1/"):
+        title = code.replace("_", " ").capitalize()
+        return html_page("error.html", status, title=title, detail=detail, request_id=request_id, here="")
     return problem_response(status, code, detail, path=request.url.path, request_id=request_id, **rest)
 
 

@@ -1,13 +1,14 @@
 """Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise and cancel."""
 
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
-from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import FileUpload, JobDetail, TextureEntry
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.plan.grid import count
@@ -113,10 +114,13 @@ def jobs(
     url: UrlOption = DEFAULT_URL,
     as_json: JsonOption = False,
     limit: Annotated[int, typer.Option(min=1, help="the most jobs to list")] = 50,
+    search: Annotated[str, typer.Option(help="a part of the name, kind, id or dataset")] = "",
+    state: Annotated[JobState | None, typer.Option(help="only jobs in this state")] = None,
+    project: Annotated[str, typer.Option(help="only jobs of this project")] = "",
 ) -> None:
     """List jobs, newest first."""
     with Client(url) as client:
-        found = [job for job, _ in zip(client.jobs(), range(limit), strict=False)]
+        found = list(islice(client.jobs(search=search, state=state, project=project), limit))
     if as_json:
         return print_json(found)
     columns = ("job", "name", "kind", "state", "samples", "rejected", "tasks", "time left", "dataset")

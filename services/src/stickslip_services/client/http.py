@@ -12,7 +12,7 @@ from typing import Any, Self, TypeVar
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
 from stickslip_schemas.documents.responses import (
     CertificateEntry,
@@ -135,9 +135,10 @@ class Client:
         """Return a job."""
         return self._call(JobDetail, "GET", f"/v1/jobs/{job_id}")
 
-    def jobs(self) -> Iterator[Job]:
-        """Yield all jobs, newest first."""
-        return self._items(Page[Job], "/v1/jobs")
+    def jobs(self, *, search: str = "", state: JobState | None = None, project: str = "") -> Iterator[Job]:
+        """Yield jobs, newest first; `search` is a part of the name, kind, id or dataset."""
+        query = {"search": search, "state": str(state or ""), "project": project}
+        return self._items(Page[Job], "/v1/jobs", {name: value for name, value in query.items() if value})
 
     def samples(self, job_id: str, *, state: TaskState | None = None) -> Iterator[SampleState]:
         """Yield the samples of a job by slot."""

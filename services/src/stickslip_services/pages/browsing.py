@@ -6,10 +6,11 @@ from math import prod
 from typing import Any
 
 import numpy as np
+from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.pages.grid_map import MOST_SAMPLES
+from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
 from stickslip_services.pages.plots import line_plot
 from stickslip_services.pages.sample_data import SampleData
 
@@ -53,6 +54,16 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
         "pictured": _pictured(data),
         "picture_index": _telling_picture(data),
     }
+
+
+def losses(data: SampleData) -> dict[str, Any]:
+    """Return the context of the rejected samples: the first of them, and maps of where they are in the grid."""
+    spec, lost = data.manifest.spec, data.rejections(MOST_SAMPLES)
+    maps = None
+    if lost and spec.sample_count <= MOST_SAMPLES:
+        states = [TaskState.rejected if slot in lost else TaskState.succeeded for slot in range(spec.sample_count)]
+        maps = grid_maps(spec, states)
+    return {"lost": list(lost.values())[:SHOWN_THUMBS], "maps": maps, "count": spec.sample_count}
 
 
 def _pictured(data: SampleData) -> str | None:

@@ -4,9 +4,9 @@ import json
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, func, select
+from sqlalchemy import Connection, Row, Select, func, or_, select
 from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import Reason, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 from stickslip_schemas.kinds import job_spec_adapter
 
@@ -72,11 +72,38 @@ def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
     return detail
 
 
-def list_jobs(context: Context, connection: Connection, page: PageRequest) -> Page[Job]:
-    """Return a page of jobs, newest first."""
+def list_jobs(
+    context: Context,
+    connection: Connection,
+    page: PageRequest,
+    search: str = "",
+    state: JobState | None = None,
+    project: str = "",
+    *,
+    newest_first: bool = True,
+) -> Page[Job]:
+    """Return a page of jobs: those of a state and of a project, with `search` in the name, kind, id or dataset."""
     workers = alive_workers(context, connection)
     query = select(jobs).where(own(jobs.c.project))
-    return read_page(connection, query, page, jobs.c.seq, lambda rows: _shown(connection, rows, workers, {}))
+    if search:
+        places = (jobs.c.name, jobs.c.kind, jobs.c.id, jobs.c.dataset)
+        query = query.where(or_(*(place.icontains(search, autoescape=True) for place in places)))
+    query = query if state is None else query.where(jobs.c.state == state)
+    query = query.where(jobs.c.project == project) if project else query
+    return read_page(
+        connection,
+        query,
+        page,
+        jobs.c.seq,
+        lambda rows: _shown(connection, rows, workers, {}),
+        newest_first=newest_first,
+    )
+
+
+def job_projects(connection: Connection) -> list[str]:
+    """Return the projects that have jobs which the asker sees."""
+    query = select(jobs.c.project).where(own(jobs.c.project)).distinct()
+    return list(connection.scalars(query.order_by(jobs.c.project)))
 
 
 def list_samples(connection: Connection, job: int, page: PageRequest, state: TaskState | None) -> Page[SampleState]:

@@ -12,17 +12,14 @@ from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
 
 from stickslip_services.api.files import picture_format, serve
 from stickslip_services.api.routes.common import ContextDep, PageDep, file_responses, problem_responses
-from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets, read_contents
+from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.dataset_page import dataset_page
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import is_preview
 
 router = APIRouter(tags=["datasets"])
 
 Version = Annotated[int, Path(ge=1, lt=2**31)]
-
-_INERT = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
 
 _BINARY_SCHEMA = {"schema": {"type": "string", "format": "binary"}}
 _BINARY = {"application/octet-stream": _BINARY_SCHEMA}
@@ -62,13 +59,6 @@ _MANIFEST_CONTENT: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/
 def get_manifest(dataset: str, version: Version, request: Request, context: ContextDep) -> Response:
     """Return the manifest: every file of the version with its digest, the spec and the builds."""
     return _serve(request, context, dataset, version, MANIFEST_NAME)
-
-
-@router.get("/v1/datasets/{dataset}/versions/{version}/page", include_in_schema=False)
-def get_page(dataset: str, version: Version, context: ContextDep) -> Response:
-    """Return the HTML page of a version: its acceptance rate, and the rejected samples in the grid."""
-    file = _find(context, dataset, version, MANIFEST_NAME)
-    return Response(dataset_page(read_contents(context.store, file.sha256)), media_type="text/html", headers=_INERT)
 
 
 @router.get(

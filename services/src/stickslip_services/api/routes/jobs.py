@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec
@@ -85,10 +85,16 @@ def validate_job(spec: SpecBody, context: ContextDep) -> Validation:
 
 
 @router.get("/v1/jobs", responses=problem_responses(422))
-def get_jobs(page: PageDep, context: ContextDep) -> Page[Job]:
+def get_jobs(
+    page: PageDep,
+    context: ContextDep,
+    search: Annotated[str, Query(max_length=100, description="part of the name, kind, id or dataset")] = "",
+    state: Annotated[JobState | None, Query(description="only jobs in this state")] = None,
+    project: Annotated[str, Query(max_length=100, description="only jobs of this project")] = "",
+) -> Page[Job]:
     """List jobs, newest first."""
     with context.database.read() as connection:
-        return list_jobs(context, connection, page)
+        return list_jobs(context, connection, page, search, state, project)
 
 
 @router.get(

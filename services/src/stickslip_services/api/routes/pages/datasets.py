@@ -12,12 +12,12 @@ from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
+from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.browsing import histograms, sample_view, sliders, thumbs
+from stickslip_services.pages.browsing import histograms, losses, sample_view, sliders, thumbs
 from stickslip_services.pages.sample_data import SampleData
 from stickslip_services.queue.context import Context
 
@@ -48,7 +48,7 @@ def get_dataset(dataset: str, context: ContextDep) -> Response:
 def get_version(request: Request, dataset: str, version: Version, context: ContextDep) -> Response:
     """Show a version."""
     found, committed, data = _open(context, dataset, version)
-    values = thumbs(data, request.query_params, 0)
+    values = thumbs(data, request.query_params, 0) | losses(data)
     return html_page(
         "dataset.html",
         here="datasets",

@@ -2,18 +2,20 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Any
+from typing import Annotated, Any, Literal
+from urllib.parse import urlencode
 
 import yaml
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Query, Response
+from pydantic import BaseModel, Field
 from sqlalchemy import Connection
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 
+from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.api.sse import EventStream
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
@@ -22,6 +24,7 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job
 from stickslip_services.queue.jobs import (
     find_job,
+    job_projects,
     list_jobs,
     list_samples,
     newest_previews,
@@ -34,7 +37,7 @@ from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter()
 
-SHOWN_JOBS = 30
+SHOWN_JOBS = 50
 
 SHOWN_LOST = 50
 
@@ -42,24 +45,46 @@ CHANGE_SECONDS = 1.0
 """Least time between two updates of a page [s]."""
 
 
+class JobFilter(BaseModel):
+    """What the form of the list asks for; all of it stands in the address of the page."""
+
+    search: str = Field("", max_length=100)
+    state: JobState | Literal[""] = ""
+    project: str = Field("", max_length=100)
+    order: Literal["newest", "oldest"] = "newest"
+    after: int | None = Field(None, ge=0, lt=10**18)
+
+
+FilterDep = Annotated[JobFilter, Query()]
+
+
 @router.get("/")
-def get_jobs(context: ContextDep) -> Response:
+def get_jobs(context: ContextDep, chosen: FilterDep) -> Response:
     """Show the jobs."""
-    return html_page("jobs.html", here="jobs", url=context.settings.url, **_jobs(context))
+    return html_page("jobs.html", here="jobs", url=context.settings.url, **_jobs(context, chosen))
 
 
 @router.get("/ui/jobs")
-def get_jobs_part(context: ContextDep) -> Response:
+def get_jobs_part(context: ContextDep, chosen: FilterDep) -> Response:
     """Show the list of jobs without its page."""
-    return html_page("jobs_list.html", **_jobs(context))
+    return html_page("jobs_list.html", **_jobs(context, chosen))
 
 
-def _jobs(context: Context) -> dict[str, Any]:
+def _jobs(context: Context, chosen: JobFilter) -> dict[str, Any]:
     with context.database.read() as connection:
-        workers = alive_workers(context, connection)
-        jobs = list_jobs(context, connection, PageRequest(SHOWN_JOBS, None)).items
-        pictures = {job.id: newest_previews(connection, find_job(connection, job.id).seq, 5) for job in jobs[:10]}
-    return {"jobs": jobs, "pictures": pictures, "workers": len(workers), "states": JobState}
+        page = list_jobs(
+            context,
+            connection,
+            PageRequest(SHOWN_JOBS, chosen.after),
+            chosen.search,
+            chosen.state or None,
+            chosen.project,
+            newest_first=chosen.order == "newest",
+        )
+        values = {"workers": len(alive_workers(context, connection)), "projects": job_projects(connection)}
+    query = chosen.model_dump(mode="json", exclude_defaults=True)
+    more = None if page.next_page_token is None else urlencode(query | {"after": page.next_page_token})
+    return values | {"jobs": page.items, "more": more, "chosen": chosen, "query": query, "states": JobState}
 
 
 @router.get("/jobs/{job_id}")

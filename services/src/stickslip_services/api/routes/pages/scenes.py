@@ -2,8 +2,8 @@
 
 from fastapi import APIRouter, Response
 
+from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.catalog.scenes import find_scene, known_scenes
 
 router = APIRouter()

@@ -8,8 +8,8 @@ from fastapi import APIRouter, Request, Response
 from sqlalchemy import Connection
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 
+from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.api.routes.pages.common import html_page
 from stickslip_services.catalog.certificates import find_certificate, list_certificates
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest

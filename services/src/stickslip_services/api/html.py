@@ -1,4 +1,4 @@
-"""Shared by the routes of pages: HTML with its security headers."""
+"""HTML as a response, with its security headers."""
 
 from typing import Any
 
@@ -16,6 +16,6 @@ _POLICY = {
 }
 
 
-def html_page(template: str, **values: Any) -> Response:
+def html_page(template: str, status: int = 200, **values: Any) -> Response:
     """Return a rendered template as a response; everything that it loads comes from this server."""
-    return Response(render(template, **values), media_type="text/html", headers=_POLICY)
+    return Response(render(template, **values), status, media_type="text/html", headers=_POLICY)
