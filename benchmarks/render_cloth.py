@@ -110,7 +110,7 @@ class Bench:
         light[window.slices] = self.scene.direct(
             shot, self.pictures[texture], REFERENCE if view.substrate.name == "matt" else SMOOTH, window
         )
-        picture = encode(self.scene.composer.on_floor(light, shot.points, camera, floor))[window.slices]
+        picture = encode(light * self.scene.composer.floor_factor(shot.points, camera, floor))[window.slices]
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             np.save(kept, picture)
@@ -140,7 +140,7 @@ class Bench:
         start = time.process_time()
         light = self.scene.direct(shot, self.pictures[texture], sampling)
         spent = time.process_time() - start
-        return encode(self.scene.composer.on_floor(light, shot.points, self.rig[view.view], floor)), spent
+        return encode(light * self.scene.composer.floor_factor(shot.points, self.rig[view.view], floor)), spent
 
     def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
         """Return which pixels of a window the cloth covers by half or more."""
@@ -280,7 +280,11 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
         assert isinstance(result.output, RenderOutput)
         shape = (len(TEXTURES), len(look.instants), 224, 224, 3)
         clips = np.empty(shape, dtype=np.uint8)
-        for clip, where in zip(clips, result.output.clips.values(), strict=True):
+        labels = []
+        for clip, own in zip(clips, result.output.clips.values(), strict=True):
+            assert isinstance(own.output, RenderOutput), own.message
+            where = own.output.chunks["video"]
+            labels.append(own.output.labels["psnr_cloth"])
             decode_clip(store.read(where.digest, offset=where.offset, length=where.length), clip)
         actor.close()
     np.save(out, clips)
@@ -288,7 +292,7 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
     print(
         f"{', '.join(map(str, look_of_clip.values()))}: {every / (shape[0] * shape[1]):.4f} CPU s per frame and "
         f"texture; Blender {blender:.2f} s, all else {every - blender:.2f} s ({100 * (every / blender - 1):.1f} %); "
-        f"gate {result.output.labels['gate_db']:.1f} dB",
+        f"PSNR {labels}",
         flush=True,
     )
 
@@ -321,7 +325,7 @@ def main() -> None:
     qualities = {str(quality): sampling for quality, sampling in CLOTH_SAMPLING.items()}
     for pair in options.also:
         frame, window = map(int, pair.split("+"))
-        qualities[pair] = ClothSampling(frame=frame, window=window)
+        qualities[pair] = ClothSampling(frame, window, (0.0, 0.0, 0.0))
     chosen = list(shots(bench.track, options.frames, ("matt",)))
     bench.composed(chosen[0], CLOTH_SAMPLING[Quality.draft])  # shaders are compiled once
     if options.look or options.ground_truth:

@@ -96,13 +96,13 @@ def report(dataset: Path, database: Path, job: str, wall: float) -> None:
 
 
 def _print_labels(dataset: Path) -> None:
-    """Print what the image gate found, and how large the cloth is in the frame."""
+    """Print how good the worst clip is, and how large the cloth is in the frame."""
     import zarr
 
     group: Any = zarr.open_group(dataset, mode="r")
     valid = np.asarray(group["valid"])
-    gate, composed, share = (np.asarray(group[name])[valid] for name in ("gate_db", "composed", "frame_share"))
-    found = {"composed": int(composed.sum()), "gate_db, least": float(gate.min()), "frame_share": float(share.mean())}
+    least = {f"{name}, least": float(np.nanmin(np.asarray(group[name])[valid])) for name in ("psnr_cloth", "psnr_edge")}
+    found = least | {"frame_share": float(np.asarray(group["frame_share"])[valid].mean())}
     console.print(f"  {json.dumps(found)}")
 
 

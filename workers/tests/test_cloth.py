@@ -17,13 +17,13 @@ from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, SimulateTask
 from stickslip_schemas.format.codecs import encode_clip, encode_trajectory
 from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import Manifest, Pictures, Rejection
+from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
 from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth.spec import PICTURE_DECIBELS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
+from stickslip_schemas.spec.appearance import REGIONS
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
@@ -222,9 +222,10 @@ def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
-            shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": (), "gate_db": ()}
+            shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": ()}
+            shown |= {f"psnr_{region}": () for region in REGIONS} | {"psnr_deviation": 3}
             seen = {name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()}
-            seen |= {"light_seed": i, "composed": i != 1, "lighting": "drawn", "substrate": "ceramic"}
+            seen |= {"light_seed": i, "lighting": "drawn", "substrate": "ceramic"}
             labels = sample.labels | result.output.labels | seen
             arrays["valid"][i] = True
             codes = {"kernel": 0, "lighting": 0, "substrate": 3}
@@ -299,13 +300,20 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
     assert manifest.pictures == Pictures(
         quality=Quality.standard,
-        psnr_db=PICTURE_DECIBELS[Quality.standard],
-        gate_db=round(float(made.arrays["gate_db"][made.arrays["valid"]].min()), 2),
+        psnr={
+            region: Psnr(
+                clips=5,
+                median=round(float(np.median(values)), 2),
+                worst=round(float(np.quantile(values, 0.01)), 2),
+                deviation=round(float(np.median(made.arrays["psnr_deviation"][made.arrays["valid"], number])), 2),
+            )
+            for number, region in enumerate(REGIONS)
+            if (values := made.arrays[f"psnr_{region}"][made.arrays["valid"]]).size
+        },
         frame_share=round(float(made.arrays["frame_share"][made.arrays["valid"]].mean()), 4),
         device="cpu",
-        direct_slots=(1,),
     )
-    assert "rendered directly instead: 1." in (directory / "README.md").read_text()
+    assert "PSNR of its clips [dB]" in (directory / "README.md").read_text()
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 2)
     assert manifest.cameras == load_rig("drag")

@@ -14,7 +14,6 @@ from PIL import Image
 from publishing import changed
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.manifest import Contents, Manifest, Pictures, check_seal
-from stickslip_schemas.kinds.rod_hang import PICTURE_DECIBELS
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.publish import publish
@@ -119,8 +118,7 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     assert sum(manifest.split_counts.values()) == 6
     assert [camera.name for camera in manifest.cameras]
     assert manifest.acceptance_rate == pytest.approx(6 / 7)
-    level = PICTURE_DECIBELS[Quality.standard]
-    assert manifest.pictures == Pictures(quality=Quality.standard, psnr_db=level, gate_db=None, direct_slots=())
+    assert manifest.pictures == Pictures(quality=Quality.standard, psnr={})
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 1)
 

@@ -52,6 +52,10 @@ def test_what_ray_raises(error: Exception, renders: bool, reason: Reason) -> Non
     assert process_failure(error, renders=renders).reason is reason
 
 
+def done(number: int) -> TaskResult:
+    return TaskResult(outcome="succeeded", output=RenderOutput(chunks={"video": chunk(number)}, labels={}))
+
+
 def clip(texture: str, *, preview: bool = False, record: RecordRef = RECORD, **look: object) -> RenderTask:
     shown = {
         "rig": "drag",
@@ -94,16 +98,18 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     asked = merged(tasks)
     assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
     depth = {"depth": chunk(9)}
-    output = RenderOutput(
-        chunks=depth,
-        labels={"light_seed": 1},
-        clips={name: chunk(number) for number, name in enumerate(asked.textures)},
-        previews=dict.fromkeys(asked.textures, "e" * 64),
-    )
+    made = [
+        RenderOutput(chunks={"video": chunk(number), **depth}, preview="e" * 64, labels={"psnr_cloth": 40.0 + number})
+        for number in range(2)
+    ]
+    poor = TaskResult(outcome="rejected", reason=Reason.poor_pictures, message="psnr_edge")
+    all_three = [*(TaskResult(outcome="succeeded", output=one) for one in made), poor]
+    output = RenderOutput(chunks={}, labels={}, clips=dict(zip(asked.textures, all_three, strict=True)))
     results = split(tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0))
-    assert [result.output.chunks for result in results] == [{"video": chunk(n), **depth} for n in range(3)]
-    assert [result.output.preview for result in results] == [None, "e" * 64, None]
-    assert all(result.output.labels == {"light_seed": 1} for result in results)
+    assert [result.output.chunks for result in results[:2]] == [{"video": chunk(n), **depth} for n in range(2)]
+    assert [result.output.preview for result in results[:2]] == [None, "e" * 64]
+    assert [result.output.labels for result in results[:2]] == [{"psnr_cloth": 40.0}, {"psnr_cloth": 41.0}]
+    assert (results[2].outcome, results[2].reason) == ("rejected", Reason.poor_pictures)
     assert [(result.cpu_seconds, result.wall_seconds) for result in results] == [(2.0, 1.0)] * 3
 
 
@@ -113,7 +119,7 @@ def test_textures_of_the_users_own_go_by_their_pictures() -> None:
     tasks = [clip("dots"), clip("logo", image=one), clip("logo", image=other), clip("brand", image=one)]
     asked = merged(tasks)
     assert asked.textures == ("dots", one, other)
-    output = RenderOutput(chunks={}, labels={}, clips={name: chunk(n) for n, name in enumerate(asked.textures)})
+    output = RenderOutput(chunks={}, labels={}, clips={name: done(n) for n, name in enumerate(asked.textures)})
     results = split(tasks, TaskResult(outcome="succeeded", output=output))
     assert [result.output.chunks["video"] for result in results] == [chunk(n) for n in (0, 1, 2, 1)]
 
@@ -122,6 +128,6 @@ def test_what_is_wrong_with_a_shading_is_wrong_with_all_its_clips() -> None:
     tasks = [clip("dots"), clip("plaid")]
     out = TaskResult(outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0)
     assert [(result.reason, result.cpu_seconds) for result in split(tasks, out)] == [(Reason.out_of_frame, 1.0)] * 2
-    lacking = RenderOutput(chunks={}, labels={}, clips={"dots": chunk(0)})
+    lacking = RenderOutput(chunks={}, labels={}, clips={"dots": done(0)})
     results = split(tasks, TaskResult(outcome="succeeded", output=lacking))
     assert {result.outcome for result in results} == {"failed"}

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,11 @@ from PIL import Image
 from pydantic import ValidationError
 from stickslip_blender.actor import RenderActor
 from stickslip_blender.build import roots
-from stickslip_blender.cloth import clips
-from stickslip_blender.cloth.clips import GATE
+from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.looks import drawn_light
 from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cloth.substrates import drawn_substrate
+from stickslip_blender.cycles.engine import CLOTH_SAMPLING
 from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_linear
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.base.states import Reason
@@ -154,8 +155,6 @@ def test_what_is_not_the_samples_fault_is_raised(actor: RenderActor, store: Dire
 _CRASH = """
 import json, os, signal, sys
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.cloth import clips
-from stickslip_blender.cloth.clips import GATE
 from stickslip_blender.cycles.pixels import FrameReader
 FrameReader.read_matte = lambda self, window=None: os.kill(os.getpid(), signal.SIGKILL)
 RenderActor(sys.argv[1]).render(json.loads(sys.argv[2]))
@@ -243,7 +242,6 @@ def test_a_trajectory_becomes_a_clip_a_preview_and_labels(
     assert len({frame.tobytes() for frame in video}) == 3
     light, floor = drawn_light("drawn", 9), drawn_substrate("ceramic", 9)
     labels = dict(output.labels)
-    assert labels.pop("gate_db") >= GATE
     assert 0.02 < labels.pop("frame_share") < 0.3
     assert 0.5 < labels.pop("visible_share") <= 1.0
     assert labels == {
@@ -253,7 +251,10 @@ def test_a_trajectory_becomes_a_clip_a_preview_and_labels(
         "lighting": "drawn",
         "substrate": "ceramic",
         "creases": 0.5,
-        "composed": True,
+        "psnr_cloth": None,
+        "psnr_landed": None,
+        "psnr_edge": None,
+        "psnr_deviation": [None, None, None],
     }
     assert output.preview is not None
     with Image.open(io.BytesIO(store.read(output.preview))) as preview:
@@ -294,14 +295,13 @@ def test_a_clip_has_the_same_bytes_however_its_shading_was_made(
     other.render(_clip(cloth, frames=1, viewpoint="right", substrate="polyester-mirror"))
     several = _output(other.render(_clip(cloth, frames=1, textures=["floral", "plaid"], preview=True)))
     other.close()
-    assert several.clips[Texture.plaid] == alone.chunks["video"]
-    assert set(several.previews) == {"floral", "plaid"}
+    assert several.clips[Texture.plaid].output.chunks == alone.chunks
+    assert several.clips[Texture.floral].output.preview is not None
     third = RenderActor(str(store.root))
     monkeypatch.setattr(ClothScene, "shading", None)  # from here on nothing can be traced
     later = _output(third.render(_clip(cloth, frames=1, textures=["plaid", "dots"])))
     third.close()
-    assert later.clips[Texture.plaid] == alone.chunks["video"]
-    assert later.labels == several.labels == alone.labels
+    assert later.clips[Texture.plaid].output == alone
 
 
 def test_nothing_is_shaded_again_for_another_texture(
@@ -323,16 +323,28 @@ def test_nothing_is_shaded_again_for_another_texture(
     assert len(traced) == 4
 
 
-def test_what_fails_the_gate_is_rendered_directly(
-    actor: RenderActor, store: DirectoryStore, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+def test_what_is_below_its_floor_is_composed_of_a_finer_shading_or_rejected(
+    actor: RenderActor, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Textures that are measured together get their own numbers and results, the same as alone."""
     cloth = trajectory()
-    composed = _output(actor.render(_clip(cloth, frames=1)))
-    monkeypatch.setattr(clips, "GATE", 99.0)
-    direct = _output(actor.render(_clip(cloth, frames=1)))
-    assert (composed.labels["composed"], direct.labels["composed"]) == (True, False)
-    one, other = (_video(store, output.chunks["video"], 1).astype(float) for output in (composed, direct))
-    assert 0.0 < np.abs(one - other).mean() < 4.0
+    task = _clip(cloth, frames=1, measured=0.15, textures=["checker", "stripes"])
+    good = _output(actor.render(task)).clips
+    levels = [good[name].output.labels["psnr_cloth"] for name in ("checker", "stripes")]
+    assert 30.0 < min(levels) < max(levels) < 50.0
+    alone = _output(actor.render(_clip(cloth, frames=1, measured=0.15, texture="stripes")))
+    assert alone == good["stripes"].output
+    floors = (0.5 * sum(levels), 0.0, 0.0)
+    coarse = CLOTH_SAMPLING[Quality.preview]
+    monkeypatch.setitem(CLOTH_SAMPLING, Quality.preview, replace(coarse, floors=floors))
+    monkeypatch.setattr(quality, "DEVIATIONS", 0.0)
+    better = _output(actor.render(task)).clips
+    worse = "checker" if levels[0] < levels[1] else "stripes"
+    assert better[worse].output.labels["psnr_cloth"] >= floors[0]
+    monkeypatch.setitem(CLOTH_SAMPLING, Quality.preview, replace(coarse, floors=(99.0, 0.0, 0.0)))
+    refused = _output(actor.render(task)).clips["checker"]
+    assert (refused.outcome, refused.reason) == ("rejected", Reason.poor_pictures)
+    assert "psnr_cloth must be at least 99 dB; got " in refused.message
 
 
 def test_rods_and_cloths_take_turns(

@@ -70,15 +70,12 @@ def split(tasks: Sequence[RenderTask], result: TaskResult) -> list[TaskResult]:
     if not isinstance(result.output, RenderOutput):
         return [result.model_copy(update=share)] * len(tasks)
     try:
-        return [result.model_copy(update=share | {"output": _own(task, result.output)}) for task in tasks]
+        return [_own(task, result.output.clips[task.render.variant]).model_copy(update=share) for task in tasks]
     except KeyError as error:
         return [failure(error)] * len(tasks)
 
 
-def _own(task: RenderTask, output: RenderOutput) -> RenderOutput:
-    name = task.render.variant
-    return RenderOutput(
-        chunks={"video": output.clips[name], **output.chunks},
-        preview=output.previews[name] if task.preview else None,
-        labels=output.labels,
-    )
+def _own(task: RenderTask, result: TaskResult) -> TaskResult:
+    if task.preview or not isinstance(result.output, RenderOutput):
+        return result
+    return result.model_copy(update={"output": result.output.model_copy(update={"preview": None})})

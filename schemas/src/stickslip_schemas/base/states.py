@@ -79,6 +79,7 @@ class Reason(StrEnum):
     solver_diverged = "solver_diverged"
     out_of_frame = "out_of_frame"
     invalid_sample = "invalid_sample"
+    poor_pictures = "poor_pictures"
     # The same, of cloth: the check of the solver that failed.
     not_finite = "not_finite"
     unconverged = "unconverged"
@@ -110,6 +111,7 @@ _OF_SAMPLE = {
     Reason.solver_diverged,
     Reason.out_of_frame,
     Reason.invalid_sample,
+    Reason.poor_pictures,
     Reason.not_finite,
     Reason.unconverged,
     Reason.crossings,

@@ -69,15 +69,14 @@ class RenderTask(Document):
 class RenderOutput(Document):
     """Encoded chunks by array name, the digest of the preview if there is one, and labels (colour, ...).
 
-    With `textures` in the task, clips and previews are by texture, and labels are those that all of them share.
+    With `textures` in the task there are only `clips`.
     """
 
     stage: Literal["render"] = "render"
     chunks: dict[str, ChunkRef]
     preview: Sha256 | None = None
     labels: dict[str, Any]
-    clips: dict[str, ChunkRef] = Field(default_factory=dict, description="array `video` by texture")
-    previews: dict[str, Sha256] = Field(default_factory=dict)
+    clips: dict[str, "TaskResult"] = Field(default_factory=dict, description="results by texture")
 
 
 # --- pack and publish -----------------------------------------------------------------------------------------

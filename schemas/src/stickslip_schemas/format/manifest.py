@@ -96,26 +96,26 @@ class BrokenSealError(ValueError):
     """The manifest, the root's metadata and the seal of a version do not fit each other."""
 
 
+class Psnr(Document):
+    """PSNR of the clips of a version over a region."""
+
+    clips: Int = Field(description="valid clips that were measured and show the region")
+    median: float = Field(description="[dB]")
+    worst: float = Field(description="exceeded by 99 % of the clips [dB]")
+    deviation: float = Field(description="median of the standard deviations of a clip's estimate [dB]")
+
+
 class Pictures(Document):
     """Quality of the pictures of a version."""
 
     quality: Quality
-    psnr_db: float = Field(
-        description="PSNR of the pixels of cloth or rod, against pictures of 256 samples with another noise, as "
-        "measured when the quality was set [dB]"
-    )
-    gate_db: float | None = Field(
-        description="lowest result of the image gate in this version [dB]; null: it has no composed pictures"
-    )
+    psnr: dict[str, Psnr] = Field(description="by region: cloth, its landed part, its edge; none for what is no cloth")
     frame_share: float | None = Field(
         default=None, description="share of the frame that is cloth, mean of the valid samples; null: no cloth"
     )
     device: str = Field(
         default="cpu",
         description="what Cycles computed on: `cpu`, or a sort of GPU, whose name and driver are in the build `render`",
-    )
-    direct_slots: tuple[int, ...] = Field(
-        description="slots whose pictures the image gate refused to compose: they were rendered directly"
     )
 
 

@@ -14,8 +14,6 @@ from stickslip_schemas.spec.jobs import JobSpec, Quality, Render, SeedRule, Simu
 ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""
 
-PICTURE_DECIBELS = {Quality.preview: 24.9, Quality.draft: 27.2, Quality.standard: 31.6, Quality.high: 36.8}
-"""PSNR of the rod's pixels by quality [dB]: `benchmarks/render_rods.py` measures it."""
 
 Gamma = Annotated[
     float, quantity("Gamma"), Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness")
@@ -94,10 +92,6 @@ class RodHangSpec(JobSpec):
         if self.views is None:
             return None
         return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
-
-    def picture_decibels(self) -> float | None:
-        """Return the PSNR of the pictures of this quality, as measured [dB]; None if there are none."""
-        return None if self.views is None else PICTURE_DECIBELS[self.quality]
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the array `views`, in its order."""

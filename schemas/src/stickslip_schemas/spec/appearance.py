@@ -12,6 +12,13 @@ from stickslip_schemas.spec.cameras import Camera
 CLIP_SIZE = 224
 """Width and height of a clip [px]."""
 
+REGIONS = {
+    "cloth": "all cloth",
+    "landed": "cloth within 40 mm of the floor",
+    "edge": "a band of 4 px along the silhouette",
+}
+"""Where it is measured how good a clip is."""
+
 FARTHEST = 4.0
 """Largest distance of a camera from the middle of the scene along each axis [m]: the floor ends at 8 m."""
 LOWEST = 0.02
@@ -88,8 +95,7 @@ class LampNumbers(_Ranges):
 class FloorNumbers(_Ranges):
     """A custom floor.
 
-    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation. Clips are
-    rendered directly where the image gate finds that composition is not exact enough.
+    Each pair is a range `[low, high]` that a seed draws from, for each view of each simulation.
     """
 
     albedo: tuple[Share, Share] = Field(

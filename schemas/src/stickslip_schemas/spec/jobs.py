@@ -194,10 +194,6 @@ class JobSpec(Document):
         """Return the cameras of the pictures; none where nothing is rendered."""
         raise NotImplementedError
 
-    def picture_decibels(self) -> float | None:
-        """Return the PSNR of the pictures of this quality, as measured [dB]; None if there are none."""
-        raise NotImplementedError
-
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         """Return a text that is the same for samples whose `stage` costs about the same; of simulate or render."""
         return str(self.quality) if stage is Stage.render else ""

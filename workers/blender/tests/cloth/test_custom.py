@@ -85,7 +85,7 @@ def _output(actor: RenderActor, task: dict[str, Any]) -> RenderOutput:
 
 
 def _frame(store: DirectoryStore, output: RenderOutput, texture: str | None = None) -> Clip:
-    chunk = output.chunks["video"] if texture is None else output.clips[texture]
+    chunk = (output if texture is None else output.clips[texture].output).chunks["video"]
     video = np.empty((1, 224, 224, 3), dtype=np.uint8)
     decode_clip(store.read(chunk.digest, offset=chunk.offset, length=chunk.length), video)
     return video[0]
@@ -110,7 +110,7 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
     assert np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean() - 10  # the cloth hangs from its upper edge
     monkeypatch.setattr(ClothScene, "shading", None)  # from here on nothing can be traced
     both = _output(actor, _task(record, textures=["dots", image]))
-    assert both.clips[image] == alone.chunks["video"]
+    assert both.clips[image].output == alone
     assert not np.array_equal(_frame(store, both, "dots"), frame)
 
 
@@ -173,7 +173,7 @@ def test_lamps_and_floors_of_the_users_own(actor: RenderActor, store: DirectoryS
     labels = output.labels
     assert (labels["lighting"], labels["substrate"]) == ("bench", "green-baize")
     assert (labels["light"], labels["floor"]) == (light.numbers, ground.numbers)
-    assert labels["composed"]
+
     corner = _frame(store, output)[:40, :40].reshape(-1, 3).mean(axis=0)
     assert corner[2] > 1.5 * corner[0] > 20, "a pale floor that is bluish"
 

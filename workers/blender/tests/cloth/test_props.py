@@ -16,8 +16,8 @@ def test_marks_of_the_floor_are_not_on_props(make_sheet: Callable[..., Any]) -> 
     camera = load_rig("drag")[0]
     points = geometry.points(sheet.track[1], 1)
     seen = ground_truth(geometry, points, points, camera).segmentation
-    light = np.ones((camera.height, camera.width, 3), dtype=np.float16)
-    marked = Composer(geometry).on_floor(light, points, camera, np.full(light.shape, 2.0, dtype=np.float32))
+    floor = np.full((camera.height, camera.width, 3), 2.0, dtype=np.float32)
+    marked = Composer(geometry).floor_factor(points, camera, floor)
     inner = {code: marked[_inside(seen == code)] for code in (GROUND, CLOTH, PROP)}
     assert all(len(values) > 20 for values in inner.values())
     assert np.allclose(inner[GROUND], 2.0)

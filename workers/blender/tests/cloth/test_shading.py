@@ -4,12 +4,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_blender.cloth.clips import GATE, ClothRenderer, block_decibels
+from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
+from stickslip_blender.cloth.quality import UNMEASURED, Measured, errors, instants, pooled, trio
+from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.engine import ClothSampling
 from stickslip_blender.cycles.pixels import encode
+from stickslip_blender.raster import decoded
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
 
 
 def test_encoding_is_srgb() -> None:
@@ -17,12 +21,35 @@ def test_encoding_is_srgb() -> None:
     assert encode(light).tolist() == [0, 0, 3, 10, 124, 188, 255, 255]
 
 
-def test_the_gate_sees_bias_through_noise() -> None:
+def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
+    """Errors of 3 levels at five brightnesses, whatever the noise; highlights have no level above 255."""
     random = np.random.Generator(np.random.PCG64(1))
-    picture = np.full((40, 40, 3), 120, dtype=np.uint8)
-    noisy = np.clip(picture + random.normal(0.0, 8.0, picture.shape), 0, 255).astype(np.uint8)
-    assert block_decibels(noisy, picture) > GATE + 5.0
-    assert block_decibels(picture + np.uint8(9), picture) < GATE
+    truth = np.repeat(np.array([20, 60, 120, 180, 230], dtype=np.uint8), 40_000).reshape(400, 500)
+    clip = (truth + 3 * random.choice([-1, 1], truth.shape)).astype(np.uint8)
+    for noise in (0.1, 0.4):
+        one, other = (decoded(truth) * (1.0 + noise * random.standard_normal(truth.shape)) for _ in range(2))
+        found = pooled([(errors(clip, one, other), np.ones((3, 400, 500), dtype=bool))])
+        exact = 10.0 * np.log10(255.0**2 / 9.0)
+        assert abs(found.psnr[0] - exact) < max(0.15, 2.5 * found.deviations[0])
+    white, bright = np.full((8, 8), 255, dtype=np.uint8), np.full((8, 8), 1.7)
+    assert errors(white, bright, bright).max() < 1e-4
+
+
+def test_a_clip_below_its_floor_says_so() -> None:
+    measured = Measured((33.0, 30.0, 27.0), (0.1, 2.0, 0.1))
+    assert measured.shortfall((32.0, 33.0, 28.0)) == "psnr_edge must be at least 28 dB; got 27.0 dB (deviation 0.1 dB)"
+    assert UNMEASURED.shortfall((99.0, 99.0, 99.0)) == ""
+    assert UNMEASURED.labels["psnr_landed"] is None
+
+
+def test_the_measured_frames_show_landed_cloth() -> None:
+    heights = [np.full(20, 0.2)] * 5 + [np.linspace(0.0, 0.2, 20)] * 5
+    for seed in range(20):
+        assert min(instants(heights, 0.0, 16, (seed, 3))) >= 5
+    assert len(instants(heights, 5.0, 64, (1, 3))) == 5
+    assert instants(heights[:2], 0.0, 16, (1, 3))[0] in (0, 1)
+    assert trio("checker") == ("checker", "dots", "stripes")
+    assert trio("sha256:0") == ("sha256:0",)
 
 
 @pytest.mark.parametrize("substrate", ["matt", "polyester-mirror"])
@@ -41,8 +68,13 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, substrate: str) -> Non
         substrate=substrate,
     )
     renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
-    clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(frame=4, window=16))
-    shading = clip.shading()
+    clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 16, (0.0, 0.0, 0.0)))
+    names = trio("plaid")
+    pictures = [texture_image(Texture(name)) for name in names]
+    videos, _ = clip.clips(clip.shading(), pictures)
+    (reference,) = clip.references(pictures, 0.0)
     renderer.close()
-    assert shading.gate_db > 36.0
-    assert shading.composed
+    for channel, video in enumerate(videos):
+        found = pooled([(reference.errors(video, channel), reference.regions)])
+        assert min(found.psnr) > 28.0, names[channel]
+        assert found.psnr[0] > 34.0, names[channel]

@@ -118,17 +118,15 @@ def _pictures(manifest: Manifest) -> list[str]:
     pictures = manifest.pictures
     if pictures is None:
         return []
-    text = (
-        f"The pictures have the quality `{pictures.quality}`: {pictures.psnr_db:g} dB over the pixels of what they "
-        "show, against pictures of 256 samples with another noise, as measured when the quality was set."
-    )
+    text = f"The pictures have the quality `{pictures.quality}`."
     if pictures.device != "cpu":
         text += f" They were rendered on a GPU ({pictures.device})."
-    if pictures.gate_db is not None:
-        text += (
-            f" One shading serves all textures; the image gate found {pictures.gate_db:.1f} dB or more. "
-            f"Samples that it had rendered directly instead: {len(pictures.direct_slots)}."
+    if pictures.psnr:
+        regions = "; ".join(
+            f"{region} {psnr.median:.1f} ({psnr.worst:.1f}) with a deviation of {psnr.deviation:.1f}"
+            for region, psnr in pictures.psnr.items()
         )
+        text += f" PSNR of its clips [dB], the median, and in brackets what 99 % exceed: {regions}."
     if pictures.frame_share is not None:
         text += f" The cloth fills {100 * pictures.frame_share:.1f} % of a frame, in the mean."
     return [text]

@@ -19,6 +19,7 @@ from stickslip_schemas.format.manifest import (
     Manifest,
     ManifestSection,
     Pictures,
+    Psnr,
     Rejection,
     has_sections,
     seal_text,
@@ -27,6 +28,7 @@ from stickslip_schemas.format.manifest import (
     with_manifest_digest,
 )
 from stickslip_schemas.plan.grid import dataset_id
+from stickslip_schemas.spec.appearance import REGIONS
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 
@@ -182,24 +184,26 @@ def _split_counts(labels: _Labels, rejections: Sequence[Rejection]) -> dict[str,
 
 
 def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
-    """Return how good the pictures are: what their quality is worth, and what the image gate said of each sample."""
-    measured = task.spec.picture_decibels()
-    if measured is None:
+    """Return how good the pictures are, as each clip was measured; None where there are none."""
+    if pictured(task.spec) is None:
         return None
-    gate, share, direct = None, None, np.empty(0, dtype=int)
-    if any(array.name == "gate_db" for array in labels.arrays):
-        valid = labels["valid"]
-        if valid.any():
-            gate = round(float(labels["gate_db"][valid].min()), 2)
-            share = round(float(labels["frame_share"][valid].mean()), 4)
-        direct = np.flatnonzero(valid & ~labels["composed"])
+    share, psnr = None, {}
+    if any(array.name == "frame_share" for array in labels.arrays) and (valid := labels["valid"]).any():
+        share = round(float(labels["frame_share"][valid].mean()), 4)
+        for number, region in enumerate(REGIONS):
+            values, deviations = labels[f"psnr_{region}"][valid], labels["psnr_deviation"][valid, number]
+            if (known := np.isfinite(values)).any():
+                psnr[region] = Psnr(
+                    clips=int(known.sum()),
+                    median=round(float(np.median(values[known])), 2),
+                    worst=round(float(np.quantile(values[known], 0.01)), 2),
+                    deviation=round(float(np.median(deviations[known])), 2),
+                )
     return Pictures(
         quality=task.spec.quality,
-        psnr_db=measured,
-        gate_db=gate,
+        psnr=psnr,
         frame_share=share,
         device=os.environ.get(RENDER_DEVICE) or CPU,  # all workers of this version's builds have the same
-        direct_slots=tuple(direct.tolist()),
     )
 
 

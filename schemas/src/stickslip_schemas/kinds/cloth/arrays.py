@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any
 
 from stickslip_schemas.kinds.cloth.spec import ClipSpec, ClothSpec, GroundTruth
-from stickslip_schemas.spec.appearance import CLIP_SIZE, Lighting, Substrate
+from stickslip_schemas.spec.appearance import CLIP_SIZE, REGIONS, Lighting, Substrate
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
@@ -55,8 +55,11 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         array("creases", "strength of the creases that the renderer added", "float32"),
         array("frame_share", "share of the frame that is cloth, mean of the clip", "float32"),
         array("visible_share", "share of the cloth in sight, mean of the clip", "float32"),
-        array("gate_db", "image gate: PSNR of means of 4 x 4 pixels [dB]", "float32"),
-        array("composed", "false where the gate failed and Cycles rendered directly", "bool"),
+        *(
+            array(f"psnr_{name}", f"PSNR over {text} [dB], NaN: not measured", "float32")
+            for name, text in REGIONS.items()
+        ),
+        array("psnr_deviation", "standard deviations of the three PSNR [dB]", "float32", {"region": len(REGIONS)}),
     )
 
 

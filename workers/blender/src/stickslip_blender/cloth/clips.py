@@ -1,8 +1,8 @@
 """Clips of cloth: from a render task to a result, for every scene of cloth.
 
-One shading serves all textures (`stickslip_blender.cloth.shading`) if it passes an image gate. The gate renders one
-frame directly, with one texture, and compares means of 4 x 4 pixels: these have little sampling noise, but all errors
-of the composition. If the gate fails, every clip is rendered directly.
+One shading serves all textures (`stickslip_blender.cloth.shading`). Every clip is measured
+(`stickslip_blender.cloth.quality`). One that is below the floor of its quality is composed of a finer shading; if that
+is no better, the sample is rejected.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import content_key, referred
 from stickslip_schemas.base.states import Reason
-from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
+from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, encode_chunk
 from stickslip_schemas.format.pictures import moving
 from stickslip_schemas.spec.cameras import Camera, load_rig
@@ -25,8 +25,8 @@ from stickslip_blender.build import build_digest
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
+from stickslip_blender.cloth.quality import HALF_SAMPLES, UNMEASURED, draw_of, errors, instants, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene, Shot
-from stickslip_blender.cloth.shading import Sight, settled
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
@@ -40,33 +40,14 @@ if TYPE_CHECKING:
 
     AnyLook = ClothRender | ClothSceneRender
 
-GATE = 32.0
-"""Least PSNR of composed pictures against direct ones, in means of 4 x 4 pixels of 8-bit sRGB [dB]."""
-GATE_TEXTURE = Texture.floral
-"""Texture of the gate, with dark, light and saturated places."""
-_GATE_SAMPLES = 16
-_BLOCK = 4
 _PREVIEW_SIDE = 160  # [px]
 
 _KEPT_SHADINGS = 4
 """Shadings that a process keeps: 9 MB each at 30 frames."""
 
 Clip = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Shading:
-    """The light of one clip, for all textures."""
-
-    light: npt.NDArray[np.float16]
-    """Linear, at the albedos of `shading.ALBEDOS`, shape (frames, height, width, 3)."""
-    gate_db: float
-    """PSNR at the gate [dB]; it fails below `GATE`."""
-
-    @property
-    def composed(self) -> bool:
-        """Whether the shading passed the gate, so that pictures are composed of it."""
-        return self.gate_db >= GATE
+Light = npt.NDArray[np.float16]
+"""Linear, at the albedos of `shading.ALBEDOS`."""
 
 
 class ClothRenderer:
@@ -129,45 +110,49 @@ class ClipRenderer:
     seed: int
     labels: dict[str, Any]
 
-    def shading(self) -> Shading:
-        """Trace all frames once, and try on the middle one what composing makes of it."""
-        light = np.stack([self.scene.shading(shot, self.sampling, self.seed) for shot in self.shots])
-        middle = len(self.shots) // 2
-        return Shading(light, self._gate(self.shots[middle], light[middle]))
+    def shading(self, sampling: ClothSampling | None = None) -> Light:
+        """Trace all frames once for all textures, shape (frames, height, width, 3)."""
+        return np.stack([self.scene.shading(shot, sampling or self.sampling, self.seed) for shot in self.shots])
 
-    def _gate(self, shot: Shot, light: npt.NDArray[np.float16]) -> float:
-        picture = grained(texture_image(GATE_TEXTURE), self.fabric, self.scene.geometry.surface)
-        window = self.scene.window(shot)
-        whole = np.zeros(light.shape, dtype=np.float16)
-        whole[window.slices] = self.scene.direct(
-            shot, picture, Sampling(_GATE_SAMPLES, "guided", self.seed + 1), window
-        )
-        direct = self._finished(whole, shot)[window.slices]
-        composed = np.empty((1, *light.shape), dtype=np.uint8)
-        self._compose(light, shot, Textures([picture]), composed)
-        return block_decibels(composed[0][window.slices], direct)
-
-    def clips(self, shading: Shading, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
+    def clips(self, shading: Light, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
         """Return the clips of textures, and labels that they share.
 
         Textures: pictures as `texture_image` returns them; clips: shape (textures, frames, height, width, 3).
         """
-        pictures = [grained(texture, self.fabric, self.scene.geometry.surface) for texture in textures]
-        packed = Textures(pictures)
+        packed = Textures(list(map(self._grained, textures)))
         camera = self.camera
-        videos = np.empty((len(pictures), len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
-        sights = []
-        for number, (shot, light) in enumerate(zip(self.shots, shading.light, strict=True)):
-            sights.append(self._compose(light, shot, packed, videos[:, number]))
-            if not shading.composed:
-                videos[:, number] = list(self._direct(shot, pictures))
+        videos = np.empty((packed.count, len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
+        sights = [
+            self.scene.composer.compose(
+                light, shot.points, camera, self.scene.substrate, self.floor, packed, videos[:, number]
+            )
+            for number, (shot, light) in enumerate(zip(self.shots, shading, strict=True))
+        ]
         labels = self.labels | {
             "frame_share": float(np.mean([sight.frame_share for sight in sights])),
             "visible_share": float(np.mean([sight.visible_share for sight in sights])),
-            "gate_db": shading.gate_db,
-            "composed": shading.composed,
         }
         return videos, labels
+
+    def references(self, textures: Sequence[Clip], share: float, draw: int = 0) -> Iterator[Reference]:
+        """Render instants, drawn with a seed, directly with up to three textures; `instants` explains the share."""
+        floor = self.scene.geometry.surroundings.floor or 0.0
+        heights = [shot.points[: self.scene.geometry.cloth_vertices, 2] - floor for shot in self.shots]
+        greens = [self._grained(texture)[..., 1] for texture in textures]
+        picture = np.stack([*greens, *greens[:1] * (3 - len(greens))], axis=-1)
+        for frame in instants(heights, share, self.sampling.window, (self.seed, draw)):
+            shot = self.shots[frame]
+            window = self.scene.window(shot)
+            light = np.zeros((2, self.camera.height, self.camera.width, 3), dtype=np.float32)
+            for half in range(2):
+                sampling = Sampling(HALF_SAMPLES, "none", self.seed + half + 1)
+                light[half][window.slices] = self.scene.direct(shot, picture, sampling, window)
+            factor = self.scene.composer.floor_factor(shot.points, self.camera, self.floor)
+            light *= factor[..., 1:2]
+            yield Reference(frame, light, regions(self.scene.geometry, shot.points, self.camera))
+
+    def _grained(self, texture: Clip) -> Clip:
+        return grained(texture, self.fabric, self.scene.geometry.surface)
 
     def ground_truth(self, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
         """Return ground truth of every pixel (frames, height, width, ...), by name."""
@@ -180,27 +165,21 @@ class ClipRenderer:
         ]
         return {name: np.stack([getattr(frame, name) for frame in known]) for name in names}
 
-    def _compose(self, light: npt.NDArray[np.float16], shot: Shot, textures: Textures, pictures: Clip) -> Sight:
-        return self.scene.composer.compose(
-            light, shot.points, self.camera, self.scene.substrate, self.floor, textures, pictures
-        )
 
-    def _direct(self, shot: Shot, pictures: Sequence[Clip]) -> Iterator[Clip]:
-        for picture in pictures:
-            yield self._finished(
-                self.scene.direct(shot, picture, Sampling(self.sampling.window, "guided", self.seed)), shot
-            )
+@dataclass(frozen=True)
+class Reference:
+    """What a frame of up to three clips should look like."""
 
-    def _finished(self, light: npt.NDArray[np.float16], shot: Shot) -> Clip:
-        return settled(self.scene.composer.on_floor(light, shot.points, self.camera, self.floor))
+    frame: int
+    light: npt.NDArray[np.float32]
+    """Linear, of two renderings, with the green of each texture in a channel, shape (2, height, width, 3)."""
+    regions: npt.NDArray[np.bool_]
+    """As `stickslip_blender.cloth.quality.regions` returns them."""
 
-
-def block_decibels(one: Clip, other: Clip) -> float:
-    """Return the PSNR between the means of 4 x 4 pixels of two pictures (height, width, 3)."""
-    rows, columns = (size // _BLOCK * _BLOCK for size in one.shape[:2])
-    difference = one[:rows, :columns].astype(np.float64) - other[:rows, :columns]
-    blocks = difference.reshape(rows // _BLOCK, _BLOCK, columns // _BLOCK, _BLOCK, 3).mean(axis=(1, 3))
-    return float(10.0 * np.log10(255.0**2 / max(float((blocks**2).mean()), 1e-3)))
+    def errors(self, clip: Clip, channel: int) -> npt.NDArray[np.float64]:
+        """Return the squared errors of a frame of a clip (frames, height, width, 3) [levels^2]."""
+        one, other = self.light[..., channel]
+        return errors(clip[self.frame, ..., 1], one, other)
 
 
 def render_clips(
@@ -229,27 +208,48 @@ def render_clips(
     if unfit := why_unfit("cloth", track, 0.0, (camera,)):
         return unfit
     clip = renderer.clip(look, camera, track[list(look.instants)])
-    shading = _shading(clip, look, task, workshop)
     known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}
-    wanted = task.textures or (look.variant,)
-    videos, labels = clip.clips(shading, [picture(name, workshop) for name in wanted])
-    labels |= {"camera": camera.numbers} if frame else {}
+    labels = {"camera": camera.numbers} if frame else {}
+    results = dict(_results(clip, look, task, workshop, known, labels))
     if not task.textures:
-        preview = workshop.store.publish(moving(videos[0], side=_PREVIEW_SIDE)) if task.preview else None
-        chunks = {"video": workshop.clip(videos[0]), **known}
-        return TaskResult(outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels))
-    output = RenderOutput(
-        chunks=known,
-        labels=labels,
-        clips={texture: workshop.clip(video) for texture, video in zip(wanted, videos, strict=True)},
-        previews={
-            texture: workshop.store.publish(moving(video, side=_PREVIEW_SIDE))
-            for texture, video in zip(wanted, videos, strict=True)
-        }
-        if task.preview
-        else {},
-    )
-    return TaskResult(outcome="succeeded", output=output)
+        return results[look.variant]
+    return TaskResult(outcome="succeeded", output=RenderOutput(chunks={}, labels={}, clips=results))
+
+
+def _results(
+    clip: ClipRenderer,
+    look: AnyLook,
+    task: RenderTask,
+    workshop: Workshop,
+    known: dict[str, ChunkRef],
+    labels: dict[str, Any],
+) -> Iterator[tuple[str, TaskResult]]:
+    """Yield the result of each texture: a clip that is good enough, or a rejection."""
+    wanted = task.textures or (look.variant,)
+    references = {
+        group: list(clip.references([picture(name, workshop) for name in group], look.measured, draw_of(group)))
+        for group in dict.fromkeys(map(trio, wanted))
+        if look.measured > 0.0
+    }
+    for sampling in (clip.sampling, clip.sampling.finer):
+        shading = _shading(clip, sampling, look, task, workshop)
+        videos, shared = clip.clips(shading, [picture(name, workshop) for name in wanted])
+        poor = {}
+        for name, video in zip(wanted, videos, strict=True):
+            group = references.get(trio(name), [])
+            channel = trio(name).index(name)
+            measured = pooled([(r.errors(video, channel), r.regions) for r in group]) if group else UNMEASURED
+            if shortfall := measured.shortfall(clip.sampling.floors):
+                poor[name] = shortfall
+                continue
+            preview = workshop.store.publish(moving(video, side=_PREVIEW_SIDE)) if task.preview else None
+            chunks = {"video": workshop.clip(video), **known}
+            output = RenderOutput(chunks=chunks, preview=preview, labels=shared | measured.labels | labels)
+            yield name, TaskResult(outcome="succeeded", output=output)
+        if not poor:
+            return
+        wanted = tuple(poor)
+    yield from ((name, rejected(Reason.poor_pictures, text)) for name, text in poor.items())
 
 
 def rig_camera(look: AnyLook) -> Camera:
@@ -264,31 +264,26 @@ def picture(texture: str, workshop: Workshop) -> Clip:
     return texture_image(Texture(texture)) if digest is None else custom_texture(workshop.store.read(digest))
 
 
-def _shading(clip: ClipRenderer, look: AnyLook, task: RenderTask, workshop: Workshop) -> Shading:
+def _shading(clip: ClipRenderer, sampling: ClothSampling, look: AnyLook, task: RenderTask, workshop: Workshop) -> Light:
     """Return the shading of a clip: one that was made before, if it is still kept, or a new one."""
-    light = {name: value for name, value in look.shading.items() if name != "ground_truth"}
-    shared = {"record": task.record.model_dump(), "look": light, "build": build_digest(look.kind)}
+    light = {name: value for name, value in look.shading.items() if name not in ("ground_truth", "measured")}
+    shared = {
+        "record": task.record.model_dump(),
+        "look": light,
+        "build": build_digest(look.kind),
+        "finer": sampling != clip.sampling,
+    }
     key = content_key("shading", shared)
     kept = workshop.shadings
     if key not in kept:
         stored = workshop.kept_shading(key)
         if stored is None:
-            kept[key] = clip.shading()
-            workshop.keep_shading(key, _packed(kept[key]))
+            kept[key] = clip.shading(sampling)
+            workshop.keep_shading(key, encode_chunk(kept[key]))
         else:
-            kept[key] = _unpacked(stored, (len(clip.shots), clip.camera.height, clip.camera.width, 3))
+            kept[key] = np.empty((len(clip.shots), clip.camera.height, clip.camera.width, 3), dtype=np.float16)
+            decode_chunk(stored, kept[key])
         while len(kept) > _KEPT_SHADINGS:
             kept.popitem(last=False)
     kept.move_to_end(key)
     return kept[key]
-
-
-def _packed(shading: Shading) -> bytes:
-    """Return a shading as bytes: the gate's verdict, and the light."""
-    return np.float64(shading.gate_db).tobytes() + encode_chunk(shading.light)
-
-
-def _unpacked(data: bytes, shape: tuple[int, ...]) -> Shading:
-    light = np.empty(shape, dtype=np.float16)
-    decode_chunk(data[8:], light)
-    return Shading(light, float(np.frombuffer(data[:8])[0]))

@@ -45,15 +45,6 @@ _DIELECTRIC = 0.06  # what a floor that is no metal reflects, at the angles of o
 Floats = npt.NDArray[np.float32]
 
 
-def settled(light: Floats) -> npt.NDArray[np.uint8]:
-    """Return linear light (height, width, 3) as the 8-bit sRGB of a clip: within `TOLERANCE`, with pixels alike.
-
-    It depends on nothing but this picture.
-    """
-    picture: npt.NDArray[np.uint8] = _raster.settled(np.ascontiguousarray(light, dtype=np.float32))
-    return picture
-
-
 @dataclass(frozen=True)
 class Sight:
     """Visibility of the cloth in a frame."""
@@ -83,7 +74,7 @@ class Composer:
         """Compose one frame's shading (height, width, 3) with all textures, into `pictures`.
 
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
-        8-bit sRGB, chosen as in `settled`, shape (textures, height, width, 3).
+        8-bit sRGB, chosen as in raster/composition.hpp, shape (textures, height, width, 3).
         """
         seen = see(projected(camera, points), self._geometry.triangles, self._window(points, camera))
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
@@ -108,17 +99,15 @@ class Composer:
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
         return Sight(float(sight.coverage.sum()) / frame, float(min(visible, 1.0)))
 
-    def on_floor(
-        self, light: npt.NDArray[np.float16], points: npt.NDArray[np.float64], camera: Camera, floor: Floats
-    ) -> Floats:
-        """Give the floor of a frame that was rendered directly (height, width, 3) its marks and colour."""
+    def floor_factor(self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats) -> Floats:
+        """Return the factor (height, width, 3) of marks and colours for a frame that is rendered directly."""
         window = self._window(points, camera)
         seen = see(projected(camera, points), self._geometry.triangles, window)
-        cover = np.zeros(light.shape[:2], dtype=np.float32)
+        cover = np.zeros((camera.height, camera.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
         marks = self._tinted(floor, points, camera) - 1.0
         factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
-        return light * factor
+        return factor
 
     def _tinted(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
         """Return the factor (height, width, 3) of all that is not the cloth: the floor's, or of the prop before it."""

@@ -1,0 +1,155 @@
+"""How good a clip is: its squared error against direct renderings of its own, without their noise.
+
+At seeded instants, Cycles renders the cloth directly, twice, with two seeds and no denoiser. At a pixel, let P be the
+clip's linear light, X and Y that of the two renderings, and f the sRGB encoding in 8-bit levels. The noises of X and Y
+are independent, so that in
+
+    e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
+
+nothing of the noise of the references is left, however few samples they have. The mean of e over a region, pooled over
+instants, is the mean squared error of its PSNR. The deviation of that mean is estimated from blocks of pixels.
+
+One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed, so a
+clip gets the same numbers alone or with others; a picture of a user's own is measured by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.spec.appearance import REGIONS
+from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.fabrics import Texture
+
+from stickslip_blender.cloth.geometry import Geometry
+from stickslip_blender.raster import Window, decoded, projected, see
+
+HALF_SAMPLES = 24
+"""Paths per pixel of each of the two direct renderings. At 48, one instant is within 0.2, 0.4 and 0.2 dB (deviations)
+of 2 x 160 paths; half of that is lost in the differences between instants."""
+_TRIOS = 3  # that eight textures make
+LANDED = 0.04
+"""Height above the floor up to which cloth counts as landed [m]."""
+MOSTLY = 0.05
+"""Share of the vertices that must be landed at an instant that is measured, where the clip has such an instant."""
+BAND = 2
+"""Half the width of the band along the silhouette [px]."""
+FEWEST = 30
+"""Pixels of a region, over all measured instants, below which nothing is said of it."""
+DEVIATIONS = 2.0
+"""Standard deviations below a floor that are taken for chance."""
+_BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
+_TRIO = 3
+
+Floats = npt.NDArray[np.float64]
+Clip = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """PSNR of a clip by region, in the order of `REGIONS`; NaN where a region is not in sight."""
+
+    psnr: tuple[float, ...]
+    """[dB]"""
+    deviations: tuple[float, ...]
+    """Standard deviations of the estimates [dB]."""
+
+    def shortfall(self, floors: Sequence[float]) -> str:
+        """Say which regions are below their floors [dB] by more than chance; nothing if none is."""
+        numbers = zip(REGIONS, self.psnr, self.deviations, floors, strict=True)
+        return "; ".join(
+            f"psnr_{name} must be at least {floor:g} dB; got {psnr:.1f} dB (deviation {deviation:.1f} dB)"
+            for name, psnr, deviation, floor in numbers
+            if psnr + DEVIATIONS * deviation < floor
+        )
+
+    @property
+    def labels(self) -> dict[str, object]:
+        """The labels of the clip."""
+        psnr, deviations = ([None if np.isnan(x) else x for x in values] for values in (self.psnr, self.deviations))
+        return {f"psnr_{name}": x for name, x in zip(REGIONS, psnr, strict=True)} | {"psnr_deviation": deviations}
+
+
+UNMEASURED = Measured((np.nan,) * len(REGIONS), (np.nan,) * len(REGIONS))
+
+
+def trio(texture: str) -> tuple[str, ...]:
+    """Return the textures that are measured together with one."""
+    names = [str(name) for name in Texture]
+    if texture not in names:
+        return (texture,)
+    first = names.index(texture) // _TRIO * _TRIO
+    return tuple(names[first : first + _TRIO])
+
+
+def draw_of(group: tuple[str, ...]) -> int:
+    """Return a seed for a trio, so that trios look at other instants."""
+    names = [str(name) for name in Texture]
+    return 3 + (names.index(group[0]) if group[0] in names else len(names))
+
+
+def instants(heights: Sequence[Floats], share: float, samples: int, seed: Sequence[int]) -> list[int]:
+    """Draw the frames that are measured, at least one.
+
+    Args:
+        heights: Of the cloth's vertices above the floor [m], by frame.
+        share: Cost of measuring eight textures, over that of their shading.
+        samples: Paths per pixel of the shading.
+        seed: Seeds of the draw.
+    """
+    landed = [frame for frame, z in enumerate(heights) if (z < LANDED).mean() >= MOSTLY] or list(range(len(heights)))
+    count = max(1, round(share * len(heights) * samples / (2 * HALF_SAMPLES * _TRIOS)))
+    draws = np.random.Generator(np.random.PCG64(seed)).random(min(count, len(landed)))
+    return sorted({landed[int((k + draw) / len(draws) * len(landed))] for k, draw in enumerate(draws)})
+
+
+def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[np.bool_]:
+    """Return where the cloth is, where landed cloth is, and the band along its edge, (3, height, width)."""
+    seen = see(projected(camera, points), geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
+    cloth = (seen.triangle >= 0) & (seen.triangle < geometry.cloth_triangles)
+    floor = geometry.surroundings.floor
+    low = seen.at_centers(points[:, 2:])[..., 0] < (-np.inf if floor is None else floor + LANDED)
+    return np.stack([cloth, cloth & low, _grown(cloth, BAND) & _grown(~cloth, BAND)])
+
+
+def _grown(mask: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
+    for _ in range(by):
+        padded = np.pad(mask, 1)
+        mask = mask | padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
+    return mask
+
+
+def errors(levels: Clip, one: Floats, other: Floats) -> Floats:
+    """Return e of this module's docstring, for 8-bit levels and two references in linear light, all (height, width)."""
+    light = decoded(levels).astype(np.float64)
+    slope = 255.0 * np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0))
+    top = np.where(levels == 255, 1.0, np.inf)  # brighter light has no other level
+    product: Floats = slope**2 * (light - np.minimum(one, top)) * (light - np.minimum(other, top))
+    return product
+
+
+def pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> Measured:
+    """Return the PSNR from errors (height, width) and regions (3, height, width) of all measured instants."""
+    found = [_pooled([(error, masks[region]) for error, masks in measured]) for region in range(len(REGIONS))]
+    return Measured(tuple(psnr for psnr, _ in found), tuple(deviation for _, deviation in found))
+
+
+def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> tuple[float, float]:
+    sums = np.concatenate([_blocks(np.where(mask, error, 0.0)) for error, mask in measured])
+    sizes = np.concatenate([_blocks(mask.astype(np.float64)) for _, mask in measured])
+    if (size := sizes.sum()) < FEWEST:
+        return np.nan, np.nan
+    mean = sums.sum() / size
+    spread = float(np.sqrt(((sums - mean * sizes) ** 2).sum())) / size
+    bounded = max(mean, spread)  # chance can make the mean of products negative
+    return float(10.0 * np.log10(255.0**2 / bounded)), float(10.0 / np.log(10.0) * spread / bounded)
+
+
+def _blocks(values: Floats) -> Floats:
+    height, width = (-(-size // _BLOCK) for size in values.shape)
+    padded = np.zeros((height * _BLOCK, width * _BLOCK))
+    padded[: values.shape[0], : values.shape[1]] = values
+    return padded.reshape(height, _BLOCK, width, _BLOCK).sum(axis=(1, 3)).ravel()
