@@ -21,7 +21,7 @@ from stickslip_schemas.store import open_store, write_durably
 if TYPE_CHECKING:  # content keys hold whole documents; the modules that define them are in no build
     from stickslip_schemas.spec.jobs import Render
 
-    from stickslip_blender.cloth.clips import Shading
+    from stickslip_blender.cloth.clips import Light
 
 FRAME_MARGIN = 1.0
 """Least distance of a rod or a cloth from the edge of the frame [px]."""
@@ -52,7 +52,7 @@ class Workshop:
 
     def __init__(self, store: str, scratch: str | None = None) -> None:
         self.store = open_store(store)
-        self.shadings: OrderedDict[str, Shading] = OrderedDict()
+        self.shadings: OrderedDict[str, Light] = OrderedDict()
         """The last shadings of cloth, by key; clips that differ only in their texture share one."""
         self.scratch = scratch
         """Folder for the frames that Blender writes; None: memory."""
