@@ -286,7 +286,6 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
             where = own.output.chunks["video"]
             labels.append(own.output.labels["psnr_cloth"])
             decode_clip(store.read(where.digest, offset=where.offset, length=where.length), clip)
-        actor.close()
     np.save(out, clips)
     blender, every = spent
     print(

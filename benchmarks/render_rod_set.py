@@ -7,7 +7,6 @@ color of rod number i is that of seed i.
 """
 
 import argparse
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +26,8 @@ def main() -> None:
     with np.load(options.rods) as file:
         rods = dict(file)
     rig = load_rig(options.rig)
-    with closing(RodRenderer(quality=options.quality)) as renderer:
-        views = [renderer.render(line, rig, color=silicone_color(seed)) for seed, line in enumerate(rods["centerline"])]
+    renderer = RodRenderer(quality=options.quality)
+    views = [renderer.render(line, rig, color=silicone_color(seed)) for seed, line in enumerate(rods["centerline"])]
     np.savez_compressed(options.views, **rods, views=np.stack(views))
 
 

@@ -9,7 +9,6 @@ time is all of a rod's four views (mesh, cameras, Cycles, pixels out) over four,
 import argparse
 import platform
 import time
-from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,12 +48,12 @@ def curls(count: int) -> npt.NDArray[np.float64]:
 
 def measure(sampling: Sampling, lines: npt.NDArray[np.float64]) -> Measured:
     rig, views, seconds = load_rig("rod-4"), [], []
-    with closing(RodRenderer(quality=sampling)) as renderer:
-        renderer.render(lines[-1], rig[:1], color=silicone_color(0))
-        for seed, line in enumerate(lines):
-            start = time.process_time()
-            views.append(renderer.render(line, rig, color=silicone_color(seed)))
-            seconds.append((time.process_time() - start) / len(rig))
+    renderer = RodRenderer(quality=sampling)
+    renderer.render(lines[-1], rig[:1], color=silicone_color(0))
+    for seed, line in enumerate(lines):
+        start = time.process_time()
+        views.append(renderer.render(line, rig, color=silicone_color(seed)))
+        seconds.append((time.process_time() - start) / len(rig))
     return Measured(np.stack(views), 1e3 * float(np.median(seconds)))
 
 

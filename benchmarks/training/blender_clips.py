@@ -61,34 +61,31 @@ def main() -> None:
     floor = {"substrate": args.substrate, "finish": own}
     renderer = ClothRenderer(triangles, rest, Holders)
     videos, seen, told = [], [], []
-    try:
-        for clip in range(args.clips):
-            run, view = runs[clip % len(runs)], views[clip % len(views)]
-            chosen = [textures[place] for place in random.permutation(len(textures))[: args.textures]]
-            look = ClothDragRender.model_validate(
-                {
-                    "material": about[run]["material"],
-                    "texture": chosen[0],
-                    "viewpoint": view,
-                    "lighting": args.lighting,
-                    **floor,
-                    "quality": Quality(args.quality),
-                    "rig": "drag",
-                    "rig_digest": "0" * 64,
-                    "instants": tuple(shown),
-                    "light_seed": int(random.integers(2**31)),
-                    "crease_seed": int(random.integers(2**31)),
-                }
-            )
-            made = renderer.clip(look, cameras[view.value], positions[run][frames])
-            videos += list(made.clips(made.shading(), [texture_image(texture) for texture in chosen])[0])
-            if args.segmentation:
-                seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
-            for texture in chosen:
-                told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **floor, **about[run]})
-                print(json.dumps(told[-1]), flush=True)
-    finally:
-        renderer.close()
+    for clip in range(args.clips):
+        run, view = runs[clip % len(runs)], views[clip % len(views)]
+        chosen = [textures[place] for place in random.permutation(len(textures))[: args.textures]]
+        look = ClothDragRender.model_validate(
+            {
+                "material": about[run]["material"],
+                "texture": chosen[0],
+                "viewpoint": view,
+                "lighting": args.lighting,
+                **floor,
+                "quality": Quality(args.quality),
+                "rig": "drag",
+                "rig_digest": "0" * 64,
+                "instants": tuple(shown),
+                "light_seed": int(random.integers(2**31)),
+                "crease_seed": int(random.integers(2**31)),
+            }
+        )
+        made = renderer.clip(look, cameras[view.value], positions[run][frames])
+        videos += list(made.clips(made.shading(), [texture_image(texture) for texture in chosen])[0])
+        if args.segmentation:
+            seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
+        for texture in chosen:
+            told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **floor, **about[run]})
+            print(json.dumps(told[-1]), flush=True)
     arrays: dict[str, Any] = {
         "video": np.stack(videos),
         "instants": np.array(shown, np.int16),

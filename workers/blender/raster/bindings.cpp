@@ -142,14 +142,6 @@ void compose(const Halves& shading, std::tuple<float, float> albedos, const Inpu
                   static_cast<std::size_t>(pictures.stride(0)));
 }
 
-auto settled(const Colors& light) {
-  if (light.shape(2) != 3) throw std::invalid_argument("light: must be of shape (height, width, 3)");
-  const std::size_t height = light.shape(0), width = light.shape(1);
-  std::vector<std::uint8_t> picture(light.size());
-  raster::settled({light.data(), light.size()}, static_cast<int>(width), static_cast<int>(height), picture.data());
-  return handed_over<std::uint8_t, nb::shape<-1, -1, 3>>(std::move(picture), {height, width, 3});
-}
-
 auto tiled(const Doubles& picture, double density, const Input<double, nb::shape<3, 3>>& rays,
            const Input<double, nb::shape<3>>& position, double height, std::tuple<int, int> size, int subsamples) {
   const auto [columns, rows] = size;
@@ -202,8 +194,6 @@ NB_MODULE(_raster, module) {
   module.def("compose", &compose, "shading"_a, "albedos"_a, "overall"_a, "coverage"_a, "mean"_a, "window"_a,
              "reflected"_a, "reflected_window"_a, "floor"_a, "reflectance"_a, "pictures"_a,
              "Write pictures (count, h, w, 3) of a shading (h, w, 3), half floats given as uint16.");
-  module.def("settled", &settled, "light"_a,
-             "Return linear light (h, w, 3) as 8-bit sRGB, within `tolerance` of it, with few different pixels.");
   module.def("tiled", &tiled, "picture"_a, "density"_a, "rays"_a, "position"_a, "height"_a, "size"_a, "subsamples"_a,
              "Return the mean of a picture that repeats over a plane, (h, w); size is (width, height) [px].");
   module.def("blurred", &blurred, "values"_a, "down"_a, "across"_a,

@@ -37,29 +37,11 @@ int code(float light) {
 
 bool is_near(int exact, int level) { return std::abs(exact - fine * level) <= tolerance * fine; }
 
-bool is_near(const std::uint16_t* exact, const std::uint8_t* pixel) {
-  return is_near(exact[0], pixel[0]) && is_near(exact[1], pixel[1]) && is_near(exact[2], pixel[2]);
-}
-
-// Write a row of 8-bit pixels near the exact values, as `settled` says.
-void settle(const std::uint16_t* exact, int width, std::uint8_t* row) {
-  for (int column = 0; column < width;) {
-    const std::uint16_t* const here = exact + 3 * column;
-    std::uint8_t* const out = row + 3 * column;
-    if (column > 0) {
-      int run = 0;
-      while (column + run < width && is_near(here + 3 * run, out - 3)) ++run;
-      if (run >= shortest_run || (run > 0 && column + run == width)) {
-        for (int k = 0; k < 3 * run; ++k) out[k] = out[k - 3];
-        column += run;
-        continue;
-      }
-    }
-    for (int k = 0; k < 3; ++k)
-      out[k] =
-          k > 0 && is_near(here[k], out[k - 1]) ? out[k - 1] : static_cast<std::uint8_t>((here[k] + fine / 2) / fine);
-    ++column;
-  }
+// Write a pixel near the exact values: a colour takes the level of the one before it where that is near.
+void settle(const std::uint16_t* exact, std::uint8_t* pixel) {
+  for (int k = 0; k < 3; ++k)
+    pixel[k] = k > 0 && is_near(exact[k], pixel[k - 1]) ? pixel[k - 1]
+                                                        : static_cast<std::uint8_t>((exact[k] + fine / 2) / fine);
 }
 
 // A half float that is not NaN; infinity is 65536.
@@ -94,8 +76,6 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
   const int colors = static_cast<int>(overall.size());
   std::vector<float> albedo(colors), factor(colors);
   std::vector<std::int32_t> codes(colors);
-  const std::size_t row_size = 3 * static_cast<std::size_t>(shading.width);
-  std::vector<std::uint16_t> exact(row_size * (colors / 3));  // a row of each picture
   for (int row = 0; row < shading.height; ++row) {
     for (int column = 0; column < shading.width; ++column) {
       const std::size_t pixel = static_cast<std::size_t>(row) * shading.width + column;
@@ -122,25 +102,12 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
       }
       for (int k = 0; k < colors; ++k) factor[k] = 1.0f + (1.0f - cover) * (floor[3 * pixel + k % 3] - 1.0f);
       add_up(gloss, once, twice, albedo.data(), overall.data(), factor.data(), codes.data(), colors);
-      std::uint16_t* out = exact.data() + 3 * static_cast<std::size_t>(column);
-      for (int k = 0; k < colors; k += 3, out += row_size) {
-        out[0] = table[codes[k]];
-        out[1] = table[codes[k + 1]];
-        out[2] = table[codes[k + 2]];
+      std::uint8_t* out = pictures + 3 * pixel;
+      for (int k = 0; k < colors; k += 3, out += stride) {
+        const std::array<std::uint16_t, 3> exact{table[codes[k]], table[codes[k + 1]], table[codes[k + 2]]};
+        settle(exact.data(), out);
       }
     }
-    for (int n = 0; n < colors / 3; ++n)
-      settle(exact.data() + n * row_size, shading.width, pictures + n * stride + row * row_size);
-  }
-}
-
-void settled(std::span<const float> light, int width, int height, std::uint8_t* picture) {
-  const std::vector<std::uint16_t>& table = encoding();
-  const std::size_t row_size = 3 * static_cast<std::size_t>(width);
-  std::vector<std::uint16_t> exact(row_size);
-  for (int row = 0; row < height; ++row) {
-    for (std::size_t k = 0; k < row_size; ++k) exact[k] = table[code(light[row * row_size + k])];
-    settle(exact.data(), width, picture + row * row_size);
   }
 }
 

@@ -33,19 +33,9 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
              const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
              std::size_t stride);
 
-// Largest difference of a pixel of a clip from its exact value [8-bit levels].
+// Largest difference of a pixel of a clip from its exact value [8-bit levels]. Red is rounded; green takes the level of
+// red, and blue that of green, where it is as near as this, or is rounded. Grey stays grey, which is smaller when coded.
 constexpr int tolerance = 1;
-// Number of consecutive pixels that must be near the pixel before them to take its level.
-constexpr int shortest_run = 3;
-
-// Write linear light (height x width x 3) as an 8-bit sRGB picture of few different pixels, which is smaller when
-// coded.
-//
-// In each row, from left to right: where the pixel to the left is within `tolerance` of the exact values of
-// `shortest_run` pixels or more, or of all that are left of the row, they take it over. Otherwise red is rounded, and
-// green and blue take over the level of the colour before them where it is within `tolerance`, or else are rounded.
-// `compose` writes its pictures so, too.
-void settled(std::span<const float> light, int width, int height, std::uint8_t* picture);
 
 // Return the mean of a picture that repeats over the plane z = height, seen through pixels (height x width) of a
 // camera.

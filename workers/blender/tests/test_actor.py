@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,9 +56,7 @@ def record(store: DirectoryStore, curl: npt.NDArray[np.float64]) -> str:
 
 @pytest.fixture
 def actor(store: DirectoryStore) -> Iterator[RenderActor]:
-    actor = RenderActor(str(store.root))
-    yield actor
-    actor.close()
+    return RenderActor(str(store.root))
 
 
 def _task(record: str, *, row: int = 0, preview: bool = False, **look: Any) -> dict[str, Any]:
@@ -95,8 +92,8 @@ def test_a_rod_becomes_a_chunk_and_a_preview(
     chunk = result.output.chunks["views"]
     data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
     views = np.frombuffer(data, dtype=np.uint8).reshape(1, 4, 224, 224, 3)[0]
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        assert np.array_equal(views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5), seed=5))
+    renderer = RodRenderer(quality=Quality.draft)
+    assert np.array_equal(views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5), seed=5))
 
     assert result.output.preview is not None
     with Image.open(io.BytesIO(store.read(result.output.preview))) as preview:
@@ -108,7 +105,6 @@ def test_two_actors_give_the_same_digests(actor: RenderActor, store: DirectorySt
     before = _files(store)
     other = RenderActor(str(store.root))
     second = other.render(_task(record))
-    other.close()
     assert second["output"] == first["output"]
     assert _files(store) == before
 
@@ -294,13 +290,11 @@ def test_a_clip_has_the_same_bytes_however_its_shading_was_made(
     other = RenderActor(str(store.root))
     other.render(_clip(cloth, frames=1, viewpoint="right", substrate="polyester-mirror"))
     several = _output(other.render(_clip(cloth, frames=1, textures=["floral", "plaid"], preview=True)))
-    other.close()
     assert several.clips[Texture.plaid].output.chunks == alone.chunks
     assert several.clips[Texture.floral].output.preview is not None
     third = RenderActor(str(store.root))
     monkeypatch.setattr(ClothScene, "shading", None)  # from here on nothing can be traced
     later = _output(third.render(_clip(cloth, frames=1, textures=["plaid", "dots"])))
-    third.close()
     assert later.clips[Texture.plaid].output == alone
 
 

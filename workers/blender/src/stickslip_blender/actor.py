@@ -21,12 +21,8 @@ from stickslip_blender.workshop import Workshop, check_rig
 class RenderActor:
     """Renders samples from the store into the store. One per process, because Blender holds one scene."""
 
-    def __init__(self, store_root: str, scratch: str | None = None) -> None:
-        self._workshop = Workshop(store_root, scratch)
-
-    def close(self) -> None:
-        """Release what the renderer holds outside Blender."""
-        self._workshop.close()
+    def __init__(self, store_root: str) -> None:
+        self._workshop = Workshop(store_root)
 
     def describe(self) -> dict[str, Any]:
         """Return the build of each kind, and versions; they are equal in all processes of one installation."""

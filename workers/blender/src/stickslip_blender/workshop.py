@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,14 +33,7 @@ _DIGEST_BYTES = 32
 Array = npt.NDArray[Any]
 
 
-class Renderer(Protocol):
-    """The owner of a Blender scene."""
-
-    def close(self) -> None:
-        """Release what it holds outside Blender."""
-
-
-R = TypeVar("R", bound=Renderer)
+R = TypeVar("R")
 
 
 class Workshop:
@@ -50,20 +43,12 @@ class Workshop:
     process, so there is one renderer at a time.
     """
 
-    def __init__(self, store: str, scratch: str | None = None) -> None:
+    def __init__(self, store: str) -> None:
         self.store = open_store(store)
         self.shadings: OrderedDict[str, Light] = OrderedDict()
         """The last shadings of cloth, by key; clips that differ only in their texture share one."""
-        self.scratch = scratch
-        """Folder for the frames that Blender writes; None: memory."""
-        self._renderer: tuple[object, Renderer] | None = None
+        self._renderer: tuple[object, Any] | None = None
         self._records: tuple[str, dict[str, Array]] = ("", {})
-
-    def close(self) -> None:
-        """Close the renderer."""
-        if self._renderer is not None:
-            self._renderer[1].close()
-            self._renderer = None
 
     def kept_shading(self, key: str) -> bytes | None:
         """Return a shading that any process kept in the store; None if there is none, or a damaged one."""
@@ -114,9 +99,10 @@ class Workshop:
     def renderer(self, scene: object, build: Callable[[], R]) -> R:
         """Return the renderer of a scene: the last one if it fits, or a new one in its place."""
         if self._renderer is None or self._renderer[0] != scene:
-            self.close()
+            self._renderer = None  # building ends the last one, even if it fails
             self._renderer = scene, build()
-        return self._renderer[1]  # type: ignore[return-value]  # `scene` identifies what `build` returns
+        kept: R = self._renderer[1]  # `scene` identifies what `build` returns
+        return kept
 
     def rendered(self, name: str, pictures: Array, preview: bytes | None, labels: dict[str, Any]) -> TaskResult:
         """Publish pictures (n, height, width, 3) of one sample, and a preview, and return the result."""

@@ -155,7 +155,6 @@ def test_the_silhouette_is_that_of_cycles(make_sheet: Callable[..., Any], view: 
     renderer.clip(ClothDragRender.model_validate(LOOK), camera, sheet.track[[2, 2]])
     shot = stage.shot(sheet.track[2].astype(np.float64), 2)
     light = _glowing(stage, shot, Sampling(samples=256))
-    renderer.close()
     window = window_about(projected(camera, shot.points[: geometry.cloth_vertices]), camera, 2)
     coverage = see(projected(camera, shot.points), geometry.triangles, window).share_below(geometry.cloth_triangles)
     error = np.abs(light[window.slices][..., 0] - coverage)

@@ -34,9 +34,7 @@ def store(tmp_path: Path) -> DirectoryStore:
 
 @pytest.fixture
 def actor(store: DirectoryStore) -> Iterator[RenderActor]:
-    actor = RenderActor(str(store.root))
-    yield actor
-    actor.close()
+    return RenderActor(str(store.root))
 
 
 @pytest.fixture

@@ -199,7 +199,6 @@ def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
     actor = RenderActor(str(store.root))
     task = {"stage": "render", "render": look, "record": {"digest": store.publish(file.getvalue()), "row": 0}}
     result = TaskResult.model_validate(actor.render(task))
-    actor.close()
     assert isinstance(result.output, RenderOutput), result.message
     assert set(result.output.chunks) == {"video", "segmentation"}
     camera = staged()[0].camera("high", staged()[1], 224)

@@ -13,7 +13,6 @@ from stickslip_blender.cycles.engine import new_scene
 
 _RENDER = """
 import hashlib, sys
-from contextlib import closing
 import numpy as np
 from stickslip_blender.cycles.blender import NoDeviceError
 from stickslip_blender.rods.renderer import RodRenderer
@@ -21,8 +20,8 @@ from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 line = np.linspace((0.0, 0.0, 0.0), (0.2, 0.1, -0.9), 150)
 try:
-    with closing(RodRenderer(quality=Quality.preview)) as renderer:
-        views = renderer.render(line, load_rig("rod-4"), color=(0.9, 0.5, 0.2))
+    renderer = RodRenderer(quality=Quality.preview)
+    views = renderer.render(line, load_rig("rod-4"), color=(0.9, 0.5, 0.2))
 except NoDeviceError as error:
     print("none:", error)
 else:

@@ -3,7 +3,6 @@
 import hashlib
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,8 @@ Views = npt.NDArray[np.uint8]
 
 @pytest.fixture
 def views(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> Views:
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        return renderer.render(curl, rig, color=ORANGE)
+    renderer = RodRenderer(quality=Quality.draft)
+    return renderer.render(curl, rig, color=ORANGE)
 
 
 def test_views_are_pictures(views: Views) -> None:
@@ -30,21 +29,20 @@ def test_views_are_pictures(views: Views) -> None:
 
 
 def test_a_repeat_has_the_same_bytes(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views) -> None:
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        renderer.render(curl * (1, -1, 1), rig[::-1], color=(0.1, 0.2, 0.9), radius=0.02)  # leaves no trace
-        again = renderer.render(curl, rig, color=ORANGE)
+    renderer = RodRenderer(quality=Quality.draft)
+    renderer.render(curl * (1, -1, 1), rig[::-1], color=(0.1, 0.2, 0.9), radius=0.02)  # leaves no trace
+    again = renderer.render(curl, rig, color=ORANGE)
     assert np.array_equal(again, views)
 
 
 _FRESH = """
 import hashlib, sys
-from contextlib import closing
 import numpy as np
 from stickslip_blender.rods.renderer import RodRenderer
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
-with closing(RodRenderer(quality=Quality.draft)) as renderer:
-    views = renderer.render(np.load(sys.argv[1]), load_rig("rod-4"), color=(0.9, 0.5, 0.2))
+renderer = RodRenderer(quality=Quality.draft)
+views = renderer.render(np.load(sys.argv[1]), load_rig("rod-4"), color=(0.9, 0.5, 0.2))
 print(hashlib.sha256(views.tobytes()).hexdigest())
 """
 
@@ -64,8 +62,8 @@ def test_the_ground_is_dark_even_and_what_blender_would_render(
     assert np.median(views) == GROUND_LEVEL
     whole = Window(0, 0, 224, 224)
     monkeypatch.setattr("stickslip_blender.rods.renderer.window_about", lambda vertices, camera: whole)
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        full = renderer.render(curl, rig, color=ORANGE)
+    renderer = RodRenderer(quality=Quality.draft)
+    full = renderer.render(curl, rig, color=ORANGE)
     assert np.array_equal(full, views)
 
 
@@ -99,56 +97,47 @@ def test_the_rod_has_its_color_and_is_not_burnt_out(views: Views) -> None:
 
 
 def test_a_thicker_rod_covers_more(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views) -> None:
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        thick = renderer.render(curl, rig, color=ORANGE, radius=2 * RADIUS)
+    renderer = RodRenderer(quality=Quality.draft)
+    thick = renderer.render(curl, rig, color=ORANGE, radius=2 * RADIUS)
     assert 1.5 < (thick > GROUND_LEVEL + 2).sum() / (views > GROUND_LEVEL + 2).sum() < 2.1
 
 
 def test_a_rod_that_no_camera_sees_leaves_the_ground(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> None:
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        nothing = renderer.render(curl + np.array([0.0, 0.0, 1.5]), rig[:1], color=ORANGE)
+    renderer = RodRenderer(quality=Quality.draft)
+    nothing = renderer.render(curl + np.array([0.0, 0.0, 1.5]), rig[:1], color=ORANGE)
     assert (nothing == GROUND_LEVEL).all()
 
 
 def test_what_is_not_a_rod_is_refused(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> None:
-    with closing(RodRenderer(quality=Quality.draft)) as renderer:
-        with pytest.raises(ValueError, match=r"centerline must be finite, of shape \(150, 3\); got shape \(149, 3\)"):
-            renderer.render(curl[1:], rig, color=ORANGE)
-        with pytest.raises(ValueError, match="centerline must be finite"):
-            renderer.render(curl * np.nan, rig, color=ORANGE)
-        with pytest.raises(ValueError, match=r"radius must be in \(0, 0.1\) L; got 0.2"):
-            renderer.render(curl, rig, color=ORANGE, radius=0.2)
+    renderer = RodRenderer(quality=Quality.draft)
+    with pytest.raises(ValueError, match=r"centerline must be finite, of shape \(150, 3\); got shape \(149, 3\)"):
+        renderer.render(curl[1:], rig, color=ORANGE)
+    with pytest.raises(ValueError, match="centerline must be finite"):
+        renderer.render(curl * np.nan, rig, color=ORANGE)
+    with pytest.raises(ValueError, match=r"radius must be in \(0, 0.1\) L; got 0.2"):
+        renderer.render(curl, rig, color=ORANGE, radius=0.2)
 
 
 def test_a_second_renderer_ends_the_first(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> None:
     first, second = RodRenderer(quality=Quality.draft), RodRenderer(quality=Quality.draft)
-    with closing(first), closing(second), pytest.raises(ReferenceError):
+    with pytest.raises(ReferenceError):
         first.render(curl, rig, color=ORANGE)
-
-
-def test_a_scratch_folder_makes_the_same_bytes_and_is_left_empty(
-    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views, tmp_path: Path
-) -> None:
-    with closing(RodRenderer(quality=Quality.draft, scratch=tmp_path)) as renderer:
-        assert np.array_equal(renderer.render(curl, rig, color=ORANGE), views)
-        assert len(list(tmp_path.rglob("frame*"))) == 1
-    assert list(tmp_path.iterdir()) == []
+    del second
 
 
 def test_an_idle_renderer_takes_no_processor_time() -> None:
     """Blender's idle worker threads would spin; a process that waits for its next task must leave the core alone."""
     script = """
 import time
-from contextlib import closing
 import numpy as np
 from stickslip_blender.rods.renderer import RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 line = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 150)
-with closing(RodRenderer(quality="draft")) as renderer:
-    renderer.render(line, load_rig("rod-4"), color=silicone_color(0))
-    before = time.process_time()
-    time.sleep(1.0)
-    print(time.process_time() - before)
+renderer = RodRenderer(quality="draft")
+renderer.render(line, load_rig("rod-4"), color=silicone_color(0))
+before = time.process_time()
+time.sleep(1.0)
+print(time.process_time() - before)
 """
     answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
     assert float(answer[-1]) < 0.05

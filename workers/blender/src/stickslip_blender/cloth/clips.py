@@ -25,7 +25,7 @@ from stickslip_blender.build import build_digest
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
-from stickslip_blender.cloth.quality import HALF_SAMPLES, UNMEASURED, draw_of, errors, instants, pooled, regions, trio
+from stickslip_blender.cloth.quality import HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene, Shot
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
@@ -53,20 +53,10 @@ Light = npt.NDArray[np.float16]
 class ClothRenderer:
     """A scene with a cloth of one mesh, built once; everything but the mesh may change between clips."""
 
-    def __init__(
-        self,
-        triangles: npt.ArrayLike,
-        rest: npt.ArrayLike,
-        make: Callable[[Any], Surroundings],
-        scratch: str | None = None,
-    ) -> None:
+    def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike, make: Callable[[Any], Surroundings]) -> None:
         """Build the scene that `make` makes of a rest shape (V, 2) [m], with a mesh of triangles (T, 3)."""
         self.geometry = Geometry(triangles, rest, make(rest))
-        self.scene = ClothScene(self.geometry, scratch=scratch)
-
-    def close(self) -> None:
-        """Release what the scene holds outside Blender."""
-        self.scene.close()
+        self.scene = ClothScene(self.geometry)
 
     def clip(
         self, look: AnyLook, camera: Camera, positions: npt.ArrayLike, *, sampling: ClothSampling | None = None
@@ -134,18 +124,16 @@ class ClipRenderer:
         }
         return videos, labels
 
-    def references(self, textures: Sequence[Clip], share: float, draw: int = 0) -> Iterator[Reference]:
-        """Render instants, drawn with a seed, directly with up to three textures; `instants` explains the share."""
-        floor = self.scene.geometry.surroundings.floor or 0.0
-        heights = [shot.points[: self.scene.geometry.cloth_vertices, 2] - floor for shot in self.shots]
+    def references(self, textures: Sequence[Clip], share: float, draw: bytes = b"") -> Iterator[Reference]:
+        """Render instants directly with up to three textures, a share as `instants` says; `draw`: more of the seed."""
         greens = [self._grained(texture)[..., 1] for texture in textures]
         picture = np.stack([*greens, *greens[:1] * (3 - len(greens))], axis=-1)
-        for frame in instants(heights, share, self.sampling.window, (self.seed, draw)):
+        for frame in instants(len(self.shots), share, self.sampling.window, (self.seed, *draw)):
             shot = self.shots[frame]
             window = self.scene.window(shot)
             light = np.zeros((2, self.camera.height, self.camera.width, 3), dtype=np.float32)
             for half in range(2):
-                sampling = Sampling(HALF_SAMPLES, "none", self.seed + half + 1)
+                sampling = Sampling(HALF_SAMPLES, "none", self.seed + half + 1, skipped=HALF_SAMPLES)
                 light[half][window.slices] = self.scene.direct(shot, picture, sampling, window)
             factor = self.scene.composer.floor_factor(shot.points, self.camera, self.floor)
             light *= factor[..., 1:2]
@@ -202,7 +190,7 @@ def render_clips(
         return rejected(Reason.invalid_sample, "the cloth has positions that are not finite")
     renderer = workshop.renderer(
         (look.kind, None if make is Holders else task.record, triangles.tobytes(), rest.tobytes()),
-        lambda: ClothRenderer(triangles, rest, make, workshop.scratch),
+        lambda: ClothRenderer(triangles, rest, make),
     )
     camera = look.camera or (frame(renderer.geometry) if frame else rig_camera(look))
     if unfit := why_unfit("cloth", track, 0.0, (camera,)):
@@ -227,7 +215,7 @@ def _results(
     """Yield the result of each texture: a clip that is good enough, or a rejection."""
     wanted = task.textures or (look.variant,)
     references = {
-        group: list(clip.references([picture(name, workshop) for name in group], look.measured, draw_of(group)))
+        group: list(clip.references([picture(name, workshop) for name in group], look.measured, group[0].encode()))
         for group in dict.fromkeys(map(trio, wanted))
         if look.measured > 0.0
     }

@@ -7,7 +7,6 @@ kind in `stickslip_blender.scenes` adds the props.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +53,7 @@ class Shot:
 class ClothScene:
     """A scene with one cloth, built once; only vertices, textures, camera, floor and lamp change between frames."""
 
-    def __init__(self, geometry: Geometry, *, scratch: str | Path | None = None) -> None:
+    def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         self.composer = Composer(geometry)
         self._scene = new_scene(max_bounces=3, diffuse_bounces=2, light_tree=False)  # one lamp: nothing to choose
@@ -78,11 +77,7 @@ class ClothScene:
                 fabric.set_color((prop.grey,) * 3)
             self._meshes.append(mesh)
         add_view(self._scene)
-        self._reader = FrameReader(self._scene, scratch)
-
-    def close(self) -> None:
-        """Release what it holds outside Blender."""
-        self._reader.close()
+        self._reader = FrameReader(self._scene)
 
     def set_up(self, camera: Camera, light: Light, substrate: Substrate, look: Look) -> None:
         """Set the camera, the lamp, the floor and the fabric of the next clips."""

@@ -13,9 +13,8 @@ in linear light, for each of the texture's colours. Off the cloth D is light tha
 a floor that mirrors shows of the cloth, blurred as much as its roughness does. Marks of the floor and colours of props
 lie on top, as factors of their light: whatever is not the cloth is grey in Cycles.
 
-Pictures of clips are not rounded to the nearest levels. Each level is within TOLERANCE of the exact value, and chosen
-so that neighbours are equal where they may be: pixels in a row, and the colours of grey. Clips are a sixth smaller for
-it.
+Each level of a picture is within TOLERANCE of the exact value, and chosen so that the colours of grey are equal: clips
+are a tenth smaller for it.
 """
 
 from __future__ import annotations

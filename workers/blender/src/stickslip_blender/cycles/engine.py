@@ -25,6 +25,8 @@ class Sampling:
     """
     seed: int = 0
     """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and clips compress."""
+    skipped: int = 0
+    """Paths per pixel that are left out first. Cycles sends the very first one through the middle of the pixel."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,9 @@ def _set_up_colors(scene: Any) -> None:
 def set_sampling(scene: Any, sampling: Sampling) -> None:
     """Set the parameters that a quality names."""
     cycles = scene.cycles
-    cycles.samples = sampling.samples
+    cycles.samples = sampling.skipped + sampling.samples
+    cycles.use_sample_subset = sampling.skipped > 0
+    cycles.sample_offset, cycles.sample_subset_length = sampling.skipped, sampling.samples
     cycles.seed = sampling.seed
     cycles.use_denoising = sampling.denoiser != "none"
     if sampling.denoiser != "none":

@@ -1,14 +1,14 @@
 """Read rendered frames from Blender as linear light, and encode light as sRGB.
 
-Headless Blender gives no access to its pixels in memory, so a frame goes through an uncompressed file. On Linux that is
-an anonymous file in memory, and a killed process leaves nothing behind.
+Headless Blender gives no access to its pixels in memory, so a frame goes through an uncompressed file: an anonymous one
+in memory, of which a killed process leaves nothing behind.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-import tempfile
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,17 +43,12 @@ def encode(light: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
 
 
 class FrameReader:
-    """Renders a scene into arrays. With a scratch folder given, frames go through a file there instead of memory."""
+    """Renders a scene into arrays."""
 
-    def __init__(self, scene: Any, scratch: str | Path | None = None) -> None:
-        self._memory: int | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
-        if scratch is None and hasattr(os, "memfd_create"):
-            self._memory = os.memfd_create("frame")
-            self._path = Path(f"/proc/self/fd/{self._memory}")
-        else:
-            self._folder = tempfile.TemporaryDirectory(prefix="stickslip-frames-", dir=scratch)
-            self._path = Path(self._folder.name) / "frame"
+    def __init__(self, scene: Any) -> None:
+        memory = os.memfd_create("frame")
+        weakref.finalize(self, os.close, memory)
+        self._path = Path(f"/proc/self/fd/{memory}")
         self._scene = scene
         image, render = scene.render.image_settings, scene.render
         image.color_management = "FOLLOW_SCENE"
@@ -63,14 +58,6 @@ class FrameReader:
         render.use_stamp = False
         render.use_file_extension = False
         render.filepath = str(self._path)
-
-    def close(self) -> None:
-        """Close or delete the file."""
-        if self._folder is not None:
-            self._folder.cleanup()
-        if self._memory is not None:
-            os.close(self._memory)
-        self._memory = self._folder = None
 
     def read_light(self, window: Window | None = None) -> npt.NDArray[np.float16]:
         """Render the scene as it stands, or a window of it: linear light, not clipped, shape (height, width, 3).

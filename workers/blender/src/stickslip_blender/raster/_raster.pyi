@@ -35,7 +35,6 @@ def compose(
     reflectance: float,
     pictures: NDArray[np.uint8],
 ) -> None: ...
-def settled(light: NDArray[np.float32]) -> NDArray[np.uint8]: ...
 def tiled(
     picture: NDArray[np.float64],
     density: float,

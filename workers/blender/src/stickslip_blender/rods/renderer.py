@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -63,7 +62,6 @@ class RodRenderer:
         *,
         quality: Quality | Sampling = Quality.standard,
         points: int = POINTS,
-        scratch: str | Path | None = None,
     ) -> None:
         self._scene = new_scene()
         self._sampling = quality if isinstance(quality, Sampling) else SAMPLING[quality]
@@ -76,11 +74,7 @@ class RodRenderer:
         self._triangles = fans(faces)
         self._shader = add_material(self._mesh, "silicone", Roughness=0.3, IOR=1.41)  # vinyl polysiloxane
         add_view(self._scene)
-        self._reader = FrameReader(self._scene, scratch)
-
-    def close(self) -> None:
-        """Release what it holds outside Blender."""
-        self._reader.close()
+        self._reader = FrameReader(self._scene)
 
     def render(
         self,

@@ -23,9 +23,7 @@ def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskRes
     if rejected := why_unfit("rod", line, look.radius, cameras):
         return rejected
     color = silicone_color(look.color_seed)
-    renderer = workshop.renderer(
-        ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality, scratch=workshop.scratch)
-    )
+    renderer = workshop.renderer(("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality))
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
     preview = png(np.concatenate(list(views), axis=1)) if task.preview else None
     return workshop.rendered("views", views, preview, {"color": list(to_linear(color))})
