@@ -142,18 +142,6 @@ void compose(const Halves& shading, std::tuple<float, float> albedos, const Inpu
                   static_cast<std::size_t>(pictures.stride(0)));
 }
 
-auto tiled(const Doubles& picture, double density, const Input<double, nb::shape<3, 3>>& rays,
-           const Input<double, nb::shape<3>>& position, double height, std::tuple<int, int> size, int subsamples) {
-  const auto [columns, rows] = size;
-  if (picture.shape(0) != picture.shape(1) || picture.size() == 0 || columns < 1 || rows < 1 || subsamples < 1)
-    throw std::invalid_argument("picture must be square, and size and subsamples at least 1");
-  std::vector<float> result =
-      raster::tiled({picture.data(), picture.size()}, static_cast<int>(picture.shape(0)), density,
-                    {rays.data(), rays.size()}, {position.data(), 3}, height, columns, rows, subsamples);
-  return handed_over<float, nb::shape<-1, -1>>(std::move(result),
-                                               {static_cast<std::size_t>(rows), static_cast<std::size_t>(columns)});
-}
-
 auto blurred(const Colors& values, const Plane& down, const Plane& across) {
   const std::size_t height = values.shape(0), width = values.shape(1), count = values.shape(2);
   for (const Plane* radius : {&down, &across})
@@ -194,8 +182,6 @@ NB_MODULE(_raster, module) {
   module.def("compose", &compose, "shading"_a, "albedos"_a, "overall"_a, "coverage"_a, "mean"_a, "window"_a,
              "reflected"_a, "reflected_window"_a, "floor"_a, "reflectance"_a, "pictures"_a,
              "Write pictures (count, h, w, 3) of a shading (h, w, 3), half floats given as uint16.");
-  module.def("tiled", &tiled, "picture"_a, "density"_a, "rays"_a, "position"_a, "height"_a, "size"_a, "subsamples"_a,
-             "Return the mean of a picture that repeats over a plane, (h, w); size is (width, height) [px].");
   module.def("blurred", &blurred, "values"_a, "down"_a, "across"_a,
              "Return values (h, w, k), blurred about each pixel by radii of its own (h, w) [px].");
   module.def("normals", &normals, "points"_a, "triangles"_a, "Return the unit normals of vertices (V, 3).");

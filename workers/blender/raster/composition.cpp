@@ -111,33 +111,6 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
   }
 }
 
-std::vector<float> tiled(std::span<const double> picture, int size, double density, std::span<const double> rays,
-                         std::span<const double> position, double height, int columns, int rows, int subsamples) {
-  std::vector<float> result(static_cast<std::size_t>(columns) * rows);
-  const auto wrapped = [size](int k) { return (k % size + size) % size; };
-  for (int row = 0; row < rows; ++row) {
-    for (int column = 0; column < columns; ++column) {
-      double total = 0.0;
-      for (int sample = 0; sample < subsamples * subsamples; ++sample) {
-        const double u = column + (sample % subsamples + 0.5) / subsamples - 0.5;
-        const double v = row + (sample / subsamples + 0.5) / subsamples - 0.5;
-        std::array<double, 3> ray;
-        for (int k = 0; k < 3; ++k) ray[k] = rays[3 * k] * u + rays[3 * k + 1] * v + rays[3 * k + 2];
-        const double reach = (height - position[2]) / std::min(ray[2], -1e-3);
-        const double x = (position[0] + reach * ray[0]) * density, y = (position[1] + reach * ray[1]) * density;
-        const double left = std::floor(x), top = std::floor(y), along = x - left, down = y - top;
-        const int i0 = wrapped(static_cast<int>(left)), i1 = wrapped(static_cast<int>(left) + 1);
-        const double* const low = picture.data() + static_cast<std::size_t>(wrapped(static_cast<int>(top))) * size;
-        const double* const high = picture.data() + static_cast<std::size_t>(wrapped(static_cast<int>(top) + 1)) * size;
-        const double lower = low[i0] + along * (low[i1] - low[i0]), upper = high[i0] + along * (high[i1] - high[i0]);
-        total += lower + down * (upper - lower);
-      }
-      result[static_cast<std::size_t>(row) * columns + column] = static_cast<float>(total / (subsamples * subsamples));
-    }
-  }
-  return result;
-}
-
 namespace {
 
 // A line of a table that lies between two of its own: (1 - share) table[low] + share table[low + 1].

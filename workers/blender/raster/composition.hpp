@@ -37,14 +37,6 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
 // red, and blue that of green, where it is as near as this, or is rounded. Grey stays grey, which is smaller when coded.
 constexpr int tolerance = 1;
 
-// Return the mean of a picture that repeats over the plane z = height, seen through pixels (height x width) of a
-// camera.
-//
-// A pixel (column, row, 1) looks along `rays` (3 x 3, row by row) from `position`. The picture has size x size texels,
-// `density` of them to a unit of length; each pixel is the mean of subsamples^2 places.
-std::vector<float> tiled(std::span<const double> picture, int size, double density, std::span<const double> rays,
-                         std::span<const double> position, double height, int columns, int rows, int subsamples);
-
 // Return values (height x width x count), blurred about each pixel by radii of its own, in rows `down` and in columns
 // `across` [px], not necessarily whole: twice the mean over a box, from a summed-area table [Crow 1984]. A side of a
 // box is sqrt(1 + 4 radius^2): its variance is that of a pixel and radius^2 / 3. There are zeros around the values.

@@ -3,7 +3,7 @@
 import hashlib
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,10 @@ Clip = npt.NDArray[np.uint8]
 
 
 @pytest.fixture(scope="module")
-def renderer(make_sheet: Callable[..., Any]) -> Iterator[ClothRenderer]:
+def renderer(make_sheet: Callable[..., Any]) -> ClothRenderer:
     """One scene for all tests that need no other; the last test of this module builds others."""
     sheet = make_sheet()
-    made = ClothRenderer(sheet.triangles, sheet.rest, Holders)
-    yield made
-    made.close()
+    return ClothRenderer(sheet.triangles, sheet.rest, Holders)
 
 
 def _render(renderer: ClothRenderer, sheet: Any, *textures: Texture, **look: Any) -> Clip:

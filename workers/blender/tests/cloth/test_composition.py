@@ -7,7 +7,6 @@ import numpy.typing as npt
 import pytest
 from stickslip_blender.cloth.shading import ALBEDOS, TOLERANCE
 from stickslip_blender.raster import Window, _raster
-from stickslip_testing.cameras import looking_at
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
@@ -106,25 +105,6 @@ def test_blurring_is_a_box_twice() -> None:
     np.testing.assert_allclose(_raster.blurred(values, down, across), expected, atol=1e-6)
     with pytest.raises(ValueError, match="radii must be at least 0"):
         _raster.blurred(values, down - 1.0, across)
-
-
-def test_a_tiled_picture_repeats_over_the_plane() -> None:
-    """Of a picture that is a wave, with one sample a pixel: the wave at the place that the pixel sees."""
-    camera = looking_at(
-        (0.1, 0.0, 0.0), azimuth=20.0, elevation=35.0, distance=1.0, name="a", width=40, height=30, focal=60.0
-    )
-    size, density = 256, 512.0
-    angle = 2.0 * np.pi * np.arange(size) / size
-    picture = np.sin(angle)[None, :] + 0.5 * np.cos(3.0 * angle)[:, None]
-    matrix = np.array([[60.0, 0.0, camera.cx], [0.0, 60.0, camera.cy], [0.0, 0.0, 1.0]])
-    rays = np.ascontiguousarray(np.asarray(camera.rotation).T @ np.linalg.inv(matrix))
-    seen = _raster.tiled(picture, density, rays, np.array(camera.position), -0.02, (40, 30), 1)
-    rows, columns = np.indices(seen.shape)
-    way = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ rays.T
-    reach = (-0.02 - camera.position[2]) / way[..., 2]
-    x, y = (camera.position[k] + reach * way[..., k] for k in range(2))
-    wave = 2.0 * np.pi * density / size
-    np.testing.assert_allclose(seen, np.sin(wave * x) + 0.5 * np.cos(3.0 * wave * y), atol=2e-3)
 
 
 def test_normals_point_off_the_surface() -> None:

@@ -12,8 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.raster import _raster
-
 if TYPE_CHECKING:
     from stickslip_schemas.spec.appearance import FloorNumbers
 
@@ -96,15 +94,20 @@ def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDA
 
     Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m].
     """
-    inverse = np.array(  # of the camera's matrix: from a pixel (column, row, 1) to its ray, in the camera's axes
-        [[1 / camera.fx, 0, -camera.cx / camera.fx], [0, 1 / camera.fy, -camera.cy / camera.fy], [0, 0, 1]]
-    )
-    rays = np.ascontiguousarray(np.asarray(camera.rotation).T @ inverse)
-    density, place = GRAIN_SIZE / GRAIN_EXTENT, np.array(camera.position, dtype=np.float64)
-    size = camera.width, camera.height
-    factor = _raster.tiled(_marks(substrate), density, rays, place, height, size, _SUBSAMPLES)
-    tinted: npt.NDArray[np.float32] = factor[..., None] * np.asarray(substrate.tint, dtype=np.float32)
-    return tinted
+    step = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
+    rows, columns = ((np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width))
+    across, down = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
+    ray = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.asarray(camera.rotation)
+    reach = (height - camera.position[2]) / np.minimum(ray[..., 2:], -1e-3)
+    place = (camera.position[:2] + reach * ray[..., :2]) * (GRAIN_SIZE / GRAIN_EXTENT)
+    low = np.floor(place).astype(int)
+    (right, lower), marks = np.moveaxis(place - low, -1, 0), _marks(substrate)
+    (i, j), (k, m) = (np.moveaxis(corner % GRAIN_SIZE, -1, 0) for corner in (low, low + 1))
+    upper_row = marks[j, i] + right * (marks[j, k] - marks[j, i])
+    lower_row = marks[m, i] + right * (marks[m, k] - marks[m, i])
+    samples = upper_row + lower * (lower_row - upper_row)
+    factor = samples.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(axis=(1, 3))
+    return np.asarray(factor[..., None] * substrate.tint, dtype=np.float32)
 
 
 def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:

@@ -35,15 +35,6 @@ def compose(
     reflectance: float,
     pictures: NDArray[np.uint8],
 ) -> None: ...
-def tiled(
-    picture: NDArray[np.float64],
-    density: float,
-    rays: NDArray[np.float64],
-    position: NDArray[np.float64],
-    height: float,
-    size: tuple[int, int],
-    subsamples: int,
-) -> NDArray[np.float32]: ...
 def blurred(
     values: NDArray[np.float32], down: NDArray[np.float32], across: NDArray[np.float32]
 ) -> NDArray[np.float32]: ...
