@@ -27,11 +27,11 @@ from stickslip_schemas.spec.fabrics import Texture
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.raster import Window, decoded, projected, see
 
-HALF_SAMPLES = 4
+HALF_SAMPLES = 8
 """Paths per pixel of each of the two direct renderings. The first ones are left out: at the edges of a print, a path
 through the middle of each pixel is an error that both have. Errors differ more between instants than they are known at
 one, so many instants with few paths tell most."""
-_FIXED = 16  # what else a frame of a shading costs [paths per pixel of its window]
+_FIXED = 25  # what else a frame of a shading costs [paths per pixel of its window]
 _SET_UP = 6  # the same of the two renderings
 _TRIOS = 3  # that eight textures make
 LANDED = 0.04
