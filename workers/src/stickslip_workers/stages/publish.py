@@ -184,7 +184,7 @@ def _split_counts(labels: _Labels, rejections: Sequence[Rejection]) -> dict[str,
 
 
 def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
-    """Return how good the pictures are, as each clip was measured; None where there are none."""
+    """Return how good the pictures are, as each clip was measured; None if it has none."""
     if pictured(task.spec) is None:
         return None
     share, psnr = None, {}
