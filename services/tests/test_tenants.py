@@ -75,7 +75,7 @@ OWNED = {
     *(
         (method, f"/v1/datasets/{{dataset}}/versions/{{version}}{rest}")
         for method in ("GET", "HEAD")
-        for rest in ("", "/manifest", "/page", "/files/{path:path}")
+        for rest in ("", "/manifest", "/files/{path:path}")
     ),
     ("GET", "/jobs/{job_id}"),
     *(("GET", f"/ui/jobs/{{job_id}}{rest}") for rest in ("", "/map")),
