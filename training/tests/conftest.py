@@ -134,6 +134,8 @@ def write_dataset(
 def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samples_per_file: int) -> None:
     shard = (samples_per_file, *array.shape)
     compressor = BloscCodec(typesize=4, cname="zstd", clevel=5, shuffle="shuffle") if array.is_trajectory else None
+    if array.is_clip:
+        compressor = BloscCodec(typesize=1, cname="lz4hc", clevel=9, shuffle="noshuffle")
     out = group.create_array(
         array.name,
         shape=values.shape,
@@ -153,7 +155,7 @@ def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samp
 
 
 def _turned(array: ArrayLayout) -> list[TransposeCodec]:
-    order = (0, 2, 1, 3, 4) if array.is_clip else (0, 3, 2, 1) if array.is_trajectory else None
+    order = (0, 2, 4, 1, 3) if array.is_clip else (0, 3, 2, 1) if array.is_trajectory else None
     return [] if order is None else [TransposeCodec(order=order)]
 
 

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+from numcodecs import blosc
 from stickslip_schemas.format.codecs import (
     CorruptChunkError,
     axes_order,
-    decode_chunk,
     decode_sample,
-    encode_chunk,
     encode_sample,
 )
 from stickslip_schemas.spec.arrays import ArrayLayout
@@ -37,11 +36,11 @@ def test_what_is_written_is_read(array: ArrayLayout) -> None:
 def test_a_clip_is_turned_as_the_metadata_say_and_is_smaller() -> None:
     clip = moving()
     chunk = encode_sample(CLIP, clip)
-    assert len(chunk) < len(encode_chunk(clip))
+    assert len(chunk) < clip.nbytes / 3  # six frames that are nearly the same
     order = axes_order(CLIP)
     assert order is not None
     turned = clip[None].transpose(order)
-    assert decode_chunk(chunk) == turned.tobytes()
+    assert blosc.decompress(chunk[:-4]) == turned.tobytes()
 
 
 def test_a_clip_of_another_size_is_refused() -> None:

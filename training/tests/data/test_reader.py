@@ -204,11 +204,11 @@ def test_a_valid_sample_without_a_chunk_raises(clips, tmp_path):
 
 def test_a_chunk_of_another_size_raises(clips, tmp_path):
     """A smaller chunk with a good checksum would leave a part of the buffer as it was."""
-    from stickslip_schemas.format.codecs import encode_chunk, encode_shard
+    from stickslip_schemas.format.codecs import encode_clip, encode_shard
 
     made = clips.copy(tmp_path / "v1")
     shape = made.arrays["video"].shape[1:]
-    chunks = [encode_chunk(np.ones(shape, np.uint8)[: 1 + (slot == 4)]) for slot in range(8)]
+    chunks = [encode_clip(np.ones(shape, np.uint8)[: 1 + (slot == 4)]) for slot in range(8)]
     made.rewrite("video/c/0/0/0/0/0", encode_shard(chunks))
     reader = DatasetReader(made.root)
     assert reader.read("video", [4]).all()
@@ -368,7 +368,7 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"zstd"', '"gzip"', "array video: codecs must be"),
+        ('"blosc"', '"gzip"', "array video: codecs must be"),
         ('"order": [', '"order": [3, ', "array video: codecs must be"),
         ('"data_type": "int16"', '"data_type": "int32"', "array texture: data_type must be"),
         ('"fill_value": -1', '"fill_value": 0', "array texture: fill_value must be -1, and is 0"),

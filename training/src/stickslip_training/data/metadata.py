@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.format.codecs import axes_order
+from stickslip_schemas.format.codecs import axes_order, packing
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.data.errors import InvalidDatasetError
@@ -76,7 +76,7 @@ _CRC = {"name": "crc32c", "configuration": {}}
 
 
 def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
-    compressor: dict[str, Any] = {"name": "blosc" if array.is_trajectory else "zstd", "configuration": {}}
+    compressor: dict[str, Any] = {"name": "zstd" if packing(array) is None else "blosc", "configuration": {}}
     chunk: list[dict[str, Any]] = [_LITTLE, compressor, _CRC]
     if (order := axes_order(array)) is not None:
         chunk.insert(0, {"name": "transpose", "configuration": {"order": list(order)}})

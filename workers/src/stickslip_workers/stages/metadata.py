@@ -3,7 +3,7 @@
 import warnings
 
 import numpy as np
-from stickslip_schemas.format.codecs import BLOSC_LEVEL, axes_order, zstd_level
+from stickslip_schemas.format.codecs import ZSTD_LEVEL, axes_order, packing
 from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.spec.jobs import JobSpec
@@ -41,10 +41,9 @@ def create_array(group: object, array: ArrayLayout, *, sample_count: int, sample
 
     group_shape = (samples_per_file, *array.shape)
     order = axes_order(array)
-    compressor: object = ZstdCodec(level=zstd_level(array), checksum=False)
-    if array.is_trajectory:
-        width = np.dtype(array.dtype).itemsize
-        compressor = BloscCodec(typesize=width, cname="zstd", clevel=BLOSC_LEVEL, shuffle="shuffle", blocksize=0)
+    compressor: object = ZstdCodec(level=ZSTD_LEVEL, checksum=False)
+    if (packed := packing(array)) is not None:
+        compressor = BloscCodec(typesize=np.dtype(array.dtype).itemsize, blocksize=0, **packed._asdict())
     return group.create_array(  # type: ignore[attr-defined]  # zarr.Group; zarr is imported late
         array.name,
         shape=(sample_count, *array.shape),
