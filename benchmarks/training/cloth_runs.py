@@ -1,7 +1,8 @@
 """Simulate drop-and-drag for training, and pack meshes of the instants that clips show.
 
     python benchmarks/training/cloth_runs.py RUNS [--fabrics NAME ...] [--runs 30] [--vertices 21] [--preset fast]
-        [--density LOW HIGH] [--bending LOW HIGH] [--stretching LOW HIGH] [--seed 0] [--frames 300] [--pack FILE]
+        [--density LOW HIGH] [--bending LOW HIGH] [--stretching LOW HIGH] [--seed 0] [--frames 300]
+        [--self-friction F] [--pack FILE]
 
 Each run is a file of RUNS, and a call goes on where another stopped; two may share a folder. mu is a Sobol sequence of
 [0, 1.6] for each fabric, and every run has a seed of its own, so that both sides occur. With a range of factors the
@@ -32,8 +33,6 @@ SHOWN = 30  # frames of a clip
 FRAMES = 300  # of a simulation
 MU = 1.6
 DROPPED = 17  # the first instant after the drop
-SELF_FRICTION = None  # the weights that come with stickslip-training learned from cloth that passes through itself
-
 
 FACTORS = ("density", "bending", "stretching")
 
@@ -67,12 +66,14 @@ def instants_of(frames: int) -> list[int]:
     return [instant for instant in shown_frames(SHOWN, FRAMES) if instant < frames]
 
 
-def simulate(name: str, point: Point, vertices: int, preset: str, seed: int, frames: int) -> dict[str, object]:
+def simulate(
+    name: str, point: Point, vertices: int, preset: str, seed: int, frames: int, self_friction: float | None
+) -> dict[str, object]:
     """Run one simulation, and return what is kept of it."""
     started = time.process_time()
     fabric = fabric_named(name).scaled(**point.factors)
     scene = cloth_drag.scene(
-        fabric, point.mu, mesh=vertices, preset=preset, seed=seed, frames=frames, self_friction=SELF_FRICTION
+        fabric, point.mu, mesh=vertices, preset=preset, seed=seed, frames=frames, self_friction=self_friction
     ).run()
     held, free = scene.rest[:, 1].argmax(), scene.rest[:, 1].argmin()
     edges = [np.isclose(scene.rest[:, 1], scene.rest[vertex, 1]) for vertex in (held, free)]
@@ -88,6 +89,7 @@ def simulate(name: str, point: Point, vertices: int, preset: str, seed: int, fra
         "landed_side": 1 if fell > 0 else -1,
         "vertices": vertices,
         "preset": preset,
+        "self_friction": self_friction,
         "build": build_info().build_hash,
         "valid": scene.valid,
         "reason": scene.reason,
@@ -140,6 +142,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=float, nargs=2, default=(1.0, 1.0), metavar=("LOW", "HIGH"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=FRAMES, help="to simulate, 2.4 a second; all are 300")
+    parser.add_argument("--self-friction", type=float, help="of the cloth with itself; none: it passes through itself")
     parser.add_argument("--pack", type=Path, help="simulate nothing, and write this file")
     args = parser.parse_args()
     if args.pack is not None:
@@ -159,7 +162,7 @@ def main() -> None:
                 continue  # done, or another process is at it
             point = points(fabric, args.runs, args.seed, ranges)[number]
             seed = int(np.random.SeedSequence((args.seed, fabric_names().index(fabric), number)).generate_state(1)[0])
-            run = simulate(fabric, point, args.vertices, args.preset, seed % 2**31, args.frames)
+            run = simulate(fabric, point, args.vertices, args.preset, seed % 2**31, args.frames, args.self_friction)
             np.savez_compressed(path, **run)  # type: ignore[arg-type]  # its stub takes no objects
             print(run["about"], flush=True)
 

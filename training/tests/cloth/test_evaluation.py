@@ -14,6 +14,8 @@ from stickslip_training.cloth.posterior import Bins, Estimates, Posterior
 
 BINS = Bins(0.0, 1.6, 64)
 
+ALL_KNOWN = np.ones(3), [None] * 3
+
 
 def answers(mu, deviation, material, certain=0.9):
     weight = np.exp(-0.5 * ((BINS.centers - np.asarray(mu)[:, None]) / deviation) ** 2)
@@ -77,8 +79,8 @@ def test_uncertainty_counts_simulations_and_not_clips():
 def test_printed_predictions_score_as_the_posteriors_do():
     mu, material = np.array([0.2, 0.6, 1.0]), np.array([0, 1, 2])
     posterior = answers(mu + 0.03, 0.06, [0, 1, 1])
-    told = json.loads(json.dumps(predictions(posterior, [4, 7, 9])))
-    assert set(told[0]) == {"slot", "material", "mu"}
+    told = json.loads(json.dumps(predictions(posterior, [4, 7, 9], ALL_KNOWN)))
+    assert set(told[0]) == {"slot", "material", "mu", "familiarity", "no_answer"}
     assert sum(told[0]["material"].values()) == pytest.approx(1.0, abs=1e-5)
     expected = truth(mu, material)
     scores, direct = score_predictions(told, posterior.materials, [4, 7, 9], expected), score(posterior, expected)
@@ -99,7 +101,7 @@ def test_printed_predictions_score_as_the_posteriors_do():
     ],
 )
 def test_a_file_of_predictions_is_checked(change, message):
-    told = predictions(answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9])
+    told = predictions(answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9], ALL_KNOWN)
     change(told)
     with pytest.raises(ValueError, match=message):
         score_predictions(told, ("a", "b", "c"), [4, 7, 9], truth([0.5] * 3))
@@ -109,5 +111,19 @@ def test_an_interval_that_reaches_the_largest_known_mu_says_above():
     joint = np.zeros((2, 1, 64))
     joint[0, 0, 60:] = 0.25
     joint[1, 0, 30:34] = 0.25
-    told = predictions(Posterior(("cloth",), BINS, joint), [0, 1])
+    told = predictions(Posterior(("cloth",), BINS, joint), [0, 1], (np.ones(2), [None] * 2))
     assert [answer["mu"]["above"] for answer in told] == [1.6, None]
+
+
+def test_a_clip_without_an_answer_has_no_mu_and_scores_as_the_prior():
+    told = predictions(
+        answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9], (np.array([1, 0.01, 1]), [None, "glued", None])
+    )
+    assert [(each["mu"] is None, each["no_answer"]) for each in told] == [(False, None), (True, "glued"), (False, None)]
+    scores = score_predictions(told, ("a", "b", "c"), [4, 7, 9], truth([0.2, 0.6, 1.0]))
+    assert scores.blind.mae.value == pytest.approx((0.0 + 0.2 + 0.0) / 3, abs=0.01)
+
+
+def test_the_interval_score_is_the_width_and_ten_times_what_is_beyond():
+    found = Estimates(np.array([0.5, 0.5]), np.array([0.4, 0.4]), np.array([0.6, 0.6]))
+    assert errors(found, np.array([0.5, 0.7]), np.arange(2)).interval.value == pytest.approx((0.2 + 0.2 + 10 * 0.1) / 2)

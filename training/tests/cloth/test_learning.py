@@ -14,7 +14,7 @@ def test_friction_of_unseen_simulations_is_learned_from_clips(runs):
     assert 65 <= len(train) <= 70
     model = train_friction(train, validation, ClothTraining(steps=900, worlds=False), epoch=150)
     clips = render_clips(test, 6, 99)
-    scores = score(model.estimate(clips)[0], clips)
+    scores = score(model.estimate(clips), clips)
     assert scores.blind.simulations >= 20
     assert scores.blind.mae.value <= 0.13
     assert scores.blind.within_02.value >= 0.75

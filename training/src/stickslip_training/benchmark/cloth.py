@@ -23,6 +23,7 @@ class ClothTask(Task):
 
     columns = (
         "mean error of mu",
+        "interval score",
         "< 0.1 / < 0.2",
         "material",
         "in 80 % sets",
@@ -46,7 +47,7 @@ class ClothTask(Task):
         ]
         return {"frames": (255 * torch.stack(means)).round().to(torch.uint8).numpy()}
 
-    def inputs(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+    def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
         raise ValueError("a method is given the clips themselves: read the array video of the dataset")
 
     def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
@@ -62,6 +63,7 @@ class ClothTask(Task):
 
         return (
             f"{error(blind)} ({blind['mae']['low']:.3f} to {blind['mae']['high']:.3f})",
+            f"{blind['interval']['value']:.3f}" if "interval" in blind else "",
             f"{blind['within_01']['value']:.0%} / {blind['within_02']['value']:.0%}",
             f"{scores['top_1']['value']:.0%}",
             f"{blind['coverage']['value']:.0%}",

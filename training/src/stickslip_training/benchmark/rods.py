@@ -1,6 +1,7 @@
 """Curvature of hanging rods from noisy centrelines, and their weight over their stiffness, gamma.
 
-A method is given the centrelines of the split test under white noise of three strengths. Its answers are a list with
+A method is given the centrelines of the split test under white noise of three strengths, drawn from a secret. Its
+answers are a list with
 
     {"slot": 7, "noise": 0.005, "bending": [150 numbers, |kappa| L from the clamp on], "gamma": 812.0}
 
@@ -12,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from stickslip_schemas.base.keys import sha256
 
-from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
+from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.benchmark.task import Task
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.rods.dataset import with_white_noise
@@ -22,7 +24,6 @@ from stickslip_training.rods.evaluation import bending, relative_rms_error
 NOISES = (0.001, 0.005, 0.01)
 """Standard deviation of every coordinate, over L."""
 
-_SEED = 2026
 _DRAWS = 1000
 _EVERY = 15  # points of a rod of which one is compared
 
@@ -34,7 +35,7 @@ class RodTask(Task):
         *(f"{100 * noise:g} %: error of \\|κ\\|, median; p95" for noise in NOISES),
         f"error of gamma at {100 * NOISES[1]:g} %, median; p95",
     )
-    tolerances = {"centerline": 1e-5, "bending": 1e-3, "noisy": 1e-5}  # noqa: RUF012
+    tolerances = {"centerline": 1e-5, "bending": 1e-3}  # noqa: RUF012
 
     def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
         columns = {name: reader.label(name)[slots].tolist() for name in ("gamma", "phi0", "phi1")}
@@ -48,12 +49,16 @@ class RodTask(Task):
         return {
             "centerline": exact[:, ::_EVERY],
             "bending": _truth(reader, slots)[:, ::_EVERY].astype(np.float32),
-            "noisy": _noisy(exact)[:, :, -1],
         }
 
-    def inputs(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
-        """Return the slots, (n,), the noises, (3,), and the centrelines over L, (3, n, 150, 3)."""
-        return {"slot": slots, "noise": np.array(NOISES), "centerline": _noisy(reader.read("centerline", slots))}
+    def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
+        """Return the slots, (n,), the noises, (3,), and the centrelines over L, (3, n, 150, 3).
+
+        Who does not know the secret cannot draw the noise again and take it away.
+        """
+        exact, seed = reader.read("centerline", slots), int(sha256(secret), 16)
+        lines = np.stack([with_white_noise(exact, noise, (seed, place)) for place, noise in enumerate(NOISES)])
+        return {"slot": slots, "noise": np.array(NOISES), "centerline": lines}
 
     def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
         truth, gamma = _truth(reader, slots), reader.label("gamma")[slots]
@@ -84,10 +89,6 @@ class RodTask(Task):
 
 def _truth(reader: DatasetReader, slots: Integers) -> Floats:
     return bending(reader.read("curvature", slots))
-
-
-def _noisy(centerline: Array) -> SingleFloats:
-    return np.stack([with_white_noise(centerline, noise, (_SEED, place)) for place, noise in enumerate(NOISES)])
 
 
 def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Floats, Floats]:

@@ -25,8 +25,9 @@ class Task(ABC):
         """Return a little of what a method sees of slots, and of a truth that is computed."""
 
     @abstractmethod
-    def inputs(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
-        """Return what a method is given; raise ValueError where that is the dataset itself."""
+    def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
+        """Return what a method is given, with noise from a secret; raise ValueError where that is the dataset
+        itself."""
 
     @abstractmethod
     def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from secrets import token_bytes
 from typing import Annotated
 
 import typer
@@ -11,6 +12,8 @@ from stickslip_schemas.store import write_durably
 
 from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
+
+SECRET_BYTES = 32
 
 benchmark = typer.Typer(no_args_is_help=True, help="Named test sets: enter yours, and compare.")
 
@@ -55,6 +58,9 @@ def inputs(
     name: SetArgument,
     dataset: DatasetArgument,
     out: Annotated[Path, typer.Option(help="file for what a method is given (.npz)")],
+    secret: Annotated[
+        Path, typer.Option(help="file that the noise is drawn from; the scorer keeps it, and the first call makes it")
+    ],
 ) -> None:
     """Write what a method is given, where that is not the dataset itself: rods are seen with noise."""
     import numpy as np
@@ -63,7 +69,10 @@ def inputs(
 
     with readable_errors(), DatasetReader(dataset) as reader:
         chosen = load_set(name)
-        given = chosen.task.inputs(reader, chosen.check(reader)[0])
+        slots = chosen.check(reader)[0]
+        if not secret.exists():
+            write_durably(secret, token_bytes(SECRET_BYTES))
+        given = chosen.task.inputs(reader, slots, secret.read_bytes())
         with out.open("wb") as file:
             np.savez(file, **given)  # type: ignore[arg-type]  # its stub takes no dictionary
     shapes = ", ".join(f"{key} {values.shape}" for key, values in given.items())

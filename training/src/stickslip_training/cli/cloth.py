@@ -15,12 +15,14 @@ from stickslip_training.data.reader import DatasetReader
 if TYPE_CHECKING:
     from stickslip_training.cloth.evaluation import Errors, Scores
 
+NO_ANSWER = 3
+"""Exit status of `predict` where no clip has an answer."""
+
 cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
 
 RunsArgument = Annotated[
     str, typer.Argument(metavar="RUNS", help="a dataset that stores positions, or a packed file of simulations (.npz)")
 ]
-ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="friction.safetensors of `cloth train`")]
 
 
 @cloth.command()
@@ -85,53 +87,6 @@ def train(
 
 
 @cloth.command()
-def evaluate(
-    model: ModelArgument,
-    runs: RunsArgument,
-    out: Annotated[Path, typer.Option(help="directory for report.json and records.jsonl")],
-    split: Annotated[str, typer.Option(help="train, validation, test, or all clips of a dataset")] = "test",
-    renders: Annotated[int, typer.Option(help="clips of each simulation of a packed file")] = 6,
-    seed: Annotated[int, typer.Option(help="of the looks of clips of a packed file")] = 99,
-    split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
-) -> None:
-    """Measure the errors of a model on simulations that it was not trained on, and write them down."""
-    from stickslip_training.cloth.clips import read_clips, render_clips, training_runs
-    from stickslip_training.cloth.evaluation import predictions, score
-    from stickslip_training.cloth.model import load_friction
-
-    with readable_errors():
-        friction = load_friction(model)
-        if runs.endswith(".npz"):
-            source, parts = training_runs(runs, split_seed)
-            clips, slots = render_clips(parts[_split(split)].named(friction.materials), renders, seed), None
-        else:
-            with DatasetReader(runs) as reader:
-                source = {"manifest": reader.manifest_digest}
-                chosen = None if split == "all" else _split(split)
-                clips, slots = read_clips(reader, chosen, friction.materials)
-        if (clips.material < 0).any():
-            raise ValueError(
-                f"materials of the clips must be known to the model: it knows {', '.join(friction.materials)}"
-            )
-        posterior, _ = friction.estimate(clips)
-        scores = score(posterior, clips)
-        out.mkdir(parents=True, exist_ok=True)
-        report = {"source": source, "split": split, "renders": renders, "scores": scores.as_dict()}
-        (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-        numbers = range(len(clips)) if slots is None else slots.tolist()
-        lines = [
-            json.dumps({**answer, "true_mu": mu, "true_material": friction.materials[code], "simulation": int(run)})
-            for answer, mu, code, run in zip(
-                predictions(posterior, numbers), clips.mu.tolist(), clips.material, clips.run, strict=True
-            )
-        ]
-        (out / "records.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    console = Console()
-    console.print(_scores(scores))
-    console.print(f"{out}: report.json, records.jsonl", soft_wrap=True)
-
-
-@cloth.command()
 def predict(
     source: Annotated[str, typer.Argument(metavar="DATASET_OR_VIDEO", help="a dataset, or a video with --camera")],
     model: Annotated[
@@ -151,9 +106,14 @@ def predict(
             help="column and row of the middles of both held patches in the first frame [px], smaller y first"
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print a list of {slot, material, mu}")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="print a list of {slot, material, mu, familiarity, no_answer}")
+    ] = False,
 ) -> None:
-    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your own video."""
+    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your own video.
+
+    A clip that is unlike those of training has no answer, and a reason; if all are so, the exit status is 3.
+    """
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.model import WEIGHTS, load_friction
@@ -179,23 +139,29 @@ def predict(
                 fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
             true = [f"{mu:.2f}, {fabric}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
-        posterior, ood_score = friction.estimate(clips)
-        answers = predictions(posterior, slots)
-        for answer, far in zip(answers, ood_score.tolist(), strict=True):
-            answer["ood_score"] = round(far, 3)
+        answers = predictions(friction.estimate(clips), slots, friction.judge(clips))
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
-        return
+    else:
+        Console().print(_answers(answers, true))
+    if all(answer["no_answer"] for answer in answers):
+        raise typer.Exit(NO_ANSWER)
+
+
+def _answers(answers: list[dict[str, Any]], true: list[str]) -> Table:
     table = Table()
-    for title in ("slot", "material", "mu", "80 %", *(["truth"] if true else []), ""):
-        table.add_column(title, justify="right" if title in ("slot", "mu", "80 %") else "left")
+    for title in ("slot", "material", "mu", "80 %", *(["truth"] if true else []), "familiarity"):
+        table.add_column(title, justify="left" if title in ("material", "truth") else "right")
     for place, answer in enumerate(answers):
         name, probability = max(answer["material"].items(), key=lambda item: item[1])
         mu = answer["mu"]
-        bounds = f"{mu['low']:.2f} to " + (f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}")
-        cells = [str(answer["slot"]), f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
-        table.add_row(*cells, *true[place : place + 1], _warning(answer))
-    Console().print(table)
+        if mu is None:
+            cells = ["", "no answer", answer["no_answer"]]
+        else:
+            bounds = f"{mu['low']:.2f} to " + (f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}")
+            cells = [f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
+        table.add_row(str(answer["slot"]), *cells, *true[place : place + 1], f"{answer['familiarity']:.2f}")
+    return table
 
 
 @cloth.command()
@@ -216,10 +182,6 @@ def score(
             read_answers(predictions)[0], reader.categories("material"), slots.tolist(), truth_of_slots(reader, slots)
         )
     Console().print(_scores(scores))
-
-
-def _warning(answer: dict[str, Any]) -> str:
-    return f"unlike the training clips: {answer['ood_score']:.1f} of 1" if answer["ood_score"] > 1 else ""
 
 
 def _split(name: str) -> Any:
@@ -243,8 +205,6 @@ def _scores(scores: "Scores") -> Table:
         table.add_row(name, str(part.mae), *shares)
 
     add("material not known", scores.blind)
-    if scores.given is not None:
-        add("material known", scores.given)
     for name, part in scores.bands.items():
         add(f"mu {name}", part)
     return table

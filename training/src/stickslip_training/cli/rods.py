@@ -1,6 +1,5 @@
 """The commands on rods: `stickslip-train curvature`, `local-global` and `reconstruct`."""
 
-import importlib.util
 import json
 import math
 from dataclasses import asdict
@@ -25,7 +24,7 @@ _EVALUATED_RODS = 1000  # at most
 
 def curvature(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option(help="directory for the model, the report and the picture")],
+    out: Annotated[Path, typer.Option(help="directory for the model and the report")],
     steps: Annotated[int, typer.Option(help="of training; 1000 of 16 rods take 70 CPU seconds")] = 1000,
     noise: Annotated[float, typer.Option(help="noise on every coordinate, standard deviation over L")] = 0.005,
     seed: Annotated[int, typer.Option()] = 0,
@@ -64,15 +63,7 @@ def curvature(
         console.print(_results(report))
         for note in report.notes:
             console.print(f"Note: {note}")
-        written = ["report.json", "model.pt", "checkpoint.pt"]
-        if importlib.util.find_spec("matplotlib") is None:
-            console.print("No picture: pip install 'stickslip-training[plots]' for one.")
-        else:
-            from stickslip_training.rods.plots import plot_curvature
-
-            plot_curvature(config, report, out / "curvature.png")
-            written.append("curvature.png")
-        console.print(f"{out}: {', '.join(written)}", soft_wrap=True)
+        console.print(f"{out}: report.json, model.pt, checkpoint.pt", soft_wrap=True)
 
 
 def local_global(

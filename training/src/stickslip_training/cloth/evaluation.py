@@ -19,6 +19,9 @@ a pixel."""
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
+PRIOR = (0.8, 0.16, 1.44)
+"""Median, low and high of who knows only that mu is from 0 to 1.6."""
+
 _DRAWS = 1000
 _ROUNDING = 1e-9  # 8 of the 15 neighbours in linspace(0, 1.5, 16) are less than 0.1 apart in float64, and 7 are not
 
@@ -48,8 +51,9 @@ class Errors:
     within_02: Measure
     coverage: Measure
     """Share of the clips whose 80 % interval holds the truth."""
-    width: Measure
-    """Mean width of the interval."""
+    interval: Measure
+    """Mean interval score [Gneiting and Raftery 2007, Eq. 43]: the width of the 80 % interval, and 10 times what the
+    truth is beyond it. Who says wide intervals, or wrong ones, has a large score."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +130,7 @@ def errors(found: Estimates, mu: Floats, run: Integers) -> Errors:
     """Return the errors of estimates of `mu`, (clips,), of the simulations `run`, (clips,)."""
     off = np.abs(found.median - mu)
     inside = (found.low - _ROUNDING <= mu) & (mu <= found.high + _ROUNDING)
+    beyond = np.maximum(found.low - mu, 0.0) + np.maximum(mu - found.high, 0.0)
     return Errors(
         clips=len(mu),
         simulations=len(np.unique(run)),
@@ -133,7 +138,7 @@ def errors(found: Estimates, mu: Floats, run: Integers) -> Errors:
         within_01=measure((off < 0.1 - _ROUNDING).astype(float), run),
         within_02=measure((off < 0.2 - _ROUNDING).astype(float), run),
         coverage=measure(inside.astype(float), run),
-        width=measure(found.high - found.low, run),
+        interval=measure(found.high - found.low + 2 / (1 - SHARE) * beyond, run),
     )
 
 
@@ -148,9 +153,12 @@ def measure(values: Floats, run: Integers) -> Measure:
     return Measure(float(values.mean()), float(low), float(high))
 
 
-def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, Any]]:
+def predictions(
+    posterior: Posterior, slots: Sequence[int], judged: tuple[Floats, Sequence[str | None]]
+) -> list[dict[str, Any]]:
     """Return answers as `stickslip-train cloth predict --json` prints them.
 
+    `judged` has the familiarity of every clip and why it has no answer, or None; mu is None where there is a reason.
     `above` is the largest known mu where the last bin has as much probability as lies above an interval about the
     median: mu may be larger. Elsewhere it is None.
     """
@@ -165,10 +173,14 @@ def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, An
                 "low": round(float(low), 6),
                 "high": round(float(high), 6),
                 "above": posterior.bins.high if ends else None,
-            },
+            }
+            if reason is None
+            else None,
+            "familiarity": round(float(familiarity), 3),
+            "no_answer": reason,
         }
-        for slot, row, median, low, high, ends in zip(
-            slots, posterior.material, found.median, found.low, found.high, at_end, strict=True
+        for slot, row, median, low, high, ends, familiarity, reason in zip(
+            slots, posterior.material, found.median, found.low, found.high, at_end, *judged, strict=True
         )
     ]
 
@@ -176,13 +188,16 @@ def predictions(posterior: Posterior, slots: Sequence[int]) -> list[dict[str, An
 def score_predictions(answers: Sequence[Any], materials: Sequence[str], slots: Sequence[int], truth: Truth) -> Scores:
     """Score a file of predictions of any method; `truth` is that of `slots`, each of which must be answered once.
 
+    Where mu is null, as for a clip without an answer, `PRIOR` is scored.
+
     Raises ValueError, which names the answer, where one is not what `predictions` returns.
     """
     found: dict[int, tuple[list[float], tuple[float, float, float]]] = {}
     for place, answer in enumerate(answers):
         try:
             slot = int(answer["slot"])
-            median, low, high = (float(answer["mu"][name]) for name in ("median", "low", "high"))
+            given = PRIOR if answer["mu"] is None else [answer["mu"][name] for name in ("median", "low", "high")]
+            median, low, high = map(float, given)
             probabilities = {str(name): float(p) for name, p in answer["material"].items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn import functional
 
 from stickslip_training.cloth.calibration import (
-    TrainingFeatures,
     covering_temperature,
     likeliest_temperatures,
 )
@@ -27,7 +27,8 @@ from stickslip_training.cloth.clips import (
     training_cameras,
 )
 from stickslip_training.cloth.crop import Cameras, holder_crops
-from stickslip_training.cloth.model import FrictionModel, features, log_histograms
+from stickslip_training.cloth.familiarity import Familiarity, pooled
+from stickslip_training.cloth.model import FrictionModel, features, log_histograms, silhouettes
 from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
 from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
@@ -47,6 +48,9 @@ from stickslip_training.engine.fit import (
     torch_threads,
 )
 from stickslip_training.engine.ranks import Rank
+
+SILHOUETTES = 4
+"""Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and costs more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +157,7 @@ class FrictionLearner(Learner):
         self.rank = Rank()
         self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
-        self.validation_runs = len(validation)
+        self.judged = validation
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
         self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
         widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
@@ -204,7 +208,7 @@ class FrictionLearner(Learner):
 
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
         assert isinstance(net, PosteriorNet)
-        crops, direction, material, mu, _ = self.batch(step)
+        crops, direction, material, mu, cover = self.batch(step)
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
         target = _blurred(self.centers, mu, deviation)
@@ -213,7 +217,10 @@ class FrictionLearner(Learner):
         log_material, log_mu = net.read(seen)
         rows = torch.arange(len(mu), device=device)
         given = log_mu[rows, material.to(device)]
-        return -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
+        loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
+        some = slice(None, None, SILHOUETTES)
+        shares = pooled(cover[some]).to(device)
+        return loss + functional.binary_cross_entropy_with_logits(net.silhouettes(crops[some].to(device)), shares)
 
     def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the crops, directions of view, materials, mu and coverage of this process's share of a step."""
@@ -269,25 +276,18 @@ class FrictionLearner(Learner):
         """Return the model of a trained network, calibrated on the clips for validation."""
         net = fitted.net.cpu()
         assert isinstance(net, PosteriorNet)
-        settings, clips, train = self.settings, self.validation, self.train
-        seen = features(net, clips)
-        of_material, _ = likeliest_temperatures(*log_histograms(net, seen), clips.material, clips.mu, MU_BINS)
+        settings, train, clips = self.settings, self.train, self.validation
+        drawn = render_clips(self.judged, 6, settings.seed + 2, wanted=settings.instants, drawn_world=settings.worlds)
         # Exposures and registrations differ as those of new clips may.
         generator = torch.Generator().manual_seed(seed_of_step(settings.seed, VALIDATION, 1))
-        log_p = log_histograms(net, features(net, replace(clips, crops=jittered(clips.crops, generator))))
-        of_mu = covering_temperature(*log_p, clips.mu, MU_BINS, of_material)
-        known = render_clips(
-            train,
-            6,
-            settings.seed + 1,
-            spread=settings.turn,
-            wanted=settings.instants,
-            drawn_world=settings.worlds,
-        )
+        good = Clips.joined([replace(clips, crops=jittered(clips.crops, generator)), drawn])
+        log_p = log_histograms(net, features(net, good))
+        of_material, _ = likeliest_temperatures(*log_p, good.material, good.mu, MU_BINS)
+        of_mu = covering_temperature(*log_p, good.mu, MU_BINS, of_material)
         card = {
             "settings": asdict(settings),
             "training_runs": len(train),
-            "validation_runs": self.validation_runs,
+            "validation_runs": len(self.judged),
             "training_clips": 0 if self.clips is None else len(self.clips.train),
             "steps": fitted.steps,
             "best_step": fitted.best_step,
@@ -301,7 +301,7 @@ class FrictionLearner(Learner):
             instants=self.instants,
             bins=MU_BINS,
             temperature=(of_material, of_mu),
-            training_features=TrainingFeatures.of(features(net, known), known.material, seen, len(train.materials)),
+            familiarity=Familiarity.of(train, settings.instants, settings.seed + 1, silhouettes(net, good)),
             card=card,
         )
 

@@ -1,7 +1,7 @@
 """A trained network with its calibration, and its file."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import torch
 from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Floats, SingleFloats
-from stickslip_training.cloth.calibration import TrainingFeatures
 from stickslip_training.cloth.clips import CHUNK, Clips
+from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.nets import PosteriorNet
 from stickslip_training.cloth.posterior import Bins, Posterior
 
@@ -31,15 +31,18 @@ class FrictionModel:
     bins: Bins
     temperature: tuple[float, float]
     """Of the histograms of material and of mu: see `calibration`."""
-    training_features: TrainingFeatures
+    familiarity: Familiarity
     card: dict[str, Any]
     """Training runs, settings, measured errors and limits."""
 
-    def estimate(self, clips: Clips) -> tuple[Posterior, Floats]:
-        """Return the posterior and the OOD score of every clip."""
+    def estimate(self, clips: Clips) -> Posterior:
+        """Return the posterior of every clip, whether it is familiar or not."""
         seen = features(self.net, clips)
-        posterior = Posterior.of(*log_histograms(self.net, seen), self.materials, self.bins, self.temperature)
-        return posterior, self.training_features.ood_score(seen)
+        return Posterior.of(*log_histograms(self.net, seen), self.materials, self.bins, self.temperature)
+
+    def judge(self, clips: Clips) -> tuple[Floats, list[str | None]]:
+        """Return the familiarity of every clip, (clips,), and why it has no answer, or None: see `familiarity`."""
+        return self.familiarity.judge(silhouettes(self.net, clips))
 
 
 def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
@@ -56,6 +59,16 @@ def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
     return np.asarray(torch.cat(parts).cpu().numpy())
 
 
+def silhouettes(net: PosteriorNet, clips: Clips) -> SingleFloats:
+    """Return the silhouettes that a network sees in clips, (clips, F, 18, 22), 0 to 1."""
+    net.eval()
+    with torch.inference_mode():
+        device = next(net.parameters()).device
+        chunks = [clips.crops[first : first + CHUNK] for first in range(0, len(clips), CHUNK)]
+        parts = [net.silhouettes(crops.to(device)).sigmoid().cpu() for crops in chunks]
+    return np.asarray(torch.cat(parts).numpy())
+
+
 def log_histograms(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, SingleFloats]:
     """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K), of features (clips, n)."""
     with torch.inference_mode():
@@ -66,15 +79,13 @@ def log_histograms(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats,
 def save_friction(path: Path, model: FrictionModel) -> None:
     """Write the model as safetensors, with its card; `load_friction` reads it."""
     tensors = {f"net.{name}": tensor.contiguous() for name, tensor in model.net.state_dict().items()}
-    tensors["features.means"] = torch.from_numpy(model.training_features.means)
-    tensors["features.precision"] = torch.from_numpy(model.training_features.precision)
+    tensors |= {f"familiarity.{name}": torch.from_numpy(part) for name, part in vars(model.familiarity).items()}
     about = {
         "sizes": model.net.sizes,
         "materials": model.materials,
         "instants": model.instants,
         "bins": asdict(model.bins),
         "temperature": model.temperature,
-        "limit": model.training_features.limit,
         "card": model.card,
     }
     write_durably(path, safetensors.torch.save(tensors, {"friction": json.dumps(about)}))
@@ -88,7 +99,7 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         net = PosteriorNet(**about["sizes"])
         net.load_state_dict({name: tensors[f"net.{name}"] for name in net.state_dict()})
-        means, precision = (tensors[f"features.{name}"].numpy() for name in ("means", "precision"))
+        known = {field.name: tensors[f"familiarity.{field.name}"].numpy() for field in fields(Familiarity)}
         of_material, of_mu = about["temperature"]
         return FrictionModel(
             net=net.eval(),
@@ -96,7 +107,7 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             instants=tuple(about["instants"]),
             bins=Bins(**about["bins"]),
             temperature=(of_material, of_mu),
-            training_features=TrainingFeatures(means, precision, about["limit"]),
+            familiarity=Familiarity(**known),
             card=about["card"],
         )
     except (safetensors.SafetensorError, KeyError, RuntimeError, TypeError, json.JSONDecodeError) as error:

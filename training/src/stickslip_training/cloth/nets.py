@@ -41,6 +41,7 @@ class PosteriorNet(nn.Module):
         )
         self.material = nn.Linear(2 * width, materials)
         self.mu = nn.Linear(2 * width, materials * bins)
+        self.silhouette = _silhouette_net()
 
     def features(self, crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
         """Return what material and mu are read off, (B, 2 width)."""
@@ -55,6 +56,32 @@ class PosteriorNet(nn.Module):
         mu = self.mu(features).reshape(len(features), self.sizes["materials"], self.sizes["bins"])
         return torch.log_softmax(self.material(features), dim=1), torch.log_softmax(mu, dim=2)
 
+    def silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
+        """Return logits of the share that cloth covers of each 4 x 4 pixels of crops (B, F, 72, 88): (B, F, 18, 22).
+
+        Mean and deviation over the frames of a clip are seen, too: a floor stays, and cloth moves.
+        """
+        deviation, mean = torch.std_mean(crops, dim=(1, 2, 3), keepdim=True)
+        x = (crops - mean) / (deviation + 1e-3)
+        still = [part.expand_as(x) for part in reversed(torch.std_mean(x, dim=1, keepdim=True))]
+        logits = self.silhouette(torch.stack([x, *still], dim=2).flatten(0, 1))
+        return torch.as_tensor(logits.reshape(*crops.shape[:2], *logits.shape[2:]))
+
     def forward(self, crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return log p(m) and log p(mu | m)."""
         return self.read(self.features(crops, direction))
+
+
+def _silhouette_net() -> nn.Sequential:
+    """Return the layers that find cloth; dilations let every place see most of the crop."""
+    layers: list[nn.Module] = [nn.PixelUnshuffle(2)]
+    for before, after, stride, dilation in (
+        (12, 32, 1, 1),
+        (32, 48, 2, 1),
+        (48, 48, 1, 1),
+        (48, 48, 1, 2),
+        (48, 48, 1, 4),
+        (48, 48, 1, 1),
+    ):
+        layers += [nn.Conv2d(before, after, 3, stride, dilation, dilation), nn.GroupNorm(8, after), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Conv2d(48, 1, 1))
