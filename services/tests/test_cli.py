@@ -47,6 +47,10 @@ def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningSer
     counts = json.loads(cli("validate", spec, "--json").stdout)
     assert (counts["sample_count"], counts["cached_count"]) == (4, 0)
     assert "4" in cli("validate", spec).stdout
+    axes = {"material": ["gray-interlock"], "mu": [0.5], "texture": ["dots"], "viewpoint": ["left"]}
+    refused = cli("validate", write(tmp_path / "cloth.yaml", {"kind": "cloth_drag", "axes": axes}))
+    assert refused.exit_code == 1
+    assert "would be refused now: no worker" in refused.stderr
     done = threading.Thread(target=wait_until, args=(lambda: worker.work() > 0,))
     done.start()
     submitted = cli("submit", spec, "--watch")

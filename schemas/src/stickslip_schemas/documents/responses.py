@@ -38,7 +38,7 @@ class StageProgress(Document):
 
 
 class Eta(Document):
-    """Estimated remaining time, from measured durations; `low` to `high` covers about 80 % of jobs [s]."""
+    """Estimated time, from measured durations; `low` to `high` covers about 80 % of jobs [s]."""
 
     seconds: float
     low: float
@@ -107,6 +107,10 @@ class Validation(Document):
     bytes_estimate: int = Field(description="size of the arrays before compression [bytes]")
     stored_bytes_estimate: int | None = Field(
         description="file size, compressed as the newest dataset of the kind [bytes]; null: there is none"
+    )
+    core_seconds: Eta | None = Field(
+        description="time of one core for all tasks, without cached results, from tasks of this kind that the service "
+        "has measured, with its 80 % interval [s]; null: it has measured none"
     )
     certificate: Sha256 | None = Field(description="certificate that covers the dataset; null: none")
     refusal: str | None = Field(

@@ -6,34 +6,26 @@ may write the data directory may make keys.
 
 import json
 import time
-from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+from stickslip_services.access import audit_log as audit
+from stickslip_services.access import keys as stored_keys
+from stickslip_services.access import projects as stored_projects
+from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.scopes import Scope
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, require_server, say, table
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, console, say, table
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
-
-if TYPE_CHECKING:
-    from sqlalchemy import Connection
+from stickslip_services.settings import Settings
 
 keys = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=True)
 projects = typer.Typer(help="List projects, and set their quotas.", no_args_is_help=True)
 webhooks = typer.Typer(help="Send job events to other programs.", no_args_is_help=True)
 
 WebhookArgument = Annotated[str, typer.Argument(metavar="WEBHOOK", help="id, as `stickslip webhooks list` shows it")]
-
-
-def _visited(data: Path, database: str | None) -> AbstractContextManager["Connection"]:
-    """Open a transaction on the database of a coordinator. Commands import its packages only when they run."""
-    require_server()
-    from stickslip_services.access.audit_log import visited
-
-    return visited(data, database)
 
 
 # --- keys -----------------------------------------------------------------------------------------------------
@@ -51,10 +43,8 @@ def create_key(
     database: DatabaseOption = None,
 ) -> None:
     """Make a key and print it. It is shown only once, because the database keeps only its digest."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.keys import create_key
-
-        key, secret = create_key(connection, name, scope, time.time(), project=project)
+    with audit.visited(data, database) as connection:
+        key, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     typer.echo(secret)
     say(f"{key.id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
     say("Authorization: Bearer KEY. Browsers send it as the password of any user name")
@@ -64,10 +54,8 @@ def create_key(
 @shows_errors
 def list_keys(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List all keys, newest first, including revoked ones."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.keys import list_keys
-
-        found = list_keys(connection)
+    with audit.visited(data, database) as connection:
+        found = stored_keys.list_keys(connection)
     shown = table("key", "name", "scopes", "project", "made", "revoked", no_wrap=("key",))
     for key in found:
         shown.add_row(
@@ -89,10 +77,8 @@ def revoke_key(
     database: DatabaseOption = None,
 ) -> None:
     """Revoke a key. A running coordinator refuses it within a second."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.keys import revoke_key
-
-        revoke_key(connection, key_id, time.time())
+    with audit.visited(data, database) as connection:
+        stored_keys.revoke_key(connection, key_id, time.time())
     typer.echo(f"{key_id} is revoked")
 
 
@@ -103,10 +89,8 @@ def revoke_key(
 @shows_errors
 def list_projects(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List projects with their quotas, and the jobs and samples in progress that count against them."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.projects import list_projects
-
-        found = list_projects(connection)
+    with audit.visited(data, database) as connection:
+        found = stored_projects.list_projects(connection)
     shown = table("project", "jobs", "at most", "samples", "at most", no_wrap=("project",))
     for project in found:
         limits = _limit(project.max_jobs), _limit(project.max_samples)
@@ -124,11 +108,9 @@ def set_quota(
     database: DatabaseOption = None,
 ) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.projects import set_quota
-
+    with audit.visited(data, database) as connection:
         try:
-            set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
+            stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
         except ValueError as error:
             raise ClientError(str(error)) from None
     whose = f"the project {name}" if name else "requests without a project"
@@ -151,13 +133,9 @@ def create_webhook(
     database: DatabaseOption = None,
 ) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.keys import sealer
-        from stickslip_services.access.webhooks import create_webhook
-        from stickslip_services.settings import Settings
-
-        sealing = sealer(Settings.chosen(data=data))
-        webhook, secret = create_webhook(connection, sealing, url, time.time(), project=project)
+    with audit.visited(data, database) as connection:
+        sealing = stored_keys.sealer(Settings.chosen(data=data))
+        webhook, secret = stored_webhooks.create_webhook(connection, sealing, url, time.time(), project=project)
     typer.echo(secret)
     say(f"{webhook.id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
 
@@ -166,10 +144,8 @@ def create_webhook(
 @shows_errors
 def list_webhooks(data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """List webhooks, newest first, with their faults."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.webhooks import list_webhooks
-
-        found = list_webhooks(connection, time.time())
+    with audit.visited(data, database) as connection:
+        found = stored_webhooks.list_webhooks(connection, time.time())
     shown = table("webhook", "project", "url", "made", "failed tries", "fault", no_wrap=("webhook",))
     for webhook in found:
         fault = f"given up: {webhook.fault}" if webhook.is_given_up else webhook.fault
@@ -182,10 +158,8 @@ def list_webhooks(data: DataOption = DEFAULT_DATA, database: DatabaseOption = No
 @shows_errors
 def retry_webhook(webhook: WebhookArgument, data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """Send again at once, also after the webhook was given up. No event since then is left out."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.webhooks import retry_webhook
-
-        retry_webhook(connection, webhook, time.time())
+    with audit.visited(data, database) as connection:
+        stored_webhooks.retry_webhook(connection, webhook, time.time())
     typer.echo(f"{webhook} is tried again")
 
 
@@ -193,10 +167,8 @@ def retry_webhook(webhook: WebhookArgument, data: DataOption = DEFAULT_DATA, dat
 @shows_errors
 def delete_webhook(webhook: WebhookArgument, data: DataOption = DEFAULT_DATA, database: DatabaseOption = None) -> None:
     """Delete a webhook."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.webhooks import delete_webhook
-
-        delete_webhook(connection, webhook, time.time())
+    with audit.visited(data, database) as connection:
+        stored_webhooks.delete_webhook(connection, webhook, time.time())
     typer.echo(f"{webhook} is deleted")
 
 
@@ -214,10 +186,8 @@ def audit_log(
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON document a line, for programs")] = False,
 ) -> None:
     """Show who changed what and when, newest first."""
-    with _visited(data, database) as connection:
-        from stickslip_services.access.audit_log import read_audit_log
-
-        entries = read_audit_log(connection, subject=subject, limit=limit)
+    with audit.visited(data, database) as connection:
+        entries = audit.read_audit_log(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:
             document = {"at": entry.at.isoformat(), "actor": entry.actor, "action": entry.action}

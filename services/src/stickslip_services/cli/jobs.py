@@ -41,7 +41,7 @@ PriorityOption = Annotated[int, typer.Option(min=-100, max=100, help=PRIORITY)]
 
 @shows_errors
 def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    """Check a spec and count its samples, without submitting it. Works offline."""
+    """Check a spec, count its samples and tell what they cost; exit with 1 if it would be refused. Works offline."""
     document, files = read_job(file)
     spec = check_spec(document, file)
     try:
@@ -52,17 +52,21 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
         if as_json:
             raise
         return _validate_offline(spec, url)
+    refused = answer.refusal is not None
     if as_json:
-        return print_json(answer)
+        print_json(answer)
+        raise typer.Exit(int(refused))
     cached = "unknown" if answer.cached_count is None else f"{answer.cached_count}"
     shown = _counts(answer.spec)
     shown.add_row("tasks cached", f"{cached} of {answer.task_count}")
     if answer.stored_bytes_estimate is not None:
         shown.add_row("size of the files, about", size(answer.stored_bytes_estimate))
+    shown.add_row("time of one core, without what is cached", wording.eta(answer.core_seconds))
     shown.add_row("certificate", answer.certificate or "none")
     console().print(shown)
-    if answer.refusal is not None:
-        return say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
+    if refused:
+        say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
+        raise typer.Exit(1)
     return say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
 
 

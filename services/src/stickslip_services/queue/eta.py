@@ -165,6 +165,14 @@ def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings
     return StageTimings(1, mean, mean**2)
 
 
+def timings_of(costs: Mapping[Group, Cost], stage: Stage, kind: str, group: str) -> StageTimings | None:
+    """Return the shares of a group, or of all groups of the stage and kind where too little is known of it."""
+    cost = costs.get((stage, kind, group))
+    if cost is not None and (cost.is_known or stage in (Stage.pack, Stage.publish)):
+        return cost.share
+    return pooled(costs, stage, kind)
+
+
 _ALL_COSTS = Prepared(select(cost_groups))
 
 

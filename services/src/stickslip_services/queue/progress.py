@@ -8,7 +8,7 @@ from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_schemas.documents.responses import Progress, StageProgress
 
 from stickslip_services.database.tables import job_counts, job_groups, job_stages, job_tasks, tasks
-from stickslip_services.queue.eta import Cost, Group, StageWork, estimate, pooled
+from stickslip_services.queue.eta import Cost, Group, StageWork, estimate, timings_of
 from stickslip_services.queue.ids import task_key
 
 Frames = Mapping[str, tuple[int, int]]
@@ -97,9 +97,7 @@ def _progress(row: Row[tuple[object, ...]], known: _Known, slots: int) -> Progre
         )
         work[stage] = []
         for group, left in known.groups.get((row.seq, stage), ()):
-            cost = known.costs.get((stage, row.kind, group))
-            enough = cost is not None and (cost.is_known or stage in (Stage.pack, Stage.publish))
-            timings = cost.share if cost is not None and enough else pooled(known.costs, stage, row.kind)
+            timings = timings_of(known.costs, stage, row.kind, group)
             told_of = known.frames.get((row.seq, stage, group))
             work[stage].append(StageWork(left - (0.0 if told_of is None else told_of.share), timings))
     eta = None

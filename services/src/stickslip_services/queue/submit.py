@@ -1,15 +1,17 @@
 """Submission of jobs: checks, idempotency, planning at once or later, and what a job of a spec would be."""
 
+from collections import Counter
 from dataclasses import dataclass
+from itertools import islice
 
 from sqlalchemy import Connection, func, insert, select
 from stickslip_schemas import tracing
 from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState, Reason, TaskState
-from stickslip_schemas.documents.responses import JobDetail, Validation
+from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import Eta, JobDetail, Validation
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.grid import count
+from stickslip_schemas.plan.grid import Counts, count, grid
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.access.asker import this_asker
@@ -21,6 +23,7 @@ from stickslip_services.database.tables import dataset_versions, idempotency_key
 from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import show_job
 from stickslip_services.queue.ledger import Ledger
@@ -156,6 +159,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
         except (KindNotAvailableError, PresetNotCertifiedError) as error:
             refusal = str(error)
         compression = _compression(connection, spec.kind)
+        core_seconds = _core_seconds(connection, spec, counts)
     return Validation(
         spec=spec,
         spec_digest=spec.content_digest,
@@ -167,9 +171,25 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
         cached_count=None if terms is None else _cached(database, spec, terms),
         bytes_estimate=raw,
         stored_bytes_estimate=None if compression is None else round(raw * compression),
+        core_seconds=core_seconds,
         certificate=None if terms is None else terms.certificate,
         refusal=refusal,
     )
+
+
+def _core_seconds(connection: Connection, spec: JobSpec, counts: Counts) -> Eta | None:
+    """Return what all tasks cost together, from what was measured of such tasks; None where nothing was."""
+    costs, points = read_costs(connection), list(islice(grid(spec), LOOKED_UP))
+    work = {}
+    for stage, number in ((Stage.simulate, counts.simulations), (Stage.render, counts.renders)):
+        groups = Counter(spec.cost_group(stage, point) for point in points)
+        work[stage] = [
+            StageWork(number * share / len(points), timings_of(costs, stage, spec.kind, group))
+            for group, share in groups.items()
+        ]
+    shards = counts.tasks - counts.simulations - counts.renders
+    work[Stage.pack] = [StageWork(shards, timings_of(costs, Stage.pack, spec.kind, ""))]
+    return estimate(work, slots=1)
 
 
 def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
