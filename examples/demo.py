@@ -51,7 +51,7 @@ def main() -> None:
     run("stickslip-train", "curvature", OUT / "training-dataset", "--out", OUT / "training", "--steps", "800")
     console.rule(f"done in {time.monotonic() - started:.0f} s")
     console.print(f"contact sheets {OUT / 'contact-sheet.png'}, {OUT / 'cloth-sheet.png'}")
-    console.print(f"training       {OUT / 'training' / 'curvature.png'}")
+    console.print(f"training       {OUT / 'training' / 'report.json'}")
     console.print(f"datasets       {OUT / 'dataset'}, {OUT / 'cloth-dataset'}, {OUT / 'training-dataset'}")
 
 

@@ -226,7 +226,9 @@ def main() -> None:
     flagged["all"] = round(float(np.mean(list(flagged.values()))), 3)
     print("without an answer", flagged["all"], f"{time.process_time() - started:.0f} CPU s")
     if args.record is not None:
-        record = {"card": model.card.get("made_from"), "rows": rows, "flagged": flagged}
+        listed = [{"clips of": name, **row} for name, row in rows.items()]
+        listed += [{"sort without an answer": name, "flagged": share} for name, share in flagged.items()]
+        record = {"rows": listed}
         write_durably(args.record, (json.dumps(record, indent=1) + "\n").encode())
 
 
