@@ -264,7 +264,7 @@ def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> No
     assert (after["sample_count"], after["cached_count"]) == (6, 4 + 4 + 2)
     assert after["bytes_estimate"] > 6 * 4 * 224 * 224 * 3
     assert before["core_seconds"] is None
-    assert after["core_seconds"]["seconds"] == pytest.approx(6 + 6 + 4)  # a second each: PretendWorker says so
+    assert after["core_seconds"]["seconds"] == pytest.approx(6 + 6 + 4)  # PretendWorker reports a second each
     assert after["core_seconds"]["low"] < 16 < after["core_seconds"]["high"]
     assert len(client.get("/v1/jobs").json()["items"]) == 1
 

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import click
 import pytest
 import typer
 from stickslip_services.cli.main import _COMMANDS, _Commands, _loaded, app
@@ -28,7 +27,7 @@ except SystemExit:
 def test_the_list_says_what_the_command_says(name: str) -> None:
     group = typer.main.get_group(app)
     assert isinstance(group, _Commands)
-    listed = group.get_command(click.Context(group), name)
+    listed = group.get_command(typer.Context(group), name)
     assert listed is not None
     assert listed.help
     assert listed.help.split("\n\n")[0].split() == (_loaded(name).help or "").split("\n\n")[0].split()
