@@ -2,6 +2,8 @@
 
 import io
 import re
+import struct
+import zlib
 from typing import Any
 
 import numpy as np
@@ -93,6 +95,10 @@ def _errors(document: dict[str, Any]) -> dict[str, str]:
     return {error.pointer: error.rule for error in field_errors(caught.value, document, AnyJobSpec)}
 
 
+def lab(fx: float, cx: float) -> dict[str, Any]:
+    return {"viewpoints": {"lab": LAB | {"camera_matrix": [[fx, 0.0, cx], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]]}}}
+
+
 @pytest.mark.parametrize(
     ("change", "pointer", "rule"),
     [
@@ -113,6 +119,9 @@ def _errors(document: dict[str, Any]) -> dict[str, str]:
             "/viewpoints/lab",
             "no skew",
         ),
+        (lab(1e-6, 320.0), "/viewpoints/lab", "fx from 85.74 to 1.222e.04 px.* it is 1e-06 px"),
+        (lab(1e12, 320.0), "/viewpoints/lab", "it is 1e.12 px"),
+        (lab(700.0, 961.0), "/viewpoints/lab", "cx from -320 to 960 px"),
         ({"viewpoints": {"lab": LAB | {"tvec": [0.0, 9.0, 1.0]}}}, "/viewpoints/lab", r"it is at \(0, -1, 9\) m"),
         ({"viewpoints": {"lab": LAB | {"tvec": [0.0, -0.2, 1.0]}}}, "/viewpoints/lab", "above the floor"),
         ({"viewpoints": {"lab": LAB | {"image_size": [640.5, 480]}}}, "/viewpoints/lab/image_size/0", "integer"),
@@ -182,6 +191,14 @@ def test_pictures_are_read_as_they_are() -> None:
     assert np.abs(turned.astype(int) - RANDOM).mean() < 5
 
 
+def _deep() -> bytes:
+    """Return a PNG in colour with 16 bits a channel."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", 80, 80, 16, 2, 0, 0, 0))]
+    parts += [(b"IDAT", zlib.compress(bytes(80 * (1 + 80 * 6)))), (b"IEND", b"")]
+    packed = [struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
 def _transparent() -> Image.Image:
     picture = Image.fromarray(RANDOM).convert("RGBA")
     picture.putpixel((3, 3), (1, 2, 3, 254))
@@ -199,6 +216,7 @@ def _transparent() -> Image.Image:
         (_file(Image.fromarray(RANDOM[:60, :60])), "it has 60 x 60"),
         (_file(Image.new("1", (5000, 5000))), "it has 5000 x 5000"),
         (_file(Image.fromarray(np.zeros((80, 80), dtype=np.uint16))), "8 bits a channel, and its mode is I;16"),
+        (_deep(), "at most 8 bits a channel, and it has 16"),
         (_file(Image.fromarray(RANDOM).convert("CMYK"), "JPEG"), "its mode is CMYK"),
         (_file(_transparent()), "opaque"),
         (bytes(MAX_BYTES + 1), "at most"),

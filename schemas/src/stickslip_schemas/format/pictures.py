@@ -54,6 +54,8 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
                 f"a texture must be one picture in grey or colour with 8 bits a channel, and its mode is {picture.mode}"
                 + (", animated" if getattr(picture, "is_animated", False) else "")
             )
+        if picture.format == "PNG" and data[24] > 8:  # Pillow would cut the lower bits of RGB off without a word
+            raise UnfitPictureError(f"a texture must have at most 8 bits a channel, and it has {data[24]}")
         upright = ImageOps.exif_transpose(picture)
         if upright.mode in ("RGBA", "LA") or "transparency" in upright.info:
             upright = upright.convert("RGBA")

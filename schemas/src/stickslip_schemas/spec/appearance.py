@@ -23,6 +23,8 @@ FARTHEST = 4.0
 """Largest distance of a camera from the middle of the scene along each axis [m]: the floor ends at 8 m."""
 LOWEST = 0.02
 """Least height of a camera above the floor [m]."""
+FIELD_OF_VIEW = (3.0, 150.0)
+"""Of a calibrated image along each side [degree]."""
 
 _TOLERANCE = 1e-9
 
@@ -137,12 +139,20 @@ class Calibration(Document):
                 "distortion must be 0: the renderer has no lens distortion. Undistort your pictures (cv2.undistort), "
                 f"and give the camera matrix of what you get; it is {list(self.distortion)}"
             )
-        (fx, skew, _), (zero, fy, _), last = self.camera_matrix
+        (fx, skew, cx), (zero, fy, cy), last = self.camera_matrix
         if skew != 0 or zero != 0 or last != (0.0, 0.0, 1.0) or fx <= 0 or fy <= 0:
             raise ValueError(
                 "camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0: the renderer has "
                 f"no skew; it is {[list(row) for row in self.camera_matrix]}"
             )
+        for axis, f, c, side in zip("xy", (fx, fy), (cx, cy), self.image_size, strict=True):
+            least, most = (0.5 * side / np.tan(np.radians(0.5 * view)) for view in reversed(FIELD_OF_VIEW))
+            for name, value, low, high in (("f", f, least, most), ("c", c, -0.5 * side, 1.5 * side)):
+                if not low <= value <= high:
+                    raise ValueError(
+                        f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, for a field of view of "
+                        f"{FIELD_OF_VIEW} degrees and a centre within half an image of its edges; it is {value:g} px"
+                    )
         x, y, z = self.camera("own").position.tolist()
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(

@@ -208,3 +208,67 @@ def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
     codes = np.frombuffer(decode_chunk(store.read(chunk.digest, offset=0, length=chunk.length)), dtype=np.uint8)
     names = scene_segments(scene["sheets"], scene["bodies"])
     assert {names[code] for code in np.unique(codes)} >= {"towel", "rug", "floor", "holders"}
+
+
+def corners_about(middle: Any, half: float) -> Any:
+    """Return the corners (8, 3) of a cube."""
+    return np.asarray(middle) + half * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+def rays(camera: Any) -> Any:
+    """Return the rays of depth 1 of all pixels, in camera axes, shape (height, width, 3)."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+
+
+def degrees_between(one: Any, other: Any) -> Any:
+    return np.degrees(np.arccos(np.clip((one.astype(float) * other).sum(axis=-1), -1.0, 1.0)))
+
+
+def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None:
+    scene, record = made()
+    turn = np.radians(6.0)
+    record["body_pose"][1, 0, :, :3] = [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    _, geometry = set_up(scene, record)
+    now, then = (geometry.points(record["towel.positions"][0], k) for k in (0, 1))
+    middle, radius = np.array([0.3, 0.0, 0.04]), 0.04 - SUNK
+    camera = framed("high", corners_about(middle, 0.06), size=224)
+    truth = ground_truth(geometry, now, then, camera)
+    rows, columns = np.nonzero(truth.segmentation == scene_segments(scene["sheets"], scene["bodies"]).index("ball"))
+    rotation, ray = np.asarray(camera.rotation), rays(camera)[rows, columns]
+    center = rotation @ middle + camera.translation
+    along, square = ray @ center, (ray**2).sum(axis=1)
+    met = along**2 - square * (center @ center - radius**2)  # a ray meets the ball where this is positive
+    kept = met > 0.1 * square * radius**2  # away from the silhouette
+    assert kept.sum() > 4000
+    normal = ((along - np.sqrt(np.maximum(met, 0.0))) / square)[:, None] * ray - center
+    angle = degrees_between(truth.normals[rows, columns], normal / radius)[kept]
+    moved, _ = camera.project(normal @ rotation @ record["body_pose"][1, 0, :, :3].T + middle)
+    error = np.linalg.norm(truth.flow[rows, columns] - moved + np.column_stack([columns, rows]), axis=1)[kept]
+    print(kept.sum(), np.percentile(angle, [50, 99]), np.percentile(error, [50, 99]))
+    assert np.median(angle) < 1.0
+    assert np.percentile(angle, 99) < 4.0
+    assert np.percentile(error, 99) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "middle", "half"),
+    [("block", (-0.3, 0, 0.03), 0.06), ("holders", (0, 0, 0.05), 0.02), ("tetrahedron", (0.03, -0.27, 0.03), 0.06)],
+)
+def test_normals_of_bodies_are_those_of_their_depth(usual: Any, name: str, middle: Any, half: float) -> None:
+    _, geometry, track = usual
+    names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
+    camera = framed("high", corners_about(middle, half), size=224)
+    points = geometry.points(track[0], 0)
+    truth = ground_truth(geometry, points, points, camera)
+    place = truth.depth[..., None].astype(float) * rays(camera)
+    normal = np.cross(np.gradient(place, axis=0), np.gradient(place, axis=1))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    near = np.lib.stride_tricks.sliding_window_view(normal, (7, 7), axis=(0, 1))
+    kept = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (truth.segmentation == names.index(name))
+    angle = degrees_between(truth.normals, normal)[kept]
+    print(name, kept.sum(), (truth.segmentation == names.index(name)).sum())
+    print(name, np.percentile(angle, [50, 99]) if len(angle) else "")
+    assert kept.sum() > 300
+    assert np.median(angle) < 1.0
+    assert np.percentile(angle, 99) < 4.0

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from stickslip_blender.cloth.looks import Look
 from stickslip_blender.cloth.shapes import Faces, box
 from stickslip_blender.cloth.surface import surface
+from stickslip_blender.cycles.objects import SHARP
 from stickslip_blender.raster import Textures, decoded, fans
 
 BACKGROUND, GROUND, CLOTH, PROP = range(4)
@@ -52,8 +53,6 @@ class Prop:
     colors: Array
     """Linear, of each face (n, 3) or of all (1, 3); a sheet's is that of its picture."""
     roughness: float
-    is_smooth: bool = False
-    """Whether its faces are shaded as one smooth skin, but for edges sharper than `cycles.objects.SHARP`."""
     segment: int = PROP
     """Its code in the segmentation."""
     sheet: Print | None = None
@@ -116,8 +115,10 @@ class Geometry:
     """Code of each triangle in the segmentation, shape (T,)."""
     has_uv: npt.NDArray[np.bool_]
     """Whether each triangle is cloth, shape (T,)."""
-    is_flat: npt.NDArray[np.bool_]
-    """Whether each triangle is shaded flat, shape (T,)."""
+    shaded: Indices
+    """The vertices, shape (S,): those of props once for each smooth skin that meets there."""
+    shaded_triangles: Indices
+    """The triangles by their places in `shaded`, shape (T, 3): only triangles of one skin share a corner."""
     tints: npt.NDArray[np.float32]
     """Of each triangle of the props, and a row of zeros at the end, shape (T' + 1, 3)."""
     printed: tuple[Printed, ...]
@@ -139,7 +140,11 @@ class Geometry:
         )
         self.segments = np.repeat([surroundings.segment, *(p.segment for p in props)], counts).astype(np.uint8)
         self.has_uv = np.repeat([True, *(p.sheet is not None for p in props)], counts)
-        self.is_flat = np.repeat([False, *(not p.is_smooth for p in props)], counts)
+        skins = [(np.arange(self.cloth_vertices), parts[0])]
+        skins += [skin(p.vertices, fans(p.faces)) for p in props]
+        ends = np.cumsum([0, *(len(vertices) for vertices, _ in skins)])
+        self.shaded = np.concatenate([v + first for (v, _), first in zip(skins, [0, *sizes[:-1]], strict=True)])
+        self.shaded_triangles = np.concatenate([t + first for (_, t), first in zip(skins, ends[:-1], strict=True)])
         self.tints = np.concatenate([*(p.tints for p in props), np.zeros((1, 3), dtype=np.float32)])
         ends = np.cumsum([0, *counts[1:]])
         self.printed = tuple(
@@ -166,6 +171,28 @@ class Geometry:
                 f"positions must be finite, of shape (frames, {self.vertices}, 3); got shape {track.shape}"
             )
         return track
+
+
+def skin(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
+    """Split the vertices (V, 3) of triangles (T, 3) where edges are sharper than `SHARP`, as Blender shades them.
+
+    Returns the vertices (S,), once for each smooth skin that meets there, and the triangles (T, 3) of those.
+    """
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    corners = triangles.ravel()
+    label, order = np.arange(corners.size), np.argsort(corners, kind="stable")
+    for _ in range(most := int(np.bincount(corners).max())):  # a chain of corners has no more links
+        for shift in range(1, most):
+            one, other = order[:-shift], order[shift:]
+            alike = (corners[one] == corners[other]) & (label[one] != label[other])
+            one, other = one[alike], other[alike]
+            alike = (normals[one // 3] * normals[other // 3]).sum(axis=1) > np.cos(SHARP)
+            pair = np.concatenate([one[alike], other[alike]])
+            np.minimum.at(label, pair, np.tile(np.minimum(label[one], label[other])[alike], 2))
+    _, first, place = np.unique(label, return_index=True, return_inverse=True)
+    return corners[first], place.reshape(-1, 3).astype(np.int32)
 
 
 def mirrored(points: Array, floor: float) -> Array:

@@ -5,7 +5,7 @@ All of it is what the ray through the middle of a pixel meets first: the cloth, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -41,8 +41,9 @@ def ground_truth(
     """Return the ground truth of an instant: all vertices (V, 3) [m] then, and at the next frame."""
     here = projected(camera, points)
     seen = see(here, geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
-    smooth = _raster.normals(points, geometry.triangles)
-    values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following, smooth], axis=1))
+    values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
+    skins = replace(seen, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
+    smooth = skins.at_centers(_raster.normals(points[geometry.shaded], geometry.shaded_triangles))
     thing = seen.triangle >= 0
     cloth = thing & geometry.has_uv[seen.triangle]
 
@@ -51,11 +52,7 @@ def ground_truth(
     moved, _ = camera.project(values[..., 3:6])
     segmentation = np.where(np.isfinite(floor), geometry.surroundings.ground, BACKGROUND)
     segmentation[thing] = geometry.segments[seen.triangle[thing]]
-    normal = np.where(thing[..., None], values[..., 6:9], (0.0, 0.0, 1.0))
-    flat = thing & geometry.is_flat[seen.triangle]
-    a, b, c = (points[geometry.triangles[seen.triangle[flat], k]] for k in range(3))
-    normal[flat] = np.cross(b - a, c - a)
-    normal = normal @ np.asarray(camera.rotation).T
+    normal = np.where(thing[..., None], smooth, (0.0, 0.0, 1.0)) @ np.asarray(camera.rotation).T
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = normal / np.maximum(length, 1e-12)
     normal = np.where((normal * rays).sum(axis=-1, keepdims=True) > 0.0, -normal, normal)

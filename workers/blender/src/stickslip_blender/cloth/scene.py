@@ -64,11 +64,11 @@ class ClothScene:
             self._floor = add_material(add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor")
         faces, uv = geometry.surface.triangles, geometry.surface.uv
         flat = np.column_stack([uv, np.zeros(len(uv))])
-        cloth = add_mesh(self._scene, "cloth", flat, faces.tolist(), is_smooth=True)
+        cloth = add_mesh(self._scene, "cloth", flat, faces.tolist())
         self._fabric = Fabric(cloth, uv, faces.ravel())
         self._meshes = [cloth]
         for prop in geometry.surroundings.props:
-            mesh = add_mesh(self._scene, prop.name, prop.vertices, prop.faces, is_smooth=prop.is_smooth)
+            mesh = add_mesh(self._scene, prop.name, prop.vertices, prop.faces)
             if prop.sheet is None:
                 add_material(mesh, prop.name, Base_Color=(*(prop.grey,) * 3, 1.0), Roughness=prop.roughness)
             else:

@@ -12,10 +12,11 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Faces = list[tuple[int, ...]]
 
-ARC = 8
+ARC = 12
 """Faces of a quarter of a circle."""
-GORE = 4
+GORE = 6
 """Faces across one gore: gores are bright and dark by turns, so that a turn can be seen."""
+_JOINT = 1e-7  # [m]: vertices that are closer are one
 DARK = 0.15
 """Colour of a dark gore over that of a bright one."""
 
@@ -70,7 +71,8 @@ def square(normal: npt.ArrayLike, side: float) -> tuple[Array, Faces]:
 def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt.NDArray[np.int64]]:
     """Cut quadrilaterals into tiles of at most a side [m]; return also the face that each tile is of.
 
-    The rasteriser leaves out what reaches behind the camera: a large face would vanish as a whole.
+    Vertices in one place are joined, so that a skin has no seams. The rasteriser leaves out what reaches behind the
+    camera: a large face would vanish as a whole.
     """
     points = [vertices]
     pieces: Faces = []
@@ -91,4 +93,8 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
         pieces += [(corner, corner + row, corner + row + 1, corner + 1) for corner in corners]
         owners += [number] * len(corners)
         count += len(points[-1])
-    return np.concatenate(points), pieces, np.array(owners)
+    given = np.concatenate(points)
+    _, first, joint = np.unique(np.round(given / _JOINT), axis=0, return_index=True, return_inverse=True)
+    rings = [tuple(dict.fromkeys(joint.ravel()[list(piece)].tolist())) for piece in pieces]
+    kept = [number for number, ring in enumerate(rings) if len(ring) > 2]
+    return given[first], [rings[number] for number in kept], np.array(owners)[kept]

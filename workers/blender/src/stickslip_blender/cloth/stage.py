@@ -144,7 +144,6 @@ class Stage:
             list(map(tuple, skin.triangles.tolist())),
             np.zeros((1, 3)),
             look.roughness,
-            is_smooth=True,
             segment=segment,
             sheet=Print(skin.uv, grained(texture, look, skin), look),
         )
@@ -156,13 +155,13 @@ class Stage:
             vertices, faces = _sunk(self._record[f"{name}.rest"], triangles), list(map(tuple, triangles.tolist()))
             posed = self._posed("body_pose", number, vertices)
             self._placers.append(posed if moved is None else lambda instant: _sunk(moved[instant], triangles))
-            return Prop(name, vertices, faces, color, look["roughness"], is_smooth=True, segment=segment)
-        vertices, shape, is_smooth = _shape(body)
+            return Prop(name, vertices, faces, color, look["roughness"], segment=segment)
+        vertices, shape = _shape(body)
         vertices, faces, owners = tiled(vertices, shape, TILE)
         if body["type"] in ("sphere", "cylinder", "capsule"):
             color = gores(color, len(shape))[owners]
         self._placers.append(self._posed("body_pose", number, vertices))
-        return Prop(name, vertices, faces, color, look["roughness"], is_smooth=is_smooth, segment=segment)
+        return Prop(name, vertices, faces, color, look["roughness"], segment=segment)
 
     def _posed(self, array: str, number: int, vertices: Array) -> Callable[[int], Array]:
         poses = np.asarray(self._record[array][:, number], dtype=np.float64)
@@ -181,17 +180,17 @@ def _sunk(points: Array, triangles: Array) -> Array:
     return inner
 
 
-def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces, bool]:
-    """Return the vertices of a body that is no mesh, in its own axes [m], its faces, and whether it is smooth."""
+def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:
+    """Return the vertices of a body that is no mesh, in its own axes [m], and its faces."""
     kind = body["type"]
     if kind == "plane":
         vertices, faces = square(body["normal"], 2.0 * ENDLESS)
-        return vertices - SUNK * np.asarray(body["normal"]) / np.linalg.norm(body["normal"]), faces, False
+        return vertices - SUNK * np.asarray(body["normal"]) / np.linalg.norm(body["normal"]), faces
     if kind == "box":
         rounding = max(body["rounding"] or min(ROUNDING, 0.5 * min(body["size"])), 2.0 * SUNK)
-        return *rounded(0.5 * np.asarray(body["size"]) - rounding, rounding - SUNK), True
+        return rounded(0.5 * np.asarray(body["size"]) - rounding, rounding - SUNK)
     half = {"sphere": 0.0, "capsule": 0.5 * body.get("length", 0.0), "cylinder": ENDLESS}[kind]
-    return *rounded((0.0, 0.0, half), body["radius"] - SUNK), True
+    return rounded((0.0, 0.0, half), body["radius"] - SUNK)
 
 
 def _shown(camera: Camera, geometry: Geometry, scenes: list[Array]) -> int:

@@ -14,22 +14,19 @@ from stickslip_blender.cycles.blender import import_bpy
 SENSOR_WIDTH = 36.0  # [mm]; only the ratio of focal length to sensor width matters
 _CLIP = (1e-3, 1e3)  # [scene units]
 SHARP = np.radians(40.0)
-"""Angle between faces above which the edge of a smooth mesh stays an edge."""
+"""Angle between faces above which an edge is no part of a smooth skin [rad]."""
 
 Array = npt.NDArray[np.float64]
 
 
-def add_mesh(
-    scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]], *, is_smooth: bool = False
-) -> Any:
-    """Add a mesh of vertices (n, 3) and polygons, and return its data."""
+def add_mesh(scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]]) -> Any:
+    """Add a mesh of vertices (n, 3) and polygons, smooth but for edges above `SHARP`, and return its data."""
     bpy = import_bpy()
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(np.asarray(vertices).tolist(), [], [list(face) for face in faces])
     scene.collection.objects.link(bpy.data.objects.new(name, mesh))
-    if is_smooth:
-        mesh.shade_smooth()
-        mesh.set_sharp_from_angle(angle=SHARP)
+    mesh.shade_smooth()
+    mesh.set_sharp_from_angle(angle=SHARP)
     return mesh
 
 

@@ -70,7 +70,7 @@ class RodRenderer:
         self._points = points
         straight = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), points)
         faces = tube_faces(points)
-        self._mesh = add_mesh(self._scene, "rod", tube_vertices(straight, RADIUS), faces, is_smooth=True)
+        self._mesh = add_mesh(self._scene, "rod", tube_vertices(straight, RADIUS), faces)
         self._triangles = fans(faces)
         self._shader = add_material(self._mesh, "silicone", Roughness=0.3, IOR=1.41)  # vinyl polysiloxane
         add_view(self._scene)
