@@ -137,17 +137,8 @@ def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) ->
     (left, right_), (top, bottom) = (((-w - k * z).max(), (w - k * z).max()) for w in (x, y))
     t = ((left - right_) / 2.0, (top - bottom) / 2.0, max(left + right_, top + bottom) / (2.0 * k))
     middle = (size - 1) / 2.0
-    return Camera(
-        name=name,
-        width=size,
-        height=size,
-        fx=focal,
-        fy=focal,
-        cx=middle,
-        cy=middle,
-        rotation=R.tolist(),
-        translation=t,
-    )
+    at: dict[str, Any] = {"rotation": R.tolist(), "translation": t}
+    return Camera(name=name, width=size, height=size, fx=focal, fy=focal, cx=middle, cy=middle, **at)
 
 
 class _Rig(Document):

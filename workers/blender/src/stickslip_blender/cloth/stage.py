@@ -74,9 +74,7 @@ class Stage:
             picture: Returns a texture by name.
         """
         codes = {name: code for code, name in enumerate(segments)}
-        self._record = record
-        self._sheet = sheet
-        self.segment = codes[self._sheet]
+        self._record, self._sheet, self.segment = record, sheet, codes[sheet]
         self.floor: float | None = None
         self.ground = BACKGROUND
         self._placers: list[Callable[[int], Array]] = []
@@ -131,22 +129,14 @@ class Stage:
         self, name: str, sheet: Mapping[str, Any], own: Mapping[str, Any] | None, picture: Any, segment: int
     ) -> Prop:
         positions = self._record[f"{name}.positions"]
-        skin, look = (
-            surface(self._record[f"{name}.triangles"], self._record[f"{name}.rest"]),
-            look_of(sheet["material"]),
-        )
+        skin = surface(self._record[f"{name}.triangles"], self._record[f"{name}.rest"])
+        look = look_of(sheet["material"])
         skin.dress(hem=1e-3 * look.hem)
         texture = np.full((64, 64, 3), PLAIN, dtype=np.uint8) if own is None else picture(own["texture"])
         self._placers.append(lambda instant: skin(positions[instant]))
-        return Prop(
-            name,
-            skin(positions[0]),
-            list(map(tuple, skin.triangles.tolist())),
-            np.zeros((1, 3)),
-            look.roughness,
-            segment=segment,
-            sheet=Print(skin.uv, grained(texture, look, skin), look),
-        )
+        faces = list(map(tuple, skin.triangles.tolist()))
+        printed = Print(skin.uv, grained(texture, look, skin), look)
+        return Prop(name, skin(positions[0]), faces, np.zeros((1, 3)), look.roughness, segment=segment, sheet=printed)
 
     def _body(self, name: str, number: int, body: Mapping[str, Any], look: Mapping[str, Any], segment: int) -> Prop:
         color = np.asarray(look["color"], dtype=np.float64).reshape(1, 3)

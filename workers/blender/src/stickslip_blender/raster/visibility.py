@@ -175,16 +175,5 @@ class Albedo:
 
 def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
     """Mean textures over the visible part of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
-    return Albedo(
-        *_raster.albedo(
-            seen.triangle,
-            seen.points,
-            seen.triangles,
-            uv,
-            cloth,
-            textures.texels,
-            textures.count,
-            seen.window.place,
-            seen.grid,
-        )
-    )
+    packed = textures.texels, textures.count, seen.window.place, seen.grid
+    return Albedo(*_raster.albedo(seen.triangle, seen.points, seen.triangles, uv, cloth, *packed))
