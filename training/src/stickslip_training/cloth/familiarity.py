@@ -117,7 +117,7 @@ class Familiarity:
         held = holders_at(instants)
         sorts = [runs, *(replace(runs, positions=made(runs.positions, held)) for _, made in WITHOUT_ANSWER)]
         shown = [
-            render_clips(some, 6 if place == 0 else 2, seed + place, wanted=instants, drawn_world=True).cover
+            render_clips(some, 4 if place == 0 else 1, seed + place, wanted=instants, drawn_world=True).cover
             for place, some in enumerate(sorts)
         ]
         pixels = pooled(torch.cat(shown)).flatten(1).numpy()

@@ -49,7 +49,7 @@ from stickslip_training.engine.fit import (
 )
 from stickslip_training.engine.ranks import Rank
 
-SILHOUETTES = 4
+SILHOUETTES = 8
 """Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and costs more."""
 
 
