@@ -324,7 +324,7 @@ def main() -> None:
     qualities = {str(quality): sampling for quality, sampling in CLOTH_SAMPLING.items()}
     for pair in options.also:
         frame, window = map(int, pair.split("+"))
-        qualities[pair] = ClothSampling(frame, window, (0.0, 0.0, 0.0))
+        qualities[pair] = ClothSampling(frame, window, 0.0, window, (0.0, 0.0, 0.0))
     chosen = list(shots(bench.track, options.frames, ("matt",)))
     bench.composed(chosen[0], CLOTH_SAMPLING[Quality.draft])  # shaders are compiled once
     if options.look or options.ground_truth:

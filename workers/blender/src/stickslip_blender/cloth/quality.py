@@ -7,7 +7,8 @@ are independent, so that in
     e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
 nothing of the noise of the references is left, however few samples they have. The mean of e over a region, pooled over
-instants, is the mean squared error of its PSNR. The deviation of that mean is estimated from blocks of pixels.
+instants, is the mean squared error of its PSNR. The deviation of that mean is estimated from blocks of pixels, and from
+how much instants differ.
 
 One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed, so a
 clip gets the same numbers alone or with others; a picture of a user's own is measured by itself.
@@ -42,6 +43,9 @@ FEWEST = 30
 """Pixels of a region, over all measured instants, below which nothing is said of it."""
 DEVIATIONS = 2.0
 """Standard deviations below a floor that are taken for chance."""
+SPREAD = 0.6
+"""Deviation of the errors of single instants over their mean, as far as a clip's own few instants do not tell."""
+_TRUST = 4  # instants that SPREAD counts for
 _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
 _TRIO = 3
 
@@ -140,7 +144,11 @@ def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> tuple[f
     mean = sums.sum() / size
     spread = float(np.sqrt(((sums - mean * sizes) ** 2).sum())) / size
     bounded = max(mean, spread)  # chance can make the mean of products negative
-    return float(10.0 * np.log10(255.0**2 / bounded)), float(10.0 / np.log(10.0) * spread / bounded)
+    count = len(measured)
+    own = [(np.sum(np.where(mask, error - bounded, 0.0)) * count / size / bounded) ** 2 for error, mask in measured]
+    between = (sum(own) + _TRUST * SPREAD**2) / (count - 1 + _TRUST) / count
+    deviation = float(np.sqrt((spread / bounded) ** 2 + between))
+    return float(10.0 * np.log10(255.0**2 / bounded)), 10.0 / np.log(10.0) * deviation
 
 
 def _blocks(values: Floats) -> Floats:

@@ -37,6 +37,8 @@ _LAMP_POWER = 24.0  # [W]
 _AMBIENT = 0.012  # radiance of the black curtains around the scene; cameras see none of it
 _FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
+_DISCARDED = 4  # at the border of a window, where the denoiser knows one side only [px]
+_RAMP = 8  # over which the window passes into the frame about it [px]
 _MIRRORING = 0.3  # roughness below which a floor's mirror image is in the window too
 
 
@@ -103,9 +105,13 @@ class ClothScene:
         self._place(shot)
         set_sampling(self._scene, Sampling(sampling.frame, "plain", seed))
         light = self._reader.read_light()
-        part = self.window(shot)
-        set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
-        light[part.slices] = self._reader.read_light(part)
+        part = self.window(shot, _DISCARDED + _RAMP)
+        set_sampling(self._scene, Sampling(sampling.window, "plain", seed, noise=sampling.noise))
+        fine, base = self._reader.read_light(part).astype(np.float32), light[part.slices]
+        down = _share(part.top, part.bottom, light.shape[0])
+        light[part.slices] = base + np.minimum.outer(down, _share(part.left, part.right, light.shape[1]))[..., None] * (
+            fine - base
+        )
         return light
 
     def direct(
@@ -117,12 +123,12 @@ class ClothScene:
         set_sampling(self._scene, sampling)
         return self._reader.read_light(window)
 
-    def window(self, shot: Shot) -> Window:
+    def window(self, shot: Shot, margin: int = _WINDOW_MARGIN) -> Window:
         """Return the part of the frame that shows the cloth, and its image in a floor that mirrors it."""
         cloth, floor = shot.points[: self.geometry.cloth_vertices], self.geometry.surroundings.floor
         if self.substrate.roughness < _MIRRORING and floor is not None:
             cloth = np.concatenate([cloth, mirrored(cloth, floor)])
-        return window_about(projected(self._camera, cloth), self._camera, _WINDOW_MARGIN)
+        return window_about(projected(self._camera, cloth), self._camera, margin)
 
     def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
         """Return the positions of everything at an instant, the solver's vertices at positions (V', 3) [m]."""
@@ -135,6 +141,14 @@ class ClothScene:
         a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         self._lamp.aim(shot.aim, outward, _LAMP_DISTANCE)
+
+
+def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
+    """Return the share of a window [low, high) in a frame of a size: a smooth step at each end inside it [px]."""
+    inside = np.arange(low, high) + 0.5
+    ends = inside - (low if low > 0 else -np.inf), (high if high < size else np.inf) - inside
+    step = np.clip((np.minimum(*ends) - _DISCARDED) / _RAMP, 0.0, 1.0)
+    return np.asarray(step * step * (3.0 - 2.0 * step), dtype=np.float32)
 
 
 def _shader(look: Look) -> dict[str, float]:

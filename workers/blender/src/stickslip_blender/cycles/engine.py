@@ -17,9 +17,9 @@ class Sampling:
     """What a quality means to Cycles."""
 
     samples: int
-    """Paths per pixel, the same for every pixel (no adaptive sampling)."""
+    """Paths per pixel; the most of a pixel where `noise` is above 0."""
     denoiser: Literal["none", "plain", "guided"] = "none"
-    """OpenImageDenoise, fast; `guided` by albedo and normal, for textures have edges.
+    """OpenImageDenoise; `guided` by albedo and normal, for textures have edges.
 
     Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even cloth is `plain`.
     """
@@ -27,6 +27,9 @@ class Sampling:
     """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and clips compress."""
     skipped: int = 0
     """Paths per pixel that are left out first. Cycles sends the very first one through the middle of the pixel."""
+
+    noise: float = 0.0
+    """Noise at which a pixel gets no more paths, as Cycles estimates it; at 0, all pixels get the same number."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +39,18 @@ class ClothSampling:
     frame: int
     """Paths per pixel in the whole frame."""
     window: int
-    """Paths per pixel in the window that the cloth is in."""
+    """Most paths per pixel in the window that the cloth is in."""
+    noise: float
+    """Noise of a pixel of the window at which it gets no more; 0: all get the same number."""
+    usual: int
+    """Paths per pixel that the window gets on average, for a dark floor."""
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
     @property
     def finer(self) -> ClothSampling:
         """Half the noise: for a clip that is below its floors."""
-        return replace(self, frame=4 * self.frame, window=4 * self.window)
+        return replace(self, frame=4 * self.frame, window=4 * self.window, noise=0.5 * self.noise)
 
 
 # Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures them.
@@ -55,11 +62,12 @@ SAMPLING = {
 }
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
 CLOTH_SAMPLING = {
-    Quality.preview: ClothSampling(1, 3, (24.0, 22.0, 22.0)),
-    Quality.draft: ClothSampling(2, 8, (30.0, 27.0, 25.0)),
-    Quality.standard: ClothSampling(2, 16, (34.0, 31.0, 27.0)),
-    Quality.high: ClothSampling(8, 64, (36.0, 33.0, 28.0)),
+    Quality.preview: ClothSampling(1, 3, 0.0, 3, (22.0, 19.0, 20.0)),
+    Quality.draft: ClothSampling(2, 32, 0.1, 9, (27.0, 24.0, 23.0)),
+    Quality.standard: ClothSampling(2, 128, 0.03, 24, (30.0, 27.0, 25.0)),
+    Quality.high: ClothSampling(8, 512, 0.015, 90, (31.0, 28.0, 26.0)),
 }
+_FEWEST = 8  # paths of a pixel before its noise is estimated
 REFERENCE = Sampling(samples=256, seed=1)
 """What pictures are compared with; its seed is another, so that it shares no noise with them."""
 
@@ -95,7 +103,6 @@ def _set_up_cycles(scene: Any) -> None:
     render.resolution_percentage = 100
     use_device(scene)
     cycles.use_animated_seed = False
-    cycles.use_adaptive_sampling = False
     cycles.time_limit = 0.0
     cycles.pixel_filter_type = "BOX"  # a pixel is the mean over its own area, as on a sensor
     cycles.caustics_reflective = False
@@ -120,10 +127,12 @@ def set_sampling(scene: Any, sampling: Sampling) -> None:
     cycles.use_sample_subset = sampling.skipped > 0
     cycles.sample_offset, cycles.sample_subset_length = sampling.skipped, sampling.samples
     cycles.seed = sampling.seed
+    cycles.use_adaptive_sampling = sampling.noise > 0.0
+    cycles.adaptive_threshold, cycles.adaptive_min_samples = sampling.noise, _FEWEST
     cycles.use_denoising = sampling.denoiser != "none"
     if sampling.denoiser != "none":
         cycles.denoiser = "OPENIMAGEDENOISE"
-        cycles.denoising_quality = "FAST"
+        cycles.denoising_quality = "HIGH"
         cycles.denoising_prefilter = "NONE"
         cycles.denoising_input_passes = "RGB" if sampling.denoiser == "plain" else "RGB_ALBEDO_NORMAL"
         cycles.denoising_use_gpu = device() != CPU
