@@ -49,7 +49,7 @@ class Lighting(StrEnum):
 
 
 class Substrate(StrEnum):
-    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, and any of the hard ones.
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, bright ones, any hard one.
 
     Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
     the end.
@@ -64,6 +64,10 @@ class Substrate(StrEnum):
     polyester_mirror = "polyester-mirror"
     stainless_steel = "stainless-steel"
     cloth = "cloth"
+    white_table = "white-table"
+    light_oak = "light-oak"
+    beech = "beech"
+    concrete = "concrete"
     any = "any"
 
 

@@ -69,7 +69,9 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, substrate: str) -> Non
         substrate=substrate,
     )
     renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
-    clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 16, 0.0, 16, (0.0, 0.0, 0.0)))
+    clip = renderer.clip(
+        look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 16, 0.0, 16, (0.0, 0.0, 0.0))
+    )
     names = trio("plaid")
     pictures = [texture_image(Texture(name)) for name in names]
     videos, _ = clip.clips(clip.shading(), pictures)

@@ -1,0 +1,78 @@
+"""What clips of cloth state of their own PSNR, against longer references at other instants, and what both cost.
+
+Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
+
+    .venv-blender/bin/python benchmarks/clip_psnr.py /tmp/cloth.npz [--material gray-interlock] [--quality standard]
+
+Three clips of 30 frames, with eight textures each. The longer references are 2 x 40 paths per pixel, not denoised, at
+ten instants, for three of the textures; they share no noise with what a clip is measured with.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from stickslip_blender.cloth import clips
+from stickslip_blender.cloth.clips import ClothRenderer
+from stickslip_blender.cloth.geometry import Holders
+from stickslip_blender.cloth.quality import pooled, trio
+from stickslip_blender.cloth.textures import texture_image
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.cameras import load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import Texture
+
+SHOWN = (("left", "matt", 21), ("calibrated", "stainless-steel", 22), ("right", "cloth", 23))
+TEXTURES = tuple(map(str, Texture))[:8]
+LONG, INSTANTS = 40, list(range(1, 30, 3))
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments.add_argument("trajectory", type=Path)
+    arguments.add_argument("--material", default="gray-interlock")
+    arguments.add_argument("--quality", default="standard")
+    options = arguments.parse_args()
+    with np.load(options.trajectory) as file:
+        track = file["track"]
+        renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
+    pictures = {name: texture_image(Texture(name)) for name in TEXTURES}
+    instants, samples = clips.instants, clips.HALF_SAMPLES
+    for viewpoint, substrate, seed in SHOWN:
+        look = ClothDragRender(
+            rig="drag",
+            rig_digest=rig_digest("drag"),
+            quality=options.quality,
+            material=options.material,
+            texture=TEXTURES[0],
+            viewpoint=viewpoint,
+            substrate=substrate,
+            instants=shown_frames(30, len(track)),
+            light_seed=seed,
+            crease_seed=1,
+        )
+        camera = next(camera for camera in load_rig("drag") if camera.name == viewpoint)
+        clip = renderer.clip(look, camera, track[list(look.instants)])
+        start = time.process_time()
+        videos, _ = clip.clips(clip.shading(), list(pictures.values()))
+        made = time.process_time()
+        groups = list(dict.fromkeys(map(trio, TEXTURES)))
+        own = [list(clip.references([pictures[name] for name in g], 0.15, g[0].encode())) for g in groups]
+        ended = time.process_time()
+        clips.instants, clips.HALF_SAMPLES = (lambda *_: INSTANTS), LONG
+        object.__setattr__(clip, "seed", seed + 5000)
+        long = list(clip.references([pictures[name] for name in groups[0]], 1.0))
+        clips.instants, clips.HALF_SAMPLES = instants, samples
+        seconds = (made - start) / len(TEXTURES) / 30
+        print(f"{viewpoint}, {substrate}: {seconds:.4f} CPU s a frame and texture", end=", ")
+        print(f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants", flush=True)
+        for channel, name in enumerate(groups[0]):
+            video = videos[TEXTURES.index(name)]
+            stated, found = (pooled([(r.errors(video, channel), r.regions) for r in group]) for group in (own[0], long))
+            said = zip(stated.psnr, stated.deviations, found.psnr, strict=True)
+            print(f"  {name}:", "; ".join(f"{a:.1f} +- {d:.1f} against {b:.1f}" for a, d, b in said), flush=True)
+
+
+if __name__ == "__main__":
+    main()
