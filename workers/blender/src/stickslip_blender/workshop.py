@@ -28,11 +28,8 @@ FRAME_MARGIN = 1.0
 
 SHADING_BYTES = 4 * 2**30
 """Limit of the shadings kept in a store [bytes]: about 500 clips of 30 frames."""
-_DIGEST_BYTES = 32
 
 Array = npt.NDArray[Any]
-
-
 R = TypeVar("R")
 
 
@@ -60,7 +57,7 @@ class Workshop:
             path.touch()  # the oldest are deleted first
         except OSError:
             return None
-        digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        digest, body = data[:32], data[32:]
         return body if hashlib.sha256(body).digest() == digest else None
 
     def keep_shading(self, key: str, data: bytes) -> None:

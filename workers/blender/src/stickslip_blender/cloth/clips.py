@@ -274,5 +274,4 @@ def _shading(clip: ClipRenderer, sampling: ClothSampling, look: AnyLook, task: R
         while len(kept) > _KEPT_SHADINGS:
             kept.popitem(last=False)
     kept.move_to_end(key)
-    shading: Light = kept[key]
-    return shading
+    return kept[key]

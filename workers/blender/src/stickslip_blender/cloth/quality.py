@@ -28,11 +28,10 @@ from stickslip_schemas.spec.fabrics import Texture
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.raster import Window, decoded, projected, see
 
-HALF_SAMPLES = 8
-"""Paths per pixel of each of the two direct renderings. The first ones are left out: at the edges of a print, a path
-through the middle of each pixel is an error that both have. Errors differ more between instants than they are known at
-one, so many instants with few paths tell most."""
-_FIXED = 25  # what else a frame of a shading costs [paths per pixel of its window]
+HALF_SAMPLES = 12
+"""Paths per pixel of each of the two direct renderings, without the first ones: at the edges of a print, the path
+through the middle of each pixel is an error that both have."""
+_FIXED = 33  # what else a frame of a shading costs [paths per pixel of its window]
 _SET_UP = 6  # the same of the two renderings
 _TRIOS = 3  # that eight textures make
 LANDED = 0.04
@@ -43,9 +42,8 @@ FEWEST = 30
 """Pixels of a region, over all measured instants, below which nothing is said of it."""
 DEVIATIONS = 2.0
 """Standard deviations below a floor that are taken for chance."""
-SPREAD = 0.6
-"""Deviation of the errors of single instants over their mean, as far as a clip's own few instants do not tell."""
-_TRUST = 4  # instants that SPREAD counts for
+_SPREAD = 0.6  # deviation of the errors of instants over their mean, before a clip's own are known
+_TRUST = 4  # instants that it counts for
 _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
 _TRIO = 3
 
@@ -78,7 +76,7 @@ class Measured:
         return {f"psnr_{name}": x for name, x in zip(REGIONS, psnr, strict=True)} | {"psnr_deviation": deviations}
 
 
-UNMEASURED = Measured((np.nan,) * len(REGIONS), (np.nan,) * len(REGIONS))
+UNMEASURED = Measured((np.nan,) * 3, (np.nan,) * 3)
 
 
 def trio(texture: str) -> tuple[str, ...]:
@@ -126,8 +124,7 @@ def errors(levels: Clip, one: Floats, other: Floats) -> Floats:
     light = decoded(levels).astype(np.float64)
     slope = 255.0 * np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0))
     top = np.where(levels == 255, 1.0, np.inf)  # brighter light has no other level
-    product: Floats = slope**2 * (light - np.minimum(one, top)) * (light - np.minimum(other, top))
-    return product
+    return np.asarray(slope**2 * (light - np.minimum(one, top)) * (light - np.minimum(other, top)))
 
 
 def pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> Measured:
@@ -146,7 +143,7 @@ def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> tuple[f
     bounded = max(mean, spread)  # chance can make the mean of products negative
     count = len(measured)
     own = [(np.sum(np.where(mask, error - bounded, 0.0)) * count / size / bounded) ** 2 for error, mask in measured]
-    between = (sum(own) + _TRUST * SPREAD**2) / (count - 1 + _TRUST) / count
+    between = (sum(own) + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
     deviation = float(np.sqrt((spread / bounded) ** 2 + between))
     return float(10.0 * np.log10(255.0**2 / bounded)), 10.0 / np.log(10.0) * deviation
 
@@ -155,5 +152,4 @@ def _blocks(values: Floats) -> Floats:
     height, width = (-(-size // _BLOCK) for size in values.shape)
     padded = np.zeros((height * _BLOCK, width * _BLOCK))
     padded[: values.shape[0], : values.shape[1]] = values
-    sums: Floats = padded.reshape(height, _BLOCK, width, _BLOCK).sum(axis=(1, 3)).ravel()
-    return sums
+    return np.asarray(padded.reshape(height, _BLOCK, width, _BLOCK).sum(axis=(1, 3)).ravel())

@@ -107,11 +107,9 @@ class ClothScene:
         light = self._reader.read_light()
         part = self.window(shot, _DISCARDED + _RAMP)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed, noise=sampling.noise))
-        fine, base = self._reader.read_light(part).astype(np.float32), light[part.slices]
-        down = _share(part.top, part.bottom, light.shape[0])
-        light[part.slices] = base + np.minimum.outer(down, _share(part.left, part.right, light.shape[1]))[..., None] * (
-            fine - base
-        )
+        down, across = _share(part.top, part.bottom, len(light)), _share(part.left, part.right, light.shape[1])
+        finer = self._reader.read_light(part).astype(np.float32) - light[part.slices]
+        light[part.slices] += np.minimum.outer(down, across)[..., None] * finer
         return light
 
     def direct(

@@ -35,11 +35,7 @@ _ENCODED = _encoding()
 
 def encode(light: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Return linear light as 8-bit sRGB [IEC 61966-2-1], clipped to [0, 1]."""
-    scaled = np.clip(light, 0.0, 1.0)
-    scaled *= _LEVELS - 1
-    scaled += 0.5
-    coded: npt.NDArray[np.uint8] = _ENCODED[scaled.astype(np.uint16)]
-    return coded
+    return np.asarray(_ENCODED[(np.clip(light, 0.0, 1.0) * (_LEVELS - 1) + 0.5).astype(np.uint16)])
 
 
 class FrameReader:
