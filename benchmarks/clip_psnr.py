@@ -37,7 +37,7 @@ def main() -> None:
     with np.load(options.trajectory) as file:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
-    pictures = {name: texture_image(Texture(name)) for name in TEXTURES}
+    pictures = {str(name): texture_image(name) for name in Texture}
     instants, samples = clips.instants, clips.HALF_SAMPLES
     for viewpoint, substrate, seed in SHOWN:
         look = ClothDragRender(
@@ -55,7 +55,7 @@ def main() -> None:
         camera = next(camera for camera in load_rig("drag") if camera.name == viewpoint)
         clip = renderer.clip(look, camera, track[list(look.instants)])
         start = time.process_time()
-        videos, _ = clip.clips(clip.shading(), list(pictures.values()))
+        videos, _ = clip.clips(clip.shading(), [pictures[name] for name in TEXTURES])
         made = time.process_time()
         groups = list(dict.fromkeys(map(trio, TEXTURES)))
         own = [list(clip.references([pictures[name] for name in g], 0.15, g[0].encode())) for g in groups]

@@ -13,8 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_blender.cloth.surface import Surface
-from stickslip_blender.cycles.pixels import encode
-from stickslip_blender.raster import decoded
 
 if TYPE_CHECKING:
     from stickslip_schemas.spec.appearance import LampNumbers
@@ -40,7 +38,7 @@ class Look:
     grain: Grain
     """Pattern of the weave or knit in the colour."""
     contrast: float
-    """Of the grain, in the share of light that it reflects: 0 is none."""
+    """Of the grain: 0 is none."""
 
 
 @cache
@@ -50,10 +48,7 @@ def looks() -> dict[str, Look]:
     return {material: Look(**numbers) for material, numbers in data.items()}
 
 
-WHITE = 0.85
-"""Albedo of white: no fabric reflects more, and grain shows on it."""
-
-PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.6, grain="plain", contrast=0.1)
+PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.6, grain="plain", contrast=0.05)
 """Of a fabric that is not in fabrics.toml: a user's own."""
 
 
@@ -65,16 +60,15 @@ def look_of(material: str) -> Look:
 def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt.NDArray[np.uint8]:
     """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet, with the grain of its fabric and a hem.
 
-    Row 0 is the lower edge of the sheet; the picture covers the longer side. No albedo is above WHITE.
+    Row 0 is the lower edge of the sheet; the picture covers the longer side.
     """
     wide, high = (1e3 * side for side in surface.size)
     across = (np.arange(len(picture)) + 0.5) / len(picture) * max(wide, high)
     u, v = np.meshgrid(across, across)
     shade = 1.0 + look.contrast * _GRAINS[look.grain](u, v)
     if surface.is_rectangle:
-        shade *= 1.0 - 0.55 * _stitches(u, v, wide, high)
-    light = WHITE / max(1.0, np.quantile(shade, 0.95)) * decoded(picture) * shade[..., None]
-    return encode(np.minimum(light, WHITE).astype(np.float32))
+        shade *= 1.0 - 0.3 * _stitches(u, v, wide, high)
+    return np.rint(np.clip(picture * shade[..., None], 0.0, 255.0)).astype(np.uint8)
 
 
 def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
