@@ -102,10 +102,6 @@ class Camera(Document):
         low, high = -0.5 + margin, np.array([self.width, self.height]) - 0.5 - margin
         return float(max((low - (pixels - disc)).max(), (pixels + disc - high).max()))
 
-    def in_frame(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> bool:
-        """Say whether balls of a radius [scene units] about points (..., 3) lie wholly in the frame."""
-        return self.overflow(points, radius, margin) <= 0.0
-
 
 FRAMING = {"front": (-90.0, 15.0), "side": (-20.0, 25.0), "high": (-60.0, 50.0)}
 """Azimuth, seen from what it frames, from +x towards +y, and elevation of each camera that frames [degree]."""

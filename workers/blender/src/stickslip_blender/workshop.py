@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,6 @@ SHADING_BYTES = 4 * 2**30
 """Limit of the shadings kept in a store [bytes]: about 500 clips of 30 frames."""
 
 Array = npt.NDArray[Any]
-R = TypeVar("R")
 
 
 class Workshop:
@@ -93,13 +92,12 @@ class Workshop:
             raise ValueError(f"record.row must be below {rows}, the rows of {record.digest}; got {record.row}")
         return {name: values[record.row] for name, values in arrays.items()}
 
-    def renderer(self, scene: object, build: Callable[[], R]) -> R:
+    def renderer(self, scene: object, build: Callable[[], Any]) -> Any:
         """Return the renderer of a scene: the last one if it fits, or a new one in its place."""
         if self._renderer is None or self._renderer[0] != scene:
             self._renderer = None  # building ends the last one, even if it fails
             self._renderer = scene, build()
-        kept: R = self._renderer[1]  # `scene` identifies what `build` returns
-        return kept
+        return self._renderer[1]
 
     def rendered(self, name: str, pictures: Array, preview: bytes | None, labels: dict[str, Any]) -> TaskResult:
         """Publish pictures (n, height, width, 3) of one sample, and a preview, and return the result."""

@@ -34,14 +34,10 @@ through the middle of each pixel is an error that both have."""
 _FIXED = 33  # what else a frame of a shading costs [paths per pixel of its window]
 _SET_UP = 6  # the same of the two renderings
 _TRIOS = 3  # that eight textures make
-LANDED = 0.04
-"""Height above the floor up to which cloth counts as landed [m]."""
-BAND = 2
-"""Half the width of the band along the silhouette [px]."""
-FEWEST = 30
-"""Pixels of a region, over all measured instants, below which nothing is said of it."""
-DEVIATIONS = 2.0
-"""Standard deviations below a floor that are taken for chance."""
+LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
+BAND = 2  # half the width of the band along the silhouette [px]
+FEWEST = 30  # pixels of a region, over all measured instants, below which nothing is said of it
+DEVIATIONS = 2.0  # standard deviations below a floor that are taken for chance
 _SPREAD = 0.6  # deviation of the errors of instants over their mean, before a clip's own are known
 _TRUST = 4  # instants that it counts for
 _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
@@ -89,13 +85,9 @@ def trio(texture: str) -> tuple[str, ...]:
 
 
 def instants(frames: int, share: float, samples: int, seed: Sequence[int]) -> list[int]:
-    """Draw which frames are measured: at least one, and one from each of as many equal parts of the clip.
+    """Draw which frames are measured, each from one of as many equal parts of the clip, at least one.
 
-    Args:
-        frames: Of the clip.
-        share: Cost of measuring eight textures, over that of their shading.
-        samples: Paths per pixel of the shading.
-        seed: Seeds of the draw.
+    To measure eight textures costs a share of their shading, which has so many samples per pixel.
     """
     cost = _TRIOS * (2 * HALF_SAMPLES + _SET_UP) / (samples + _FIXED)
     count = min(max(1, round(share * frames / cost)), frames)
