@@ -7,11 +7,10 @@ are independent, so that in
     e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
 nothing of the noise of the references is left, however few samples they have. The mean of e over a region, pooled over
-instants, is the mean squared error of its PSNR. The deviation of that mean is estimated from blocks of pixels, and from
-how much instants differ.
+instants, is the mean squared error of its PSNR. Blocks of pixels, and instants, tell how far chance goes.
 
-One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed, so a
-clip gets the same numbers alone or with others; a picture of a user's own is measured by itself.
+One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed: a clip
+gets the same numbers alone or with others. A user's picture is measured by itself.
 """
 
 from __future__ import annotations
@@ -44,17 +43,14 @@ _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a de
 _TRIO = 3
 
 Floats = npt.NDArray[np.float64]
-Clip = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """PSNR of a clip by region, in the order of `REGIONS`; NaN where a region is not in sight."""
+    """PSNR of a clip by region, in the order of `REGIONS`, and their deviations [dB]; NaN where none is in sight."""
 
     psnr: tuple[float, ...]
-    """[dB]"""
     deviations: tuple[float, ...]
-    """Standard deviations of the estimates [dB]."""
 
     def shortfall(self, floors: Sequence[float]) -> str:
         """Say which regions are below their floors [dB] by more than chance; nothing if none is."""
@@ -111,7 +107,7 @@ def _grown(mask: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
     return mask
 
 
-def errors(levels: Clip, one: Floats, other: Floats) -> Floats:
+def errors(levels: npt.NDArray[np.uint8], one: Floats, other: Floats) -> Floats:
     """Return e of this module's docstring, for 8-bit levels and two references in linear light, all (height, width)."""
     light = decoded(levels).astype(np.float64)
     slope = 255.0 * np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0))

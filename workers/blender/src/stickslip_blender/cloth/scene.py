@@ -37,8 +37,7 @@ _LAMP_POWER = 24.0  # [W]
 _AMBIENT = 0.012  # radiance of the black curtains around the scene; cameras see none of it
 _FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
-_DISCARDED = 4  # at the border of a window, where the denoiser knows one side only [px]
-_RAMP = 8  # over which the window passes into the frame about it [px]
+_DISCARDED, _RAMP = 4, 8  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
 _MIRRORING = 0.3  # roughness below which a floor's mirror image is in the window too
 
 
