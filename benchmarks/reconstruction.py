@@ -75,7 +75,7 @@ def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats
     else:
         solution = solve_rods(*made.values())
     lines, strains = solution.centerline, solution.curvature
-    seen = [all(camera.in_frame(line, RADIUS) for camera in rig) for line in lines]
+    seen = [all(camera.overflow(line, RADIUS) <= 0.0 for camera in rig) for line in lines]
     kept = np.flatnonzero(np.array(seen) & solution.stable)[:count]
     return {"centerline": lines[kept], "strains": strains[kept], **{name: row[kept] for name, row in made.items()}}
 

@@ -35,8 +35,7 @@ Array = npt.NDArray[Any]
 class Workshop:
     """Reads records and publishes pictures.
 
-    It keeps the last record and the last renderer, because several tasks share them. Blender holds one scene per
-    process, so there is one renderer at a time.
+    It keeps the last record and, because Blender holds one scene per process, one renderer: several tasks share them.
     """
 
     def __init__(self, store: str) -> None:

@@ -159,7 +159,7 @@ def test_cameras_frame_what_moves_and_nothing_else(usual: Any, name: str) -> Non
     assert camera.overflow(track) == pytest.approx(camera.overflow(stage.moving(geometry)))
     assert -14.0 < camera.overflow(stage.moving(geometry)) < -6.0
     assert camera.position[2] > 0.1
-    assert not camera.in_frame(stage.placed(0, track[0])[0])  # the rug lies still
+    assert camera.overflow(stage.placed(0, track[0])[0]) > 0.0  # the rug lies still
 
 
 def test_a_camera_goes_around_what_hides_the_cloth() -> None:

@@ -9,8 +9,8 @@ are independent, so that in
 nothing of the noise of the references is left, however few samples they have. The mean of e over a region, pooled over
 instants, is the mean squared error of its PSNR. Blocks of pixels, and instants, tell how far chance goes.
 
-One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed: a clip
-gets the same numbers alone or with others. A user's picture is measured by itself.
+One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed: a
+clip gets the same numbers alone or with others. A user's picture is measured by itself.
 """
 
 from __future__ import annotations
