@@ -50,7 +50,7 @@ _SETTINGS: dict[str, dict[str, Any]] = {"export": _PASSING}
 def _loaded(name: str) -> Any:
     """Return a command, of whose module the import takes most of the time of a short command."""
     module, attribute = _COMMANDS[name].split(".")
-    if module == "admin":  # it imports the server, which a client lacks
+    if module in ("admin", "maintenance"):  # they import the server, which a client lacks
         from stickslip_services.cli.common import require_server
         from stickslip_services.cli.errors import shows_errors
 

@@ -5,19 +5,22 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from stickslip_schemas.store import Store, open_store
 
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, require_server, say
+from stickslip_services.access.asker import asking, this_user
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, say
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
+from stickslip_services.database.database import Database, Role
+from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import CommandError, DatabaseRefusedError
-
-if TYPE_CHECKING:
-    from stickslip_schemas.store import Store
-
-    from stickslip_services.database.database import Database
+from stickslip_services.local.process import locked
+from stickslip_services.queue.cleanup import remove, unused
+from stickslip_services.queue.reindex import reindex as reindexed
+from stickslip_services.settings import Settings
 
 StoppedDataOption = Annotated[Path, typer.Option("--data", help="data directory of a coordinator that is stopped")]
 
@@ -25,20 +28,11 @@ StoppedDataOption = Annotated[Path, typer.Option("--data", help="data directory 
 @contextmanager
 def _owned(
     data: Path, store: str | None, database: str | None, *, is_new: bool = False
-) -> Iterator[tuple["Database", "Store"]]:
+) -> Iterator[tuple[Database, Store]]:
     """Open the database and the store of a coordinator that is stopped, and keep others from starting one.
 
     Raise DatabaseRefusedError if one runs, or if there is no database and `is_new` does not allow to make one.
     """
-    require_server()
-    from stickslip_schemas.store import open_store
-
-    from stickslip_services.access.asker import asking, this_user
-    from stickslip_services.database.database import Role
-    from stickslip_services.database.opening import check, opened
-    from stickslip_services.local.process import locked
-    from stickslip_services.settings import Settings
-
     given = {name: value for name, value in (("store", store), ("database", database)) if value is not None}
     settings = Settings.chosen(data=data, **given)
     if not is_new and not check(settings, Role.upkeep, with_store=True):
@@ -67,10 +61,8 @@ def rm(
     parts = re.fullmatch(r"(ds-[0-9a-f]{16}):v([1-9]\d{0,8})", version)
     if parts is None:
         raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {version!r}")
-    with _owned(data, store, database) as (opened, files):
-        from stickslip_services.queue.cleanup import remove
-
-        removed = remove(opened, files, parts[1], int(parts[2]))
+    with _owned(data, store, database) as (opened_database, files):
+        removed = remove(opened_database, files, parts[1], int(parts[2]))
     typer.echo(f"{version} is removed, with {removed.jobs} jobs and {removed.tasks} results that no other job needs")
     typer.echo("to free the space: stickslip gc --delete --older-than 0")
 
@@ -85,10 +77,8 @@ def gc(
 ) -> None:
     """Find the files of the store that nothing refers to, and delete them with --delete."""
     count = size = 0
-    with _owned(data, store, database) as (opened, files):
-        from stickslip_services.queue.cleanup import unused
-
-        for file in unused(opened, files, older_than=3600 * older_than):
+    with _owned(data, store, database) as (opened_database, files):
+        for file in unused(opened_database, files, older_than=3600 * older_than):
             count += 1
             size += file.bytes
             if delete:
@@ -101,10 +91,8 @@ def gc(
 def reindex(data: StoppedDataOption = DEFAULT_DATA, store: StoreOption = None, database: DatabaseOption = None) -> None:
     """Recover the datasets in the store after the database was lost. Known datasets stay as they are."""
     counts = Counter[str]()
-    with _owned(data, store, database, is_new=True) as (opened, files):
-        from stickslip_services.queue.reindex import reindex
-
-        for found in reindex(opened, files):
+    with _owned(data, store, database, is_new=True) as (opened_database, files):
+        for found in reindexed(opened_database, files):
             if found.fault:
                 say(f"left out: {found.name}: {found.fault}")
             elif found.is_new:
