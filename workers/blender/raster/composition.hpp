@@ -34,7 +34,8 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
              std::size_t stride);
 
 // Largest difference of a pixel of a clip from its exact value [8-bit levels]. Red is rounded; green takes the level of
-// red, and blue that of green, where it is as near as this, or is rounded. Grey stays grey, which is smaller when coded.
+// red, and blue that of green, where it is as near as this, or is rounded. Grey stays grey, which is smaller when
+// coded.
 constexpr int tolerance = 1;
 
 // Return values (height x width x count), blurred about each pixel by radii of its own, in rows `down` and in columns
