@@ -38,7 +38,7 @@ def main() -> None:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
     pictures = {str(name): texture_image(name) for name in Texture}
-    instants, samples = clips.instants, clips.HALF_SAMPLES
+    instants, samples = clips.instants, clips.HALF_SAMPLES  # type: ignore[attr-defined]
     for viewpoint, substrate, seed in SHOWN:
         look = ClothDragRender(
             rig="drag",
@@ -60,10 +60,10 @@ def main() -> None:
         groups = list(dict.fromkeys(map(trio, TEXTURES)))
         own = [list(clip.references([pictures[name] for name in g], 0.15, g[0].encode())) for g in groups]
         ended = time.process_time()
-        clips.instants, clips.HALF_SAMPLES = (lambda *_: INSTANTS), LONG
+        clips.instants, clips.HALF_SAMPLES = (lambda *_: INSTANTS), LONG  # type: ignore[attr-defined]
         object.__setattr__(clip, "seed", seed + 5000)
         long = list(clip.references([pictures[name] for name in groups[0]], 1.0))
-        clips.instants, clips.HALF_SAMPLES = instants, samples
+        clips.instants, clips.HALF_SAMPLES = instants, samples  # type: ignore[attr-defined]
         seconds = (made - start) / len(TEXTURES) / 30
         print(f"{viewpoint}, {substrate}: {seconds:.4f} CPU s a frame and texture", end=", ")
         print(f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants", flush=True)

@@ -108,7 +108,7 @@ def h264(video: Any, camera: Camera, random: Random) -> Any:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         file.mux(stream.encode())
     buffer.seek(0)
-    with av.open(buffer) as file:
+    with av.open(buffer, "r") as file:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
 
 
@@ -146,7 +146,7 @@ def filmed(path: Path, materials: tuple[str, ...], steps: tuple[Callable[..., An
     crops = []
     for place, (video, told) in enumerate(zip(videos, about, strict=True)):
         random, camera = np.random.default_rng((SEED, place)), named[told["viewpoint"]]
-        holds = random.choice([clamp, hands])
+        holds = (clamp, hands)[random.integers(2)]
         for step in steps:
             if len(steps) == 1 or step not in (clamp, hands) or step is holds:
                 video = step(np.ascontiguousarray(video.copy()), camera, random)
@@ -162,15 +162,15 @@ def without_answer(runs: Runs) -> dict[str, Clips]:
         return render_clips(replace(runs, positions=positions.astype(np.float32)), 2, SEED + seed, drawn_world=True)
 
     meshes = runs.positions
-    lifted = hanging(meshes, held) + np.float32([0, 0, 0.06])
+    lifted = hanging(meshes, held) + np.array([0, 0, 0.06], np.float32)
     swung = hanging(meshes, held)
     swung[..., 0] += 0.3 * (held[..., 2] - swung[..., 2])
     rigid = meshes[:, :1] - held[:1] + held
-    narrow = meshes * np.float32([1, 0.5, 1])
+    narrow = meshes * np.array([1, 0.5, 1], np.float32)
     stiff = hanging(meshes, held)
     stiff[..., 0] += held[..., 2] - stiff[..., 2]
     stiff[..., 2] = held[..., 2]
-    empty = meshes + np.float32([0, 0, -9.0])
+    empty = meshes + np.array([0, 0, -9.0], np.float32)
     good = shown(meshes, 0)
     lies = (meshes[:, 2:3, ..., 2:] < 0.004) & (np.arange(6) >= 2)[None, :, None, None, None]
     stuck = np.where(lies, meshes[:, 2:3], meshes)

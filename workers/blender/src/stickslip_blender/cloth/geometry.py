@@ -140,7 +140,9 @@ class Geometry:
         )
         self.segments = np.repeat([surroundings.segment, *(p.segment for p in props)], counts).astype(np.uint8)
         self.has_uv = np.repeat([True, *(p.sheet is not None for p in props)], counts)
-        skins = [(np.arange(self.cloth_vertices), parts[0])]
+        skins: list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]] = [
+            (np.arange(self.cloth_vertices), parts[0])
+        ]
         skins += [skin(p.vertices, fans(p.faces)) for p in props]
         ends = np.cumsum([0, *(len(vertices) for vertices, _ in skins)])
         self.shaded = np.concatenate([v + first for (v, _), first in zip(skins, [0, *sizes[:-1]], strict=True)])
