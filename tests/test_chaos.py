@@ -155,7 +155,7 @@ def check_dataset(store: Store, reference: dict[str, Any], spec: dict[str, Any],
     assert len(pictures) == count
 
 
-RAY = ("raylet/raylet", "gcs/gcs_server")
+RAY = ("raylet/raylet", "gcs/gcs_server", "ray::DashboardAgent")
 
 
 def test_ray_listens_on_loopback_and_is_replaced_at_once_when_it_dies(service: Service) -> None:
@@ -223,7 +223,7 @@ class Watch:
         self._services = services
         self._turns = 0
         self.jobs: list[str] = []
-        self.done = -1
+        self.done = 0
         self.since = time.monotonic()
         self.longest = 0.0
 

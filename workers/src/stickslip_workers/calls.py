@@ -158,6 +158,8 @@ class Calls:
             one = self._calls[reference]
             try:
                 said = ray.get(next(reference))
+            except ray.exceptions.LocalRayletDiedError:  # no call of this driver can end well any more
+                raise
             except ray.exceptions.RayError as error:
                 said = error
             if isinstance(said, dict):

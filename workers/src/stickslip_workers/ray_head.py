@@ -2,7 +2,8 @@
 
 The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then (ray-project/ray#65983). It
 does not wait for ports that it already knows. One of them is no option of `ray start`, so a private function of Ray
-adds it.
+adds it. It also ends the head with its raylet: a raylet that has lost an agent exits with 0, which `--block` takes for
+an ordinary end.
 """
 
 import os
@@ -12,8 +13,11 @@ import socket
 import stat
 import sys
 import tempfile
+import threading
 from contextlib import ExitStack
 from pathlib import Path
+from subprocess import Popen
+from typing import Any
 
 from stickslip_schemas.base.keys import sha256
 
@@ -67,10 +71,12 @@ def main(directory: Path, cpus: int | None) -> None:
         port, *ports = (free.getsockname()[1] for free in sockets)
     start = services.start_ray_process
 
-    def start_ray_process(command: list[str], *arguments: object, **options: object) -> object:
-        if command[0] == services.RAYLET_EXECUTABLE:
-            command.append(f"--dashboard_agent_listen_port={ports[0]}")
-        return start(command, *arguments, **options)
+    def start_ray_process(command: list[str], *arguments: object, **options: object) -> Any:
+        if command[0] != services.RAYLET_EXECUTABLE:
+            return start(command, *arguments, **options)
+        raylet = start([*command, f"--dashboard_agent_listen_port={ports[0]}"], *arguments, **options)
+        threading.Thread(target=_end_with, args=[raylet.process], daemon=True).start()
+        return raylet
 
     services.start_ray_process = start_ray_process
     told = ("dashboard-agent-listen-port", "dashboard-agent-grpc-port", "runtime-env-agent-port", "metrics-export-port")
@@ -85,12 +91,12 @@ def main(directory: Path, cpus: int | None) -> None:
         **dict(zip(told, ports, strict=True)),
     }
     (directory / "address").write_text(f"127.0.0.1:{port}")
-    sys.argv = [
-        "ray",
-        "start",
-        "--head",
-        "--block",
-        "--no-monitor",
-        *(f"--{name}={value}" for name, value in options.items()),
-    ]
+    words = (f"--{name}={value}" for name, value in options.items())
+    sys.argv = ["ray", "start", "--head", "--block", "--no-monitor", *words]
     ray()
+
+
+def _end_with(raylet: Popen[bytes]) -> None:
+    """End this process when its raylet has ended; the kernel ends its other children then."""
+    raylet.wait()
+    os._exit(1)
