@@ -41,16 +41,16 @@ CASES: dict[str, str] = {
         "squeeze": "contact.surface_share",
         "crumple": """contact.detection_range contact.penalty_max contact.smooth_proximal contact.stiff_mean_share
             node.body_first path.rounds_max
-            factor.fold_smallest newton.common_least newton.last_growth newton.slow newton.smooth_hops
-            newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio stepping.easy stepping.loose
+            factor.fold_smallest newton.common_least newton.slow newton.smooth_hops
+            newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio stepping.easy
             stepping.smooth_iterations stepping.strained_long""",
-        "strip": """control.dearer control.factor_work control.forgiven control.grow_at control.newton_work
+        "strip": """stepping.lag control.dearer control.factor_work control.forgiven control.grow_at control.newton_work
             control.novelty control.reject_at control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",
         "push": "stepping.near_patience stepping.strained_soon",
-        "let down": "control.halvings control.halvings_near",
+        "let down": "control.halvings",
     }.items()
     for name in names.split()
 }
@@ -59,7 +59,7 @@ CASES: dict[str, str] = {
 DEARER = {("stepping.strained_soon", 0.5): 6.0}
 """Factors of the cost beyond COST."""
 
-OTHERWISE = {("newton.window", 2.0), ("node.penalty", 2.0)}
+OTHERWISE = {("newton.cuts_max", 0.5), ("node.penalty", 2.0)}
 """Changes with which the fold falls another way."""
 
 

@@ -71,17 +71,10 @@ def fallen(material: str, mesh: meshes.Mesh, *, box_below: bool) -> str:
 def clamped() -> str:
     """Let a clamped strip with Poisson's ratio sag under its weight."""
     mesh = meshes.unstructured(0.02, 0.1, 0.005, 1)
-    at_clamp = mesh.rest[:, 1] < -0.05 + 1e-9
-    edges = mesh.boundary(lambda p: p[:, 1] < -0.05 + 1e-9)
-    cloth = Cloth(
-        mesh,
-        isotropic(0.2, 500.0, 1e-5, 0.3),
-        preset_named("certified"),
-        held=np.flatnonzero(at_clamp),
-        clamped=edges,
-    )
+    at_clamp = mesh.rest[:, 1] < -0.043
+    cloth = Cloth(mesh, isotropic(0.2, 500.0, 1e-5, 0.3), preset_named("certified"), held=np.flatnonzero(at_clamp))
     flat = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
-    cloth.set_state(flat, None, np.tile([0.0, -1.0, 0.0], (len(edges), 1)))
+    cloth.set_state(flat)
     for _ in range(40):
         cloth.step(0.02, held=flat[at_clamp], damping=3.0)
     return digest(cloth.positions, cloth.reactions)

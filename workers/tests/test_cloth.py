@@ -102,7 +102,6 @@ class Core:
             kernel="baseline",
             steps=1200,
             unconverged_steps=3,
-            missed_steps=2,
             worst_residual=2e-4,
             rest_time=np.nan,
             checks=dict.fromkeys(CHECKS, 0.0),
@@ -149,7 +148,6 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
         "bias": 1e-5,
         "steps": 1200,
         "unconverged_steps": 3,
-        "missed_steps": 2,
         "worst_residual": 2e-4,
         **dict.fromkeys(CHECKS, 0.0),
     }
@@ -171,9 +169,10 @@ def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: C
     core.changes = {"code": "stretch", "reason": "stretch: must be at most 1.25, got 2.5"}
     (result,) = run_tasks([_task()], store)
     assert (result.outcome, result.reason) == ("rejected", Reason.stretch)
+    worst = ", ".join(f"{name} 0" for name in CHECKS)
     assert result.message == (
-        "stretch: must be at most 1.25, got 2.5 at material = gray-interlock, density = 1, bending = 1, "
-        "stretching = 1, mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
+        f"stretch: must be at most 1.25, got 2.5; worst values: {worst} at material = gray-interlock, density = 1, "
+        "bending = 1, stretching = 1, mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
     )
     assert not (store.root / "artifacts").exists()
 

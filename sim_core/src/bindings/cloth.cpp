@@ -31,10 +31,10 @@ using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, 
 using FabricTuple = std::tuple<double, Table, Eigen::Matrix3d, double>;
 
 using MotionCallback =
-    std::function<std::tuple<Points3, Points3, Points3, Points3, std::vector<BodyTuple>, double>(double time)>;
+    std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(double time)>;
 
 struct DriveNow {
-  Points3 gravity, held, slopes, surfaces;
+  Points3 gravity, held, surfaces;
   std::vector<Body> bodies;
 };
 
@@ -81,7 +81,6 @@ void bind_cloth(nb::module_& m) {
       .def_ro("steps", &StepReport::steps)
       .def_ro("unconverged", &StepReport::unconverged)
       .def_ro("missed", &StepReport::missed, "Steps of the controller that are further off than it allows.")
-      .def_ro("substeps", &StepReport::substeps)
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
@@ -98,46 +97,45 @@ void bind_cloth(nb::module_& m) {
       .def(
           "__init__",
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
-             const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, const Edges& clamped,
-             double tolerance, int newton_max, int krylov_max, double krylov_tolerance, int refactor_after,
-             int patience, int halvings_max, double step_error, double longest_step, int finest,
-             const std::string& kernel, const std::vector<double>& thickness, const Eigen::MatrixXd& mu,
-             double edge_share, double second_share, const Triangles& surface_triangles,
-             const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
-             const std::vector<double>& crease, const std::map<std::string, double>& changed) {
+             const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, double tolerance,
+             int newton_max, int krylov_max, double krylov_tolerance, int refactor_after, int patience,
+             int halvings_max, double step_error, double longest_step, int finest, const std::string& kernel,
+             const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_share, double second_share,
+             const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
+             const Points3& surface_positions, const std::vector<double>& crease,
+             const std::map<std::string, double>& changed) {
             const Constants constants(changed);
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, {stretching}, rigidity, damping});
             }
             new (self) ClothSolver(
-                rest, triangles, list, held, clamped,
+                rest, triangles, list, held,
                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
                 {step_error, longest_step, finest}, kernel,
                 {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share,
                  constants.contact.surface_share},
                 {surface_triangles, surface_of_vertex, surface_positions, crease}, constants);
           },
-          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, "clamped"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
-          "krylov_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a,
-          "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a,
-          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a,
-          "constants"_a = std::map<std::string, double>())
+          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a, "krylov_max"_a,
+          "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a, "longest_step"_a,
+          "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a, "surface_triangles"_a,
+          "surface_of_vertex"_a, "surface_positions"_a, "crease"_a, "constants"_a = std::map<std::string, double>())
       .def(
           "set_state",
-          [](ClothSolver& self, const Points3& positions, const Points3& velocities, const Points3& slopes,
-             const Points3& surfaces, const std::vector<BodyTuple>& bodies,
-             bool begins) { self.set_state(positions, velocities, slopes, surfaces, bodies_of(bodies), begins); },
-          "positions"_a, "velocities"_a, "slopes"_a, "surfaces"_a, "bodies"_a, "begins"_a)
+          [](ClothSolver& self, const Points3& positions, const Points3& velocities, const Points3& surfaces,
+             const std::vector<BodyTuple>& bodies,
+             bool begins) { self.set_state(positions, velocities, surfaces, bodies_of(bodies), begins); },
+          "positions"_a, "velocities"_a, "surfaces"_a, "bodies"_a, "begins"_a)
       .def(
           "step",
-          [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
-             const Points3& surfaces, const std::vector<BodyTuple>& bodies, double damping) {
+          [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
+             const std::vector<BodyTuple>& bodies, double damping) {
             const std::vector<Body> list = bodies_of(bodies);
             nb::gil_scoped_release release;
-            return self.step(dt, gravity, held, slopes, surfaces, list, damping);
+            return self.step(dt, gravity, held, surfaces, list, damping);
           },
-          "dt"_a, "gravity"_a, "held"_a, "slopes"_a, "surfaces"_a, "bodies"_a, "damping"_a)
+          "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a)
       .def(
           "advance",
           [](ClothSolver& self, double time, double event, const MotionCallback& motion) {
@@ -145,14 +143,13 @@ void bind_cloth(nb::module_& m) {
             nb::gil_scoped_release release;
             const StepReport report = self.advance(time, event, [&](double at) -> Drive {
               nb::gil_scoped_acquire acquire;
-              auto [gravity, held, slopes, surfaces, bodies, damping] = motion(at);
-              now = {gravity, held, slopes, surfaces, bodies_of(bodies)};
-              return {now.gravity, now.held, now.slopes, now.surfaces, now.bodies, damping};
+              auto [gravity, held, surfaces, bodies, damping] = motion(at);
+              now = {gravity, held, surfaces, bodies_of(bodies)};
+              return {now.gravity, now.held, now.surfaces, now.bodies, damping};
             });
             return std::make_tuple(time, report);
           },
           "time"_a, "event"_a, "motion"_a)
-      .def("last_dt", &ClothSolver::last_dt)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)
@@ -168,22 +165,20 @@ void bind_cloth(nb::module_& m) {
       .def("masses", &ClothSolver::masses)
       .def(
           "energies",
-          [](ClothSolver& self, const Points3& positions, const Points3& slopes) {
-            const ClothSolver::Energies e = self.energies(positions, slopes);
+          [](ClothSolver& self, const Points3& positions) {
+            const ClothSolver::Energies e = self.energies(positions);
             return std::make_tuple(e.membrane, e.bending, e.gradient);
           },
-          "positions"_a, "slopes"_a)
-      .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "slopes"_a, "v"_a)
-      .def("softest", &ClothSolver::softest, "positions"_a, "slopes"_a)
+          "positions"_a)
+      .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "v"_a)
+      .def("softest", &ClothSolver::softest, "positions"_a)
       .def("part_error", &ClothSolver::part_error, "sticking"_a, "dt"_a)
-      .def("factor_error", &ClothSolver::factor_error, "positions"_a, "slopes"_a, "dt"_a)
+      .def("factor_error", &ClothSolver::factor_error, "positions"_a, "dt"_a)
       .def("phases",
            [](const ClothSolver& self) {
              const ClothPhases p = self.phases();
              return std::make_tuple(p.assembly, p.factorization, p.krylov, p.contact);
            })
-      .def("factor_flops", &ClothSolver::factor_flops)
-      .def("factor_floats", &ClothSolver::factor_floats)
       .def("kernel", &ClothSolver::kernel);
 }
 

@@ -6,12 +6,11 @@
 namespace sim_core {
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
-                   const std::vector<std::int32_t>& held, const Edges& clamped, int others, int bones,
-                   const FactorSettings& settings)
+                   const std::vector<std::int32_t>& held, int others, int bones, const FactorSettings& settings)
     : kernel(kernel_in),
-      stencils(bending_stencils(mesh, fabrics, clamped)),
-      compact_stencils(bending_stencils(mesh, fabrics, clamped, true)),
-      numbering(mesh, stencils, compact_stencils, held, static_cast<int>(clamped.rows()), others, bones),
+      stencils(bending_stencils(mesh, fabrics)),
+      compact_stencils(bending_stencils(mesh, fabrics, true)),
+      numbering(mesh, stencils, compact_stencils, held, others, bones),
       mass_of_vertex(Eigen::VectorXd::Zero(mesh.rest.rows())),
       mass(numbering.nodes, 0.0),
       own_damping(numbering.nodes, 0.0),

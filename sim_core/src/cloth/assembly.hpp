@@ -24,15 +24,14 @@ class Assembly {
  public:
   // `others`: vertices of surfaces; `bones`: points of skeletons.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, const Edges& clamped, int others, int bones,
-           const FactorSettings& settings = {});
+           const std::vector<std::int32_t>& held, int others, int bones, const FactorSettings& settings = {});
   Assembly(const Assembly&) = delete;
 
   const ClothKernel kernel;
   const std::vector<Stencil> stencils, compact_stencils;
   const Numbering numbering;
   Eigen::VectorXd mass_of_vertex;  // kg
-  Buffer<double> mass;             // (nodes), 0 for slopes and others
+  Buffer<double> mass;             // (nodes), 0 for others
   Buffer<double> own_damping;      // (nodes): of the fabrics, 1/s
 
   // At the positions last evaluated.
@@ -45,6 +44,8 @@ class Assembly {
   bool exact = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
+  // From now on stretching lags behind what it is at x by this share, none if 0: see kernels/membrane.hpp.
+  void lag_from(const Buffer<double>& x, double share) { membrane_.lag_from(kernel, x.data(), share); }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
   void set_diagonal(double dt, double damping);
   void clear_diagonal();

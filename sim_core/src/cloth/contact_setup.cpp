@@ -52,14 +52,14 @@ double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
   return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
 }
 
-// Sheets, and after them surfaces and skeletons; -1 of slopes.
+// Sheets, and after them surfaces and skeletons.
 std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces,
                                  const std::vector<Skeleton>& skeletons) {
   const std::vector<int> sheets = mesh.sheets();
   const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
   std::vector<int> out(numbering.nodes, -1);
   for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = sheets[i];
-  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  const int* others = numbering.node.data() + numbering.vertices;
   for (int i = 0; i < numbering.others; ++i) out[others[i]] = count + surfaces.surface_of_vertex[i];
   int next = numbering.nodes - numbering.bones, sheet = count + static_cast<int>(surfaces.crease.size());
   for (const Skeleton& skeleton : skeletons) {
@@ -121,7 +121,7 @@ std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numberin
   check_thickness(mesh, mesh.sheets(), materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
-  append(surfaces.triangles, numbering.node.data() + numbering.vertices + numbering.slopes, triangles);
+  append(surfaces.triangles, numbering.node.data() + numbering.vertices, triangles);
   Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, skeletons),
                   (materials.mu.array() >= 0.0).matrix(), bones_of(numbering, skeletons));
   const double cell = std::sqrt(2.0 * mesh.area.mean());
@@ -133,7 +133,7 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
                                                  const ContactMaterials& materials, const SurfaceMeshes& surfaces,
                                                  const SmoothSettings& settings) {
   Buffer<double> x(4L * numbering.nodes, 0.0);
-  const int* others = numbering.node.data() + numbering.vertices + numbering.slopes;
+  const int* others = numbering.node.data() + numbering.vertices;
   for (int i = 0; i < numbering.others; ++i) at_node(x, others[i]) = surfaces.positions.row(i).transpose();
   Triples triangles;
   append(surfaces.triangles, others, triangles);

@@ -25,7 +25,7 @@ StepController::StepController(Stepper& stepper, const StepControl& control, con
       control_(control),
       constants_(constants),
       finest_(level_of(control.finest, "finest")),
-      last_(finest_ + constants.halvings_near),
+      last_(finest_ + constants.halvings),
       level_(finest_),
       tick_(ticks(0)),
       cost_(last_ + 1, 0.0) {
@@ -81,9 +81,8 @@ StepReport StepController::advance(double& time, double event, const Motion& mot
     StepReport report;
     const bool solved = stepper_.attempt(dt, drive, report);
     const bool near = stepper_.near();
-    const int last = near ? last_ : finest_ + constants_.halvings;
     const double missed = stepper_.missed() / control_.error;
-    if (solved ? level_ < finest_ && missed > constants_.reject_at : level_ < last) {
+    if (solved ? level_ < finest_ && missed > constants_.reject_at : level_ < last_) {
       stepper_.reject();
       total.add_work(report);
       ++total.halvings;

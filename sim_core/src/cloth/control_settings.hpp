@@ -26,19 +26,15 @@ struct ControlSettings {
   double forgiven = 0.02;
   // Weight of the last step in the mean cost of its level: that of three steps. Sweep: within 6 %.
   double novelty = 0.3;
-  // Halvings of a step that is not solved beyond `finest`. Without it, royal-target dragged for 24 s at mu 0.8 cost
-  // 24.8 CPU s in place of 14.5. Sweep: nothing changes.
-  int halvings = 2;
-  // The same near other cloth, where halving is cheaper than other ways to solve a step. Sweep: 2 takes 1 % more
-  // iterations and 3 % more factors of a fold that is let down.
-  int halvings_near = 4;
+  // Halvings of a step that is not solved beyond `finest`. Without any, royal-target dragged for 24 s at mu 0.8 cost
+  // 24.8 CPU s in place of 14.5. Sweep: 2 takes 1 % more iterations and 3 % more factors of a fold that is let down.
+  int halvings = 4;
 
   template <class Self, class Call>
   static void each(Self& s, const Call& call) {
     call("reject_at", s.reject_at), call("grow_at", s.grow_at), call("factor_work", s.factor_work),
         call("newton_work", s.newton_work), call("rejected_work", s.rejected_work), call("dearer", s.dearer),
-        call("forgiven", s.forgiven), call("novelty", s.novelty), call("halvings", s.halvings),
-        call("halvings_near", s.halvings_near);
+        call("forgiven", s.forgiven), call("novelty", s.novelty), call("halvings", s.halvings);
   }
 };
 

@@ -20,8 +20,7 @@ Correction::Correction(Assembly& assembly, const ClothSettings& settings, const 
       work_((2 * krylov_max + 1) * 4L * assembly.numbering.free_nodes + 64, 0.0f),
       image_(change) {}
 
-bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, double krylov_tolerance,
-                       StepReport& report) {
+bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, StepReport& report) {
   if (pairs) force_ = contact_.force;
   if (!pairs || !pairs->active()) {
     StaleFactor& factor = factors.latest();
@@ -29,7 +28,7 @@ bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, do
       const Stopwatch watch(phases_.factorization);
       report.factorizations += factor.renew(assembly_, x, contact_, dt, settings_);
     }
-    const KrylovResult solved = solve_linear(pairs, factor.view(), krylov_tolerance);
+    const KrylovResult solved = solve_linear(pairs, factor.view(), settings_.krylov_tolerance);
     factor.spent(solved.iterations);
     report.krylov += solved.iterations;
   } else {

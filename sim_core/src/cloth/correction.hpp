@@ -21,9 +21,9 @@ class Correction {
   Buffer<float> change;  // of the free nodes, (free nodes, 4), m
 
   // Solves J change = -F for a step of dt, in the directions that contact leaves free; contact prescribes the others.
-  // `pairs` may be null. GMRES stops at `krylov_tolerance` of the right-hand side. Repeats with the active set that the
-  // solution asks for; returns whether all rounds of that were taken.
-  bool solve(ContactSet* pairs, const Buffer<double>& x, double dt, double krylov_tolerance, StepReport& report);
+  // `pairs` may be null. Repeats with the active set that the solution asks for; returns whether all rounds of that
+  // were taken.
+  bool solve(ContactSet* pairs, const Buffer<double>& x, double dt, StepReport& report);
 
  private:
   void solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt, StepReport& report);

@@ -1,6 +1,7 @@
 #include "cloth/membrane.hpp"
 
 #include <Eigen/LU>
+#include <algorithm>
 #include <cmath>
 #include <vector>
 
@@ -79,8 +80,16 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
     law_.insert(law_.end(), in_y.data(), in_y.data() + 20);  // column by column
     tabulated_.push_back(!table.constant());
   }
-  data_ = {groups,         nodes_.data(), shape_.data(),     area_.data(),
-           fabric_.data(), law_.data(),   tabulated_.data(), slots_.data()};
+  data_ = {groups,      nodes_.data(),     shape_.data(), area_.data(), fabric_.data(),
+           law_.data(), tabulated_.data(), slots_.data(), nullptr};
+}
+
+void Membrane::lag_from(const ClothKernel& kernel, const double* x, double share) {
+  data_.lag = nullptr;
+  if (share == 0.0 || std::none_of(tabulated_.begin(), tabulated_.end(), [](char one) { return one != 0; })) return;
+  lag_.resize(9L * membrane_lanes * data_.groups);
+  kernel.membrane_lag(data_, x, share, lag_.data());
+  data_.lag = lag_.data();
 }
 
 }  // namespace sim_core

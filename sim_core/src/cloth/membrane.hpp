@@ -14,10 +14,11 @@ class Membrane {
   Membrane(const Membrane&) = delete;
 
   const MembraneData& data() const { return data_; }
+  void lag_from(const ClothKernel& kernel, const double* x, double share);
 
  private:
   Buffer<int> nodes_, slots_, fabric_;
-  Buffer<double> shape_, area_, law_;
+  Buffer<double> shape_, area_, law_, lag_;
   Buffer<char> tabulated_;
   MembraneData data_{};
 };

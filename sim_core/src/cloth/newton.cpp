@@ -140,7 +140,7 @@ void Newton::choose_matrix(const Buffer<double>& x, double before, double now, b
 }
 
 StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations,
-                          StepReport& report, double krylov_tolerance, bool smoothly) {
+                          StepReport& report, bool smoothly) {
   begin(problem, x, from_rest, smoothly);
   Norms norms = look(problem, x);
   if (pairs) pairs->mark_best();
@@ -160,19 +160,17 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     // A step is solved at least once: one that is taken as predicted would creep within the tolerance.
     if (iteration > 0 && !smoothly && norms.largest <= settings_.tolerance && arrived(x)) break;
     if (!std::isfinite(norms.squared)) break;
-    if (smoothly && norms.squared > constants_.last_growth * constants_.last_growth * first) break;
     strained = strained_ ? strained + 1 : 0;
     if (strained > strained_max && iterations < settings_.newton_max) break;
     ++report.newton;
-    strained_ = correction.solve(pairs.get(), x, problem.dt, krylov_tolerance, report);
+    strained_ = correction.solve(pairs.get(), x, problem.dt, report);
     // Along the line, non-monotone [Grippo et al. 1986].
     const double limit = *std::max_element(window.begin(), window.end());
     double share = pairs && pairs->smoothing > 0.0 ? reach() : 1.0;
     Norms next;
     for (int cut = 0;; ++cut) {
       next = move(problem, x, share, smoothly);
-      if (cut == constants_.cuts_max || (iteration == 0 && resumed)) break;
-      if (next.squared <= limit * (cut + 1 < constants_.cuts_max ? 1.0 : constants_.last_growth)) break;
+      if (next.squared <= limit || cut == constants_.cuts_max || (iteration == 0 && resumed)) break;
       share *= 0.5;
     }
     for (int i = 0; i < assembly_.numbering.free_nodes; ++i) report.flips += contact.mode[i] != modes[i];

@@ -36,12 +36,11 @@ class Newton {
   int strained_max = 0;
 
   // Solves for the free nodes of x, or leaves the best found in it; its held nodes are at their ends. `from_rest`:
-  // begins at the start of the step, not where the velocity leads. GMRES stops at `krylov_tolerance` of its right-hand
-  // side. `smoothly`: by way of a law of pairs that is smooth, and ever less so; that takes more iterations and ends
-  // where the other way does not. Nothing crosses on the way from the start of the step, held nodes included, which
-  // arrive as pairs let them.
+  // begins at the start of the step, not where the velocity leads. `smoothly`: by way of a law of pairs that is smooth,
+  // and ever less so; that takes more iterations and ends where the other way does not. Nothing crosses on the way from
+  // the start of the step, held nodes included, which arrive as pairs let them.
   StepOutcome solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations, StepReport& report,
-                    double krylov_tolerance, bool smoothly);
+                    bool smoothly);
 
   // Where the velocity leads the free nodes of x, or the start, out of the bodies and surfaces; these are at `ends`.
   void predict(const StepProblem& problem, const Buffer<double>& ends, Buffer<double>& x, bool from_rest);

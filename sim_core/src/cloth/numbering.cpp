@@ -26,13 +26,12 @@ std::vector<int> free_of(int vertices, const std::vector<std::int32_t>& held) {
 
 // Free vertices, numbered by `local`, that share a stencil.
 Graph coupled(const std::vector<Stencil>& stencils, const std::vector<int>& local, int count) {
-  const int vertices = static_cast<int>(local.size());
   std::vector<std::set<int>> sets(count);
   for (const Stencil& stencil : stencils) {
     for (int a : stencil.nodes) {
-      if (a >= vertices || local[a] < 0) continue;
+      if (local[a] < 0) continue;
       for (int b : stencil.nodes) {
-        if (b < vertices && local[b] >= 0) sets[local[a]].insert(local[b]);
+        if (local[b] >= 0) sets[local[a]].insert(local[b]);
       }
     }
   }
@@ -44,12 +43,11 @@ Graph coupled(const std::vector<Stencil>& stencils, const std::vector<int>& loca
 }  // namespace
 
 Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
-                     const std::vector<std::int32_t>& held_vertices, int slopes_in, int others_in, int bones_in)
+                     const std::vector<std::int32_t>& held_vertices, int others_in, int bones_in)
     : vertices(static_cast<int>(mesh.rest.rows())),
-      slopes(slopes_in),
       others(others_in),
       bones(bones_in),
-      nodes(vertices + slopes + others + bones) {
+      nodes(vertices + others + bones) {
   const std::vector<int> free_vertices = free_of(vertices, held_vertices);
   free_nodes = static_cast<int>(free_vertices.size());
   std::vector<int> local(vertices, -1);

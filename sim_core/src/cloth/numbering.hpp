@@ -1,5 +1,5 @@
-// Numbers of nodes: free vertices in the order of elimination, then held vertices, then the slopes at clamped edges,
-// then the vertices of surfaces and the points of skeletons, which are no cloth and move as prescribed.
+// Numbers of nodes: free vertices in the order of elimination, then held vertices, then the vertices of
+// surfaces and the points of skeletons, which are no cloth and move as prescribed.
 #pragma once
 
 #include <cstdint>
@@ -11,15 +11,15 @@
 namespace sim_core {
 
 struct Numbering {
-  int vertices, slopes, others, bones, nodes, free_nodes;
-  std::vector<int> node, vertex;  // of a vertex, a slope, another or a point of a skeleton, and back
+  int vertices, others, bones, nodes, free_nodes;
+  std::vector<int> node, vertex;  // of a vertex, another or a point of a skeleton, and back
   std::vector<int> held;          // nodes of the held vertices, in the caller's order
   Dissection dissection;
   Pattern bending, compact_bending, membrane;  // of the free nodes
 
   // Throws std::invalid_argument, naming `held`.
   Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
-            const std::vector<std::int32_t>& held, int slopes, int others, int bones);
+            const std::vector<std::int32_t>& held, int others, int bones);
 };
 
 }  // namespace sim_core

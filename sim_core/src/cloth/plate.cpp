@@ -87,26 +87,13 @@ SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Ve
 
 }  // namespace
 
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, const Edges& clamped,
-                                      bool compact) {
-  const int vertices = static_cast<int>(mesh.rest.rows()), count = static_cast<int>(mesh.triangles.rows());
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, bool compact) {
+  const int count = static_cast<int>(mesh.triangles.rows());
   std::vector<std::vector<int>> around(count);
-  std::map<std::pair<int, int>, int> edge_of;
-  for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
-    const ClothMesh::Edge& edge = mesh.edges[e];
-    edge_of[{edge.a, edge.b}] = static_cast<int>(e);
+  for (const ClothMesh::Edge& edge : mesh.edges) {
     if (edge.boundary()) continue;
     around[edge.triangle[0]].push_back(edge.triangle[1]);
     around[edge.triangle[1]].push_back(edge.triangle[0]);
-  }
-  std::vector<int> slope_of(mesh.edges.size(), -1);
-  for (Eigen::Index i = 0; i < clamped.rows(); ++i) {
-    const int a = std::min(clamped(i, 0), clamped(i, 1)), b = std::max(clamped(i, 0), clamped(i, 1));
-    const auto found = edge_of.find({a, b});
-    if (found == edge_of.end() || !mesh.edges[found->second].boundary()) {
-      refuse(text("clamped: must be edges of the boundary, got (", a, ", ", b, ")"));
-    }
-    slope_of[found->second] = vertices + static_cast<int>(i);
   }
   std::vector<SlopeFit> slopes(mesh.edges.size());
   for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
@@ -138,18 +125,14 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabr
       const Eigen::Vector3d direction = length[c] / mesh.area[t] *
                                         Eigen::Vector3d(normal[c].x() * normal[c].x(), normal[c].y() * normal[c].y(),
                                                         2.0 * normal[c].x() * normal[c].y());
-      if (edge.boundary() && slope_of[e] < 0) {
+      if (edge.boundary()) {
         open.push_back(direction);
         continue;
       }
-      if (edge.boundary()) {
-        add(slope_of[e], direction);
-      } else {
-        const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
-        const double sign = normal_of(along).dot(normal[c]) > 0.0 ? 1.0 : -1.0;
-        for (std::size_t i = 0; i < slopes[e].nodes.size(); ++i) {
-          add(slopes[e].nodes[i], sign * slopes[e].weights[i] * direction);
-        }
+      const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
+      const double sign = normal_of(along).dot(normal[c]) > 0.0 ? 1.0 : -1.0;
+      for (std::size_t i = 0; i < slopes[e].nodes.size(); ++i) {
+        add(slopes[e].nodes[i], sign * slopes[e].weights[i] * direction);
       }
       for (int i = 0; i < 3; ++i) add(mesh.triangles(t, i), -normal[c].dot(gradient[i]) * direction);
     }

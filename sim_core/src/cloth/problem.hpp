@@ -41,6 +41,7 @@ struct MembraneData {
   const double* law;      // (fabrics, 24): A, B, C, D at no strain, then five coefficients of each, N/m
   const char* tabulated;  // (fabrics): whether these five are not all zero
   const int* slots;       // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for held nodes
+  const double* lag;      // (groups, 9, lanes): strain at the start of a step, and what holds it there; null: nothing
 };
 
 // Of each triangle the second derivatives (H11, H22, 2 H12) are linear in the positions of the nodes of its stencil.
@@ -153,6 +154,7 @@ struct ClothKernel {
   const char* name;
   // Adds gradients and returns the energy. `blocks` and `folds` may be null.
   double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, MembranePart part);
+  void (*membrane_lag)(const MembraneData&, const double* x, double share, double* lag);
   double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening, FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
   void (*apply)(const ClothMatrix&, const float* x, float* y);

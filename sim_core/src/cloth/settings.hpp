@@ -20,10 +20,10 @@ struct ClothSettings {
 
 struct StepReport {
   bool converged = true;
-  double residual = 0.0;           // N: worst over the substeps
+  double residual = 0.0;           // N: worst over the parts
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
   int missed = 0;                  // of those, by steps of the controller that are further off than it allows
-  int substeps = 0, newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
+  int newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
   double sharpest = std::numeric_limits<double>::infinity();        // cells: least radius of a skeleton that bears
   double factorizations = 0.0;                                      // whole ones, and shares of those in part
@@ -41,7 +41,6 @@ struct StepReport {
     steps += other.steps;
     unconverged += other.unconverged;
     missed += other.missed;
-    substeps += other.substeps;
     converged = converged && other.converged;
     if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
     contacts = other.contacts;

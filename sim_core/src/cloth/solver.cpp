@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numeric>
 
 #include "cloth/contact_setup.hpp"
 #include "cloth/diagnostics.hpp"
@@ -24,14 +23,13 @@ struct ClothSolver::Impl {
   const Numbering& numbering;
 
   Impl(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
-       const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-       const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
-       const SurfaceMeshes& surfaces_in, const Constants& constants, const std::vector<Body>& bodies = {},
-       const std::vector<Skeleton>& skeletons = {})
+       const std::vector<std::int32_t>& held, const ClothSettings& settings, const StepControl& control,
+       const std::string& kernel, const ContactMaterials& touch, const SurfaceMeshes& surfaces_in,
+       const Constants& constants, const std::vector<Body>& bodies = {}, const std::vector<Skeleton>& skeletons = {})
       : mesh(rest, triangles),
         surfaces(surfaces_in),
         materials(with_skeletons(touch, skeletons, bodies, cell_of(mesh))),
-        assembly(cloth_kernel_named(kernel), mesh, Fabrics(mesh, fabrics), held, clamped,
+        assembly(cloth_kernel_named(kernel), mesh, Fabrics(mesh, fabrics), held,
                  static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons), constants.factor),
         stepper(mesh, assembly, settings, constants),
         controller(stepper, control, constants.control),
@@ -57,20 +55,16 @@ struct ClothSolver::Impl {
     return static_cast<int>(count);
   }
 
-  void load(const Points3& positions, const Points3& slopes, Buffer<double>& into) const {
+  void load(const Points3& positions, Buffer<double>& into) const {
     if (positions.rows() != numbering.vertices) refuse("positions: must have a row for each vertex");
-    if (slopes.rows() != numbering.slopes) refuse("slopes: must have a row for each clamped edge");
-    if (!positions.allFinite() || !slopes.allFinite()) refuse("positions: must be finite");
+    if (!positions.allFinite()) refuse("positions: must be finite");
     for (int i = 0; i < numbering.vertices; ++i) at_node(into, numbering.node[i]) = positions.row(i).transpose();
-    for (int i = 0; i < numbering.slopes; ++i) {
-      at_node(into, numbering.node[numbering.vertices + i]) = slopes.row(i).transpose();
-    }
   }
 
   // The state with other positions.
-  Buffer<double> at(const Points3& positions, const Points3& slopes) const {
+  Buffer<double> at(const Points3& positions) const {
     Buffer<double> out = stepper.x;
-    load(positions, slopes, out);
+    load(positions, out);
     return out;
   }
 
@@ -80,7 +74,7 @@ struct ClothSolver::Impl {
     for (int i = 0; i < numbering.others; ++i) at_node(into, other(i)) = positions.row(i).transpose();
   }
 
-  int other(int i) const { return numbering.node[numbering.vertices + numbering.slopes + i]; }
+  int other(int i) const { return numbering.node[numbering.vertices + i]; }
 
   // Whether the cloth crosses anything that it touches.
   bool crosses(const Points3& positions, const Points3& others) const {
@@ -101,12 +95,12 @@ struct ClothSolver::Impl {
 };
 
 ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
-                         const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
+                         const std::vector<std::int32_t>& held, const ClothSettings& settings,
                          const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
                          const SurfaceMeshes& surfaces, const Constants& constants)
     : make_([=](const std::vector<Body>& bodies, const std::vector<Skeleton>& skeletons) {
-        return std::make_unique<Impl>(rest, triangles, fabrics, held, clamped, settings, control, kernel, touch,
-                                      surfaces, constants, bodies, skeletons);
+        return std::make_unique<Impl>(rest, triangles, fabrics, held, settings, control, kernel, touch, surfaces,
+                                      constants, bodies, skeletons);
       }),
       constants_(constants.skeleton),
       impl_(make_({}, {})) {}
@@ -130,25 +124,25 @@ void ClothSolver::meet(const std::vector<Body>& bodies) {
   impl_ = std::move(next);
 }
 
-void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& slopes,
-                            const Points3& surfaces, const std::vector<Body>& bodies, bool begins) {
-  impl_->load(positions, slopes, impl_->stepper.x);
+void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& surfaces,
+                            const std::vector<Body>& bodies, bool begins) {
+  impl_->load(positions, impl_->stepper.x);
   impl_->load_surfaces(surfaces, impl_->stepper.x);
   if (impl_->newton.pairs && impl_->crosses(positions, surfaces)) {
     refuse("positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
   if (begins) impl_->stepper.refuse_inside(bodies);
-  impl_->load(velocities, Points3::Zero(slopes.rows(), 3), impl_->stepper.v);
+  impl_->load(velocities, impl_->stepper.v);
   impl_->stepper.restart({});
   meet(bodies);
   impl_->stepper.restart(bodies);
   impl_->controller.restart();
 }
 
-StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
-                             const Points3& surfaces, const std::vector<Body>& bodies, double damping) {
+StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
+                             const std::vector<Body>& bodies, double damping) {
   meet(bodies);
-  return impl_->stepper.step(dt, {gravity, held, slopes, surfaces, bodies, damping});
+  return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
 StepReport ClothSolver::advance(double& time, double event, const Motion& motion) {
@@ -156,7 +150,6 @@ StepReport ClothSolver::advance(double& time, double event, const Motion& motion
   return impl_->controller.advance(time, event, motion);
 }
 
-double ClothSolver::last_dt() const { return impl_->stepper.last_dt(); }
 Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
 
 Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x); }
@@ -205,8 +198,7 @@ Points3 ClothSolver::surface_forces() const {
     const Foot& foot = contact.surfaces->foot(i);
     for (int k = 0; k < 3; ++k) {
       const int vertex = impl_->numbering.vertex[contact.surfaces->triangles()[foot.triangle][k]];
-      out.row(vertex - impl_->numbering.vertices - impl_->numbering.slopes) -=
-          foot.weights[k] * at_node(impl_->newton.residual, i).transpose();
+      out.row(vertex - impl_->numbering.vertices) -= foot.weights[k] * at_node(impl_->newton.residual, i).transpose();
     }
   }
   return out;
@@ -223,10 +215,7 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
   const auto count = static_cast<Eigen::Index>(some.size());
   PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), {}, {}};
   for (Eigen::Index p = 0; p < count; ++p) {
-    for (int c = 0; c < 4; ++c) {
-      const int vertex = numbering.vertex[some[p]->who.node[c]];
-      out.vertices(p, c) = vertex < numbering.vertices ? vertex : vertex - numbering.slopes;
-    }
+    for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->who.node[c]];
     out.weights.row(p) = some[p]->weights.transpose();
     out.forces.row(p) = some[p]->at.force.transpose();
     out.distance[p] = some[p]->at.gap + some[p]->thickness;
@@ -237,19 +226,19 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
   return out;
 }
 
-ClothSolver::Energies ClothSolver::energies(const Points3& positions, const Points3& slopes) {
-  impl_->newton.evaluate(impl_->at(positions, slopes), false);
+ClothSolver::Energies ClothSolver::energies(const Points3& positions) {
+  impl_->newton.evaluate(impl_->at(positions), false);
   const Assembly& assembly = impl_->assembly;
   return {assembly.membrane_energy, assembly.bending_energy, impl_->unload(assembly.gradient)};
 }
 
-Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v) {
+Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& v) {
   const Numbering& numbering = impl_->numbering;
   Buffer<float> in(4 * numbering.free_nodes);
   for (int i = 0; i < numbering.free_nodes; ++i) {
     at_node(in, i) = v.row(numbering.vertex[i]).transpose().cast<float>();
   }
-  const Buffer<float> out = sim_core::stiffness_times(impl_->assembly, impl_->newton, impl_->at(positions, slopes), in);
+  const Buffer<float> out = sim_core::stiffness_times(impl_->assembly, impl_->newton, impl_->at(positions), in);
   Points3 result = Points3::Zero(numbering.vertices, 3);
   for (int i = 0; i < numbering.free_nodes; ++i) {
     result.row(numbering.vertex[i]) = at_node(out, i).cast<double>().transpose();
@@ -257,12 +246,12 @@ Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& sl
   return result;
 }
 
-double ClothSolver::softest(const Points3& positions, const Points3& slopes) {
-  return softest_mode(impl_->assembly, impl_->newton, impl_->at(positions, slopes));
+double ClothSolver::softest(const Points3& positions) {
+  return softest_mode(impl_->assembly, impl_->newton, impl_->at(positions));
 }
 
-double ClothSolver::factor_error(const Points3& positions, const Points3& slopes, double dt) {
-  return sim_core::factor_error(impl_->assembly, impl_->newton, impl_->at(positions, slopes), dt);
+double ClothSolver::factor_error(const Points3& positions, double dt) {
+  return sim_core::factor_error(impl_->assembly, impl_->newton, impl_->at(positions), dt);
 }
 
 std::pair<double, double> ClothSolver::part_error(const std::vector<std::int32_t>& sticking, double dt) {
@@ -273,13 +262,6 @@ std::pair<double, double> ClothSolver::part_error(const std::vector<std::int32_t
 
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }
 ClothPhases ClothSolver::phases() const { return impl_->newton.phases; }
-double ClothSolver::factor_flops() const {
-  const std::vector<double>& work = impl_->newton.correction.factors.latest().storage().work;
-  return std::accumulate(work.begin(), work.end(), 0.0);
-}
-std::size_t ClothSolver::factor_floats() const {
-  return impl_->newton.correction.factors.latest().storage().tiles.size();
-}
 std::string ClothSolver::kernel() const { return impl_->assembly.kernel.name; }
 
 }  // namespace sim_core

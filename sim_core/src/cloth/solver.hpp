@@ -23,28 +23,26 @@ namespace sim_core {
 class ClothSolver {
  public:
   // `kernel`: level of the kernels, "" for the widest that this processor runs. `fabrics`: one, or one of each sheet.
-  // `held`: vertices whose positions are prescribed; `clamped`: boundary edges whose outward slope is prescribed;
-  // `touch`: contact among the sheets and then the surfaces.
+  // `held`: vertices whose positions are prescribed; `touch`: contact among the sheets and then the surfaces.
   ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
-              const std::vector<std::int32_t>& held, const Edges& clamped, const ClothSettings& settings,
-              const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
-              const SurfaceMeshes& surfaces = {}, const Constants& constants = {});
+              const std::vector<std::int32_t>& held, const ClothSettings& settings, const StepControl& control,
+              const std::string& kernel, const ContactMaterials& touch, const SurfaceMeshes& surfaces = {},
+              const Constants& constants = {});
   ~ClothSolver();
 
   // `surfaces`: positions of their vertices; `bodies`: where they are, or none: they do not move in the next step.
   // `begins`: refuses free vertices inside a body.
-  void set_state(const Points3& positions, const Points3& velocities, const Points3& slopes, const Points3& surfaces,
+  void set_state(const Points3& positions, const Points3& velocities, const Points3& surfaces,
                  const std::vector<Body>& bodies = {}, bool begins = true);
 
-  // `gravity`: acceleration of each vertex; `held`, `slopes` and `surfaces`: at the end of the step; bodies keep their
+  // `gravity`: acceleration of each vertex; `held` and `surfaces`: at the end of the step; bodies keep their
   // number and order from step to step. `damping`: mass-proportional, 1/s, on top of the fabrics' own.
-  StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& slopes,
-                  const Points3& surfaces, const std::vector<Body>& bodies, double damping);
+  StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
+                  const std::vector<Body>& bodies, double damping);
 
   // A step of the controller's choice: see StepController::advance.
   StepReport advance(double& time, double event, const Motion& motion);
-  // Of the last step: its length [s], and the change of the cloth's momentum over it [N].
-  double last_dt() const;
+  // Change of the cloth's momentum over the last step, N.
   Eigen::Vector3d momentum_rate() const;
 
   Points3 positions() const;
@@ -74,21 +72,19 @@ class ClothSolver {
     double membrane, bending;
     Points3 gradient;
   };
-  Energies energies(const Points3& positions, const Points3& slopes);
+  Energies energies(const Points3& positions);
   // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
-  Points3 stiffness_times(const Points3& positions, const Points3& slopes, const Points3& v);
+  Points3 stiffness_times(const Points3& positions, const Points3& v);
   // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.
-  double softest(const Points3& positions, const Points3& slopes);
+  double softest(const Points3& positions);
   // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
-  double factor_error(const Points3& positions, const Points3& slopes, double dt);
+  double factor_error(const Points3& positions, double dt);
   // Largest difference between a factor whose parts that hold these vertices, which stick, were made anew, and a whole
   // one, over its largest number; and the share that was made.
   std::pair<double, double> part_error(const std::vector<std::int32_t>& sticking, double dt);
 
   const Eigen::VectorXd& masses() const;
   ClothPhases phases() const;
-  double factor_flops() const;
-  std::size_t factor_floats() const;
   std::string kernel() const;
 
  private:

@@ -79,12 +79,8 @@ void Stepper::drive_nodes(double begin, double end, double part, const Drive& dr
     const int node = numbering.held[h];
     at_node(x, node) += share * (drive.held.row(h).transpose() - at_node(x, node));
   }
-  for (int s = 0; s < numbering.slopes; ++s) {
-    const int node = numbering.node[numbering.vertices + s];
-    at_node(x, node) += share * (drive.slopes.row(s).transpose() - at_node(x, node));
-  }
   for (int o = 0; o < numbering.others; ++o) {
-    const int node = numbering.node[numbering.vertices + numbering.slopes + o];
+    const int node = numbering.node[numbering.vertices + o];
     at_node(x, node) += share * (drive.others.row(o).transpose() - at_node(x, node));
   }
   place_skeletons(bodies);
@@ -102,13 +98,12 @@ bool Stepper::near() const { return newton.pairs && newton.pairs->relevant(); }
 StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report) {
   x = driven;
   newton.pairs->stiff = true;
-  const StepOutcome outcome =
-      newton.solve(problem, x, false, patience(near()), report, settings_.krylov_tolerance, false);
+  const StepOutcome outcome = newton.solve(problem, x, false, patience(near()), report, false);
   newton.pairs->stiff = false;
   if (outcome.converged) return outcome;
   x = driven;
   assembly_.definite = true;
-  return newton.solve(problem, x, false, constants_.smooth_iterations, report, settings_.krylov_tolerance, true);
+  return newton.solve(problem, x, false, constants_.smooth_iterations, report, true);
 }
 
 // Solves for the state at the end of a part of a step. Where that fails it does nothing, unless no part is shorter:
@@ -129,14 +124,12 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
   const StepProblem problem{part, drive.damping, start_, inertial_, v, at_start, at_end};
   const bool deepest = halvings_ == settings_.halvings_max;
   assembly_.definite = halvings_ > 0;  // where steps are hard, the matrix of a convex energy leads on more surely
-  StepOutcome outcome = newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(near()), report,
-                                     settings_.krylov_tolerance, false);
-  // Modes of contact that flip to and fro under exact solves settle under loose ones. Those of pairs do not.
+  StepOutcome outcome =
+      newton.solve(problem, x, false, deepest ? settings_.newton_max : patience(near()), report, false);
   if (!outcome.converged && near()) outcome = solve_hard(problem, driven, report);
   if (!outcome.converged && (deepest || !near())) {
     x = driven;
-    outcome = newton.solve(problem, x, deepest, settings_.newton_max, report,
-                           std::max(constants_.loose, settings_.krylov_tolerance), false);
+    outcome = newton.solve(problem, x, deepest, settings_.newton_max, report, false);
   }
   if (!outcome.converged && !deepest) {
     x = start_;
@@ -167,7 +160,6 @@ void Stepper::take(double dt, double residual, const Drive& drive, const std::ve
     newton.pairs->keep();
     report.least_distance = std::min(report.least_distance, newton.pairs->least_distance());
   }
-  ++report.substeps;
   if (!std::isnan(report.residual) && !(residual <= report.residual)) report.residual = residual;
   momentum_rate_.setZero();
   for (int i = 0; i < assembly_.numbering.nodes; ++i) {
@@ -175,7 +167,6 @@ void Stepper::take(double dt, double residual, const Drive& drive, const std::ve
     at_node(v, i) = (at_node(x, i) - at_node(start_, i) - forced(i, at_start)) / dt;
     momentum_rate_ += assembly_.mass[i] / dt * (at_node(v, i) - before);
   }
-  last_dt_ = dt;
   report.seen.add(watch_.see({start_, x, v, drive.gravity, at_start, at_end}, newton));
 }
 
@@ -192,7 +183,9 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, x, predicted_, false);
   newton.strained_max = constants_.strained_soon;
-  tried_ = newton.solve(problem, x, false, patience(near()), report, settings_.krylov_tolerance, false);
+  assembly_.lag_from(start_, constants_.lag);
+  tried_ = newton.solve(problem, x, false, patience(near()), report, false);
+  assembly_.lag_from(start_, 0.0);
   newton.strained_max = constants_.strained_long;
   return tried_.converged;
 }
@@ -231,12 +224,9 @@ void Stepper::check(double dt, const Drive& drive) {
   if (drive.held.rows() != static_cast<Eigen::Index>(numbering.held.size())) {
     refuse("held: must have a row for each held vertex");
   }
-  if (drive.slopes.rows() != numbering.slopes) refuse("slopes: must have a row for each clamped edge");
   if (drive.others.rows() != numbering.others) refuse("surfaces: must keep their vertices");
   if (!drive.others.allFinite()) refuse("surfaces: positions must be finite");
-  if (!drive.held.allFinite() || !drive.slopes.allFinite() || !drive.gravity.allFinite()) {
-    refuse("held, slopes and gravity: must be finite");
-  }
+  if (!drive.held.allFinite() || !drive.gravity.allFinite()) refuse("held and gravity: must be finite");
   if (!started_) {
     refuse_inside(drive.bodies);
     bodies_before_ = drive.bodies;

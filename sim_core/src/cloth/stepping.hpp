@@ -12,7 +12,6 @@ namespace sim_core {
 struct Drive {
   const Points3& gravity;  // (V, 3), m/s^2
   const Points3& held;     // (held, 3), m
-  const Points3& slopes;   // (clamped edges, 3)
   const Points3& others;   // (vertices of surfaces, 3), m
   const std::vector<Body>& bodies;
   double damping;  // 1/s: on top of the fabrics' own
@@ -48,8 +47,7 @@ class Stepper {
 
   // Of the last step: how many there were.
   int bodies() const { return static_cast<int>(bodies_before_.size()); }
-  // Of the last step: its length [s], and the change of momentum over it [N].
-  double last_dt() const { return last_dt_; }
+  // Change of momentum over the last step, N.
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
 
   // Throws std::invalid_argument where a free vertex is inside a body.
@@ -74,7 +72,7 @@ class Stepper {
   SteppingSettings constants_;
   Buffer<double> start_, inertial_, predicted_;
   StepOutcome tried_{false, 0.0};
-  double tried_dt_ = 0.0, last_dt_ = 0.0;
+  double tried_dt_ = 0.0;
   Eigen::Vector3d momentum_rate_ = Eigen::Vector3d::Zero();
   std::vector<Body> bodies_before_;
   bool started_ = false;

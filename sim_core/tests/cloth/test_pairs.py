@@ -24,7 +24,6 @@ ONE_ITERATION = replace(
         "contact.length_tolerance": 1.0,
         "newton.linear_share": 1e-12,
         "newton.cuts_max": 1.0,
-        "newton.last_growth": 1e30,
     },
 )
 H = 1e-3

@@ -26,9 +26,7 @@ class Sheet:
         """Energy per area and second Piola-Kirchhoff stress (2, 2) [N/m] at Green's strain (2, 2)."""
         values, axes = np.linalg.eigh(np.eye(2) + 2.0 * strain)
         gradient = axes @ np.diag(np.sqrt(values)) @ axes.T
-        energy, _, forces = self.cloth._solver.energies(
-            np.pad(MESH.rest @ gradient, ((0, 0), (0, 1))), np.zeros((0, 3))
-        )
+        energy, _, forces = self.cloth._solver.energies(np.pad(MESH.rest @ gradient, ((0, 0), (0, 1))))
         return energy / SIDE**2, np.linalg.solve(gradient, np.asarray(forces)[:, :2].T @ MESH.rest / SIDE**2)
 
 

@@ -83,6 +83,8 @@ class Reason(StrEnum):
     # The same, of cloth: the check of the solver that failed.
     not_finite = "not_finite"
     unconverged = "unconverged"
+    budget = "budget"
+    missed = "missed"
     crossings = "crossings"
     contact_gain = "contact_gain"
     stretch = "stretch"
@@ -114,6 +116,8 @@ _OF_SAMPLE = {
     Reason.poor_pictures,
     Reason.not_finite,
     Reason.unconverged,
+    Reason.budget,
+    Reason.missed,
     Reason.crossings,
     Reason.contact_gain,
     Reason.stretch,

@@ -63,6 +63,25 @@ CHECKS = (
         "the preset allows a share of 0.002",
     ),
     Check(
+        "budget",
+        "most iterations of Newton's method in a second of scene time, over those that the preset allows; the run ends "
+        "beyond",
+        "1",
+        lambda seen: seen.cloth.spent,
+        1.0,
+        "where holders, bodies and cloth cannot all have their way, steps take ever more",
+    ),
+    Check(
+        "missed",
+        "shortest steps that are further off than twice the preset's step error, over those that fit the scene",
+        "1",
+        lambda seen: _ratio(
+            seen.cloth.missed_steps * seen.cloth.preset.longest_step, seen.cloth.preset.finest * seen.cloth.time
+        ),
+        0.5,
+        "drags reach 0 and falls 0.13 with `certified`; a preset that is too coarse for its scene reaches 1",
+    ),
+    Check(
         "crossings",
         "pairs of triangles that cross in a frame, where cloth touches itself",
         "1",

@@ -46,8 +46,6 @@ class Cloth:
             their first vertices.
         preset: Solver settings.
         held: (K,) vertices whose positions are prescribed.
-        clamped: (E, 2) boundary edges across which the slope is prescribed: the derivative of the position along the
-            outward normal of the rest plane.
         self_contact: Contact within and between sheets. None: off, the cloth passes through itself.
         surfaces: Triangles that it touches.
         force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the lightest fabric.
@@ -65,7 +63,6 @@ class Cloth:
         preset: SolverSettings,
         *,
         held: ArrayLike = (),
-        clamped: ArrayLike | None = None,
         self_contact: SelfContact | None = None,
         surfaces: Sequence[Surface] = (),
         force_scale: float | None = None,
@@ -75,8 +72,6 @@ class Cloth:
         self.fabrics = (fabric,) if isinstance(fabric, Fabric) else tuple(fabric)
         """One, or one for each sheet."""
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
-        edges = np.empty((0, 2), np.int32) if clamped is None else np.asarray(clamped, dtype=np.int32)
-        self.slopes = np.zeros((len(edges), 3))
         check_mesh(mesh.rest, mesh.triangles)
         extent = float(np.ptp(mesh.rest, axis=0).max())
         if extent > EXTENT_MAX:
@@ -97,7 +92,6 @@ class Cloth:
             mesh.rest,
             mesh.triangles,
             [(fabric.density, fabric.stretching, fabric.rigidity, fabric.damping) for fabric in self.fabrics],
-            clamped=edges,
             tolerance=preset.tolerance * self.force_scale,
             newton_max=preset.newton_max,
             krylov_max=preset.krylov_max,
@@ -127,8 +121,8 @@ class Cloth:
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
         self.sharpest = np.inf
         """Least radius over the side of a cell of a body that cloth touched by more than its vertices."""
-        self.exhausted = ""
-        """Why `advance` goes no further, or empty: the preset's `newton_per_second` is spent."""
+        self.spent = 0.0
+        """Most iterations in a second of `advance` over the preset's `newton_per_second`; beyond 1 it stops."""
         self._spent = 0.0
         self.steps = self.unconverged_steps = 0
         self.missed_steps = 0
@@ -215,10 +209,9 @@ class Cloth:
         self,
         positions: ArrayLike,
         velocities: ArrayLike | None = None,
-        slopes: ArrayLike | None = None,
         bodies: Sequence[Body] = (),
     ) -> None:
-        """Set positions (V, 3) [m], velocities (V, 3) [m/s], and slopes at clamped edges (E, 3).
+        """Set positions (V, 3) [m], and velocities (V, 3) [m/s].
 
         Without `bodies`, those of this time, they do not move in the next step.
 
@@ -228,10 +221,8 @@ class Cloth:
         """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
-        if slopes is not None:
-            self.slopes = np.asarray(slopes, float)
         self._solver.set_state(
-            at, speed, self.slopes, self._surfaces_at(self.time), [body.as_tuple() for body in bodies], begins=True
+            at, speed, self._surfaces_at(self.time), [body.as_tuple() for body in bodies], begins=True
         )
 
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
@@ -246,7 +237,7 @@ class Cloth:
         self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
         self._solver = self._make(held=self.held.tolist())
         around = [body.as_tuple() for body in bodies]
-        self._solver.set_state(positions, velocities, self.slopes, self._surfaces_at(self.time), around, begins=False)
+        self._solver.set_state(positions, velocities, self._surfaces_at(self.time), around, begins=False)
 
     def step(
         self,
@@ -254,22 +245,18 @@ class Cloth:
         *,
         held: ArrayLike = (),
         bodies: Sequence[Body] = (),
-        slopes: ArrayLike | None = None,
         damping: float = 0.0,
     ) -> StepReport:
-        """Advance by dt [s]. Positions of held vertices (K, 3), slopes, bodies and surfaces are those at its end.
+        """Advance by dt [s]. Positions of held vertices (K, 3), bodies and surfaces are those at its end.
 
         `damping` is proportional to mass [1/s]; that of the fabric is added.
         A step that does not converge is counted, and its best iterate is kept.
         """
-        if slopes is not None:
-            self.slopes = np.asarray(slopes, float)
         ends = np.asarray(held, float).reshape(-1, 3)
         report = self._solver.step(
             dt,
             self.gravity,
             ends,
-            self.slopes,
             self._surfaces_at(self.time + dt),
             [body.as_tuple() for body in bodies],
             damping,
@@ -300,12 +287,12 @@ class Cloth:
             ValueError: `event` has passed.
         """
 
-        def drive(time: float) -> tuple[Floats, Floats, Floats, Floats, list[BodyTuple], float]:
+        def drive(time: float) -> tuple[Floats, Floats, Floats, list[BodyTuple], float]:
             self.gravity, held, bodies = motion(time)
             ends, tuples = np.asarray(held, float).reshape(-1, 3), [body.as_tuple() for body in bodies]
-            return self.gravity, ends, self.slopes, self._surfaces_at(time), tuples, damping(time)
+            return self.gravity, ends, self._surfaces_at(time), tuples, damping(time)
 
-        while self.time < end and not self.exhausted:
+        while self.time < end and self.spent <= 1.0:
             self._before = self.time, self.positions, self.velocities
             if self.preset.step_error is not None:
                 self.time, report = self._solver.advance(self.time, event, drive)
@@ -323,14 +310,9 @@ class Cloth:
                 self.time = event
 
     def _spend(self, iterations: int, seconds: float) -> None:
-        """Count the iterations of the last second of scene time, and give up beyond the preset's number."""
-        limit = self.preset.newton_per_second
-        self._spent = max(0.0, self._spent - limit * seconds) + iterations
-        if self._spent > limit:
-            self.exhausted = (
-                f"at {self.time:.3g} s steps took more than {limit:,} iterations of Newton's method "
-                "in a second of scene time: holders, bodies and cloth cannot all have their way"
-            )
+        """Count the iterations of the last second of scene time."""
+        self._spent = max(0.0, self._spent - self.preset.newton_per_second * seconds) + iterations
+        self.spent = max(self.spent, self._spent / self.preset.newton_per_second)
 
     def positions_at(self, time: float) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
@@ -381,7 +363,7 @@ class Cloth:
 
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state, without contact [1/s^2]; > 0: stable."""
-        return float(self._solver.softest(self.positions, self.slopes))
+        return float(self._solver.softest(self.positions))
 
     def phases(self) -> dict[str, float]:
         """Return CPU times by phase since the start [s]."""

@@ -116,7 +116,7 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
         for sign in (1.0, -1.0):
             moved = at.copy()
             moved[free[members], 2] += sign * DIFFERENCE * LENGTH
-            ends.append(cloth._solver.energies(moved, cloth.slopes)[2][free, 2])
+            ends.append(cloth._solver.energies(moved)[2][free, 2])
         distance, nearest = cKDTree(rest[members]).query(rest)
         near = np.flatnonzero(distance <= REACH * cell)
         rows.append(near)

@@ -59,8 +59,6 @@ class ClothRun:
 
     steps: int
     unconverged_steps: int
-    missed_steps: int
-    """Steps that miss the preset's `step_error` although they are the shortest."""
 
     worst_residual: float
     """Largest residual force of a node in any step, in weights of 25 mm^2 of the lightest fabric."""
@@ -177,7 +175,7 @@ class Scene:
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
             self._advance(cloth, hands, time)
-            if cloth.exhausted:
+            if cloth.spent > 1.0:
                 break
             paths.append(cloth.positions_at(time))
             forces.append(self.forces(cloth))
@@ -198,8 +196,7 @@ class Scene:
         record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
         crossings = np.array([self_intersections(p, self.mesh.triangles) if finite else 0 for p in path], np.int32)
         worst = checks.values(checks.Seen(cloth, path, int(crossings.max()) if self.self_contact else 0))
-        why = self.reason or cloth.exhausted
-        code, reason = ("solver_diverged", why) if why else checks.failed(worst)
+        code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
         run = ClothRun(
             positions=path,
             rest=self.mesh.rest,
@@ -212,7 +209,6 @@ class Scene:
             kernel=cloth.kernel,
             steps=cloth.steps,
             unconverged_steps=cloth.unconverged_steps,
-            missed_steps=cloth.missed_steps,
             worst_residual=cloth.worst_residual,
             rest_time=rest_time,
             checks=worst,
@@ -229,7 +225,7 @@ class Scene:
 
     def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way."""
-        while cloth.time < end and not cloth.exhausted:
+        while cloth.time < end and cloth.spent <= 1.0:
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
@@ -239,14 +235,14 @@ class Scene:
         """Run the scene and return the arrays and labels to store."""
         run = self.run(on_frame)
         if not run.valid:
-            return Outcome(reason=run.reason, code=run.code)
+            worst = ", ".join(f"{name} {value:.4g}" for name, value in run.checks.items())
+            return Outcome(reason=f"{run.reason}; worst values: {worst}", code=run.code)
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
         arrays: Record = {**self.arrays(run), **run.record}
         labels = {
             "kernel": run.kernel,
             "steps": run.steps,
             "unconverged_steps": run.unconverged_steps,
-            "missed_steps": run.missed_steps,
             "worst_residual": run.worst_residual,
             **run.checks,
             **run.labels,

@@ -12,7 +12,7 @@ namespace sim_core {
 namespace {
 
 constexpr ClothKernel kernel_named(const char* name) {
-  return {name, membrane, bending, bending_matrix, apply, factor, solve, krylov};
+  return {name, membrane, membrane_lag, bending, bending_matrix, apply, factor, solve, krylov};
 }
 
 }  // namespace

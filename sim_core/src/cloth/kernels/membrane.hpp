@@ -23,6 +23,70 @@ inline void add_blocks(float* blocks, const int* slots, int place, const Lane (&
   }
 }
 
+// The deformation gradient and Green's strain of a group of triangles.
+struct Strained {
+  Lane n[3][2];  // gradients of the shape functions, 1/m
+  Lane f[2][3];
+  Lane a, h, q;
+};
+
+inline Strained strained(const MembraneData& data, int group, const double* x) {
+  constexpr int W = membrane_lanes;
+  const int* nodes = data.nodes + 3L * W * group;
+  Lane p[3][3];
+  for (int a = 0; a < 3; ++a) {
+    for (int l = 0; l < W; ++l) {
+      const double* at = x + 4L * nodes[W * a + l];
+      for (int c = 0; c < 3; ++c) p[a][c][l] = at[c];
+    }
+  }
+  const Lane* shape = reinterpret_cast<const Lane*>(data.shape + 4L * W * group);
+  Strained out{
+      {{-shape[0] - shape[2], -shape[1] - shape[3]}, {shape[0], shape[1]}, {shape[2], shape[3]}}, {}, {}, {}, {}};
+  Lane(&f)[2][3] = out.f;
+  for (int c = 0; c < 3; ++c) {
+    const Lane u = p[1][c] - p[0][c], v = p[2][c] - p[0][c];
+    f[0][c] = u * shape[0] + v * shape[2];
+    f[1][c] = u * shape[1] + v * shape[3];
+  }
+  const Lane g00 = 0.5 * (f[0][0] * f[0][0] + f[0][1] * f[0][1] + f[0][2] * f[0][2] - 1.0);
+  const Lane g11 = 0.5 * (f[1][0] * f[1][0] + f[1][1] * f[1][1] + f[1][2] * f[1][2] - 1.0);
+  out.a = 0.5 * (g00 + g11);
+  out.h = 0.5 * (g00 - g11);
+  out.q = 0.5 * (f[0][0] * f[1][0] + f[0][1] * f[1][1] + f[0][2] * f[1][2]);
+  return out;
+}
+
+// Where the law is not convex where a step starts, a share of what makes it convex holds strain there: a viscosity that
+// falls as the step and vanishes at rest, so that a step has one end. Convex splitting [Eyre 1998].
+inline void add_lag(StretchLaw& law, const Lane* lag, const Strained& now) {
+  const Lane a = now.a - lag[0], h = now.h - lag[1], q = now.q - lag[2];
+  law.a += lag[3] * a + lag[4] * h + lag[5] * q;
+  law.h += lag[4] * a + lag[6] * h + lag[7] * q;
+  law.q += lag[5] * a + lag[7] * h + lag[8] * q;
+  law.aa += lag[3], law.ah += lag[4], law.aq += lag[5], law.hh += lag[6], law.hq += lag[7], law.qq += lag[8];
+}
+
+void membrane_lag(const MembraneData& data, const double* x, double share, double* lag) {
+  for (int group = 0; group < data.groups; ++group) {
+    const int fabric = data.fabric[group];
+    const Strained now = strained(data, group, x);
+    const StretchLaw law = stretch_law<true>(data.law + 24L * fabric, data.tabulated[fabric], now.a, now.h, now.q);
+    StretchLaw positive = law;
+    make_definite(positive);
+    const Lane entries[9] = {now.a,
+                             now.h,
+                             now.q,
+                             share * (positive.aa - law.aa),
+                             share * (positive.ah - law.ah),
+                             share * (positive.aq - law.aq),
+                             share * (positive.hh - law.hh),
+                             share * (positive.hq - law.hq),
+                             share * (positive.qq - law.qq)};
+    for (int i = 0; i < 9; ++i) *reinterpret_cast<Lane*>(lag + (9L * group + i) * membrane_lanes) = entries[i];
+  }
+}
+
 // Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative, of which
 // `part` may leave out what is not positive: of the stress, or of the stress and the law [Teran et al. 2005].
 template <bool matrix>
@@ -31,28 +95,13 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
   Lane energy{};
   for (int group = 0; group < data.groups; ++group) {
     const int* nodes = data.nodes + 3L * W * group;
-    Lane p[3][3];
-    for (int a = 0; a < 3; ++a) {
-      for (int l = 0; l < W; ++l) {
-        const double* at = x + 4L * nodes[W * a + l];
-        for (int c = 0; c < 3; ++c) p[a][c][l] = at[c];
-      }
-    }
-    const Lane* shape = reinterpret_cast<const Lane*>(data.shape + 4L * W * group);
     const int fabric = data.fabric[group];
     const Lane area = *reinterpret_cast<const Lane*>(data.area + 1L * W * group);
-    const Lane n[3][2] = {{-shape[0] - shape[2], -shape[1] - shape[3]}, {shape[0], shape[1]}, {shape[2], shape[3]}};
-    Lane f[2][3];
-    for (int c = 0; c < 3; ++c) {
-      const Lane u = p[1][c] - p[0][c], v = p[2][c] - p[0][c];
-      f[0][c] = u * shape[0] + v * shape[2];
-      f[1][c] = u * shape[1] + v * shape[3];
-    }
-    const Lane g00 = 0.5 * (f[0][0] * f[0][0] + f[0][1] * f[0][1] + f[0][2] * f[0][2] - 1.0);
-    const Lane g11 = 0.5 * (f[1][0] * f[1][0] + f[1][1] * f[1][1] + f[1][2] * f[1][2] - 1.0);
-    const Lane g01 = 0.5 * (f[0][0] * f[1][0] + f[0][1] * f[1][1] + f[0][2] * f[1][2]);
-    StretchLaw law =
-        stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], 0.5 * (g00 + g11), 0.5 * (g00 - g11), g01);
+    const Strained now = strained(data, group, x);
+    const Lane(&n)[3][2] = now.n;
+    const Lane(&f)[2][3] = now.f;
+    StretchLaw law = stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], now.a, now.h, now.q);
+    if (data.lag) add_lag(law, reinterpret_cast<const Lane*>(data.lag + 9L * W * group), now);
     const Lane s00 = 0.5 * (law.a + law.h), s11 = 0.5 * (law.a - law.h), s01 = 0.5 * law.q;
     energy += area * law.energy;
     Lane force[3][3];

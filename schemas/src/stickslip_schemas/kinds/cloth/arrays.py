@@ -120,6 +120,8 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
     {
         "not_finite": ("coordinates that are not finite numbers", 0.0),
         "unconverged": ("steps above the tolerance over those that the preset allows", 1.0),
+        "budget": ("most iterations in a second of the scene over those that the preset allows", 1.0),
+        "missed": ("share of time in shortest steps that are further off than twice the step error", 0.5),
         "crossings": ("pairs of triangles that cross in a frame, where cloth touches itself", 0.0),
         "contact_gain": ("work that bodies do on the motion against them, over the flow of energy", 1e-3),
         "energy_gain": ("largest energy gained beyond the work of all forces, over the flow of energy", None),
@@ -138,7 +140,6 @@ def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         codes("kernel", KERNELS),
         array("steps", "time steps of the solver", "int32"),
         array("unconverged_steps", "steps that stopped short of the tolerance", "int32"),
-        array("missed_steps", "shortest steps that are further off than the preset's step error allows", "int32"),
         array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
         *(
             array(
