@@ -2,19 +2,25 @@
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 
 import pytest
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
+from stickslip_schemas.plan import points as plan
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
-from stickslip_schemas.plan.points import keyed_points, pack_key, publish_key, shards
+from stickslip_schemas.plan.points import KeyedPoint, keyed_points, publish_key, shards
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_testing.samples import Sample, samples, split_of
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
+
+
+def pack_key(spec: JobSpec, shard: int, members: Sequence[KeyedPoint], builds: Builds) -> str:
+    return plan.pack_key(spec, shard, [(point.key, point.split) for point in members], builds)
 
 
 def one(

@@ -1,17 +1,4 @@
-"""Errors of well-formed requests, which api/problems.py maps to problem documents, and of commands.
-
-StickslipError
-├── NotFoundError               404
-├── UnknownWorkerError          404
-├── ConflictError               409
-├── PreconditionFailedError     412
-├── QuotaExceededError          429
-├── IdempotencyKeyReusedError   422
-├── KindNotAvailableError       409
-├── PresetNotCertifiedError     409
-├── UnknownFileError            422
-└── MissingArtifactError        500
-"""
+"""Errors of well-formed requests, which api/problems.py maps to problem documents, and of commands."""
 
 import json
 from collections.abc import Sequence
@@ -91,6 +78,14 @@ class UnknownWorkerError(StickslipError):
 
 class MissingArtifactError(StickslipError):
     """An artifact that the database refers to is missing or damaged in the store."""
+
+
+class DamagedRowsError(StickslipError):
+    """Rows of the database have other values than were written; tasks can make `results` again."""
+
+    def __init__(self, results: Sequence[int] = ()) -> None:
+        self.results = results
+        super().__init__("rows of the job are damaged in the database. If it cannot go on, submit its spec again")
 
 
 class CommandError(Exception):

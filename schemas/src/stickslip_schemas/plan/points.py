@@ -97,12 +97,13 @@ def shards(spec: JobSpec, builds: Builds, *, first: int = 0) -> Iterator[Shard]:
     points = keyed_points(spec, builds, first=first * spec.samples_per_shard)
     number = first
     while members := tuple(islice(points, spec.samples_per_shard)):
-        yield Shard(number, members, pack_key(spec, number, members, builds))
+        slots = [(point.key, point.split) for point in members]
+        yield Shard(number, members, pack_key(spec, number, slots, builds))
         number += 1
 
 
-def pack_key(spec: JobSpec, shard: int, members: Sequence[KeyedPoint], builds: Builds) -> str:
-    """Return the content key of a shard group: its slots' samples and splits, its arrays, and the packer's build.
+def pack_key(spec: JobSpec, shard: int, slots: Sequence[tuple[str, int]], builds: Builds) -> str:
+    """Return the content key of a shard group: its slots (sample key, split), its arrays, and the packer's build.
 
     The arrays are part of it because they depend on the spec, too: on the names of the codes of a label, for example.
     """
@@ -110,7 +111,7 @@ def pack_key(spec: JobSpec, shard: int, members: Sequence[KeyedPoint], builds: B
         "kind": spec.kind,
         "shard": shard,
         "samples_per_shard": spec.samples_per_shard,
-        "slots": [[sample.key, sample.split] for sample in members],
+        "slots": slots,
         "arrays": spec.arrays_digest,
         "build": builds.pack,
     }

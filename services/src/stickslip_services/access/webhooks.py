@@ -185,14 +185,15 @@ class WebhookDelivery:
             with self._database.write() as connection:
                 connection.execute(place.values(next_at=self._clock()))
             return False
+        event, body = message
         try:
             secret = self._sealing.decrypt(row.secret.encode()).decode()
-            fault = _send(row.url, secret, f"msg_{row.id}_{message.event}", message.body, self._clock())
+            fault = _send(row.url, secret, f"msg_{row.id}_{event}", body, self._clock())
         except InvalidToken:
             fault = "its secret is damaged, or was sealed with another secrets key: make the webhook again"
         now = self._clock()
         if not fault:
-            told = {"position": message.event, "failures": 0, "failing_since": None, "fault": ""}
+            told = {"position": event, "failures": 0, "failing_since": None, "fault": ""}
             with self._database.write() as connection:
                 connection.execute(place.values(told | {"next_at": now + CLAIM_SECONDS}))
             return True
@@ -204,19 +205,13 @@ class WebhookDelivery:
         return False
 
 
-@dataclass(frozen=True, slots=True)
-class _Message:
-    event: int
-    body: str
-
-
 def _is_due(now: float) -> ColumnElement[bool]:
     given_up = webhooks.c.failing_since < now - GIVE_UP_SECONDS
     return and_(webhooks.c.next_at <= now, or_(webhooks.c.failing_since.is_(None), ~given_up))
 
 
-def _next_message(connection: Connection, seq: int) -> _Message | None:
-    """Return the first message that a webhook has not received; None if it has received all."""
+def _next_message(connection: Connection, seq: int) -> tuple[int, str] | None:
+    """Return the first event that a webhook has not received, and its message; None if it has received all."""
     found = connection.execute(
         select(events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name)
         .join(jobs, jobs.c.seq == events.c.job)
@@ -233,7 +228,7 @@ def _next_message(connection: Connection, seq: int) -> _Message | None:
         "timestamp": as_datetime(created_at).isoformat(),
         "data": {"job": job, "name": name, **json.loads(data)},
     }
-    return _Message(event, json.dumps(document))
+    return event, json.dumps(document)
 
 
 def _send(url: str, secret: str, message_id: str, body: str, now: float) -> str:

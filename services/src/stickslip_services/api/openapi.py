@@ -1,6 +1,7 @@
 """The OpenAPI document."""
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 from fastapi import FastAPI
@@ -48,7 +49,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
         _name_by_title(document)
         _summarise(document)
         _drop_null_parameters(document)
-        _require_tags(document, components)
+        _require_tags(document)
         for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
             components.pop(unused, None)
         app.openapi_schema = document
@@ -74,19 +75,22 @@ def _drop_null_parameters(document: dict[str, Any]) -> None:
                     parameter["schema"] |= kind
 
 
-def _require_tags(node: Any, components: dict[str, Any]) -> None:
-    """Make the discriminator of a union required, even if it has a default."""
+def _objects(node: Any) -> Iterator[dict[str, Any]]:
+    """Yield all objects of a JSON document."""
     if isinstance(node, dict):
+        yield node
+    for value in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        yield from _objects(value)
+
+
+def _require_tags(document: dict[str, Any]) -> None:
+    """Make the discriminator of a union required, even if it has a default."""
+    for node in _objects(document):
         discriminator = node.get("discriminator")
         if isinstance(discriminator, dict) and "mapping" in discriminator:
             for reference in discriminator["mapping"].values():
-                member = components[reference.rpartition("/")[2]]
+                member = document["components"]["schemas"][reference.rpartition("/")[2]]
                 member["required"] = sorted({*member.get("required", ()), discriminator["propertyName"]})
-        for value in node.values():
-            _require_tags(value, components)
-    elif isinstance(node, list):
-        for value in node:
-            _require_tags(value, components)
 
 
 def _name_by_title(document: dict[str, Any]) -> None:
@@ -96,19 +100,10 @@ def _name_by_title(document: dict[str, Any]) -> None:
         title = components[name].get("title", name)
         if title != name and title.isidentifier() and title not in components:
             components[title] = components.pop(name)
-            _refer(document, f"#/components/schemas/{name}", f"#/components/schemas/{title}")
-
-
-def _refer(node: Any, old: str, new: str) -> None:
-    if isinstance(node, dict):
-        for key, value in node.items():
-            if value == old:
-                node[key] = new
-            else:
-                _refer(value, old, new)
-    elif isinstance(node, list):
-        for value in node:
-            _refer(value, old, new)
+            for node in _objects(document):
+                for key, value in node.items():
+                    if value == f"#/components/schemas/{name}":
+                        node[key] = f"#/components/schemas/{title}"
 
 
 def _drop_foreign_errors(document: dict[str, Any]) -> None:

@@ -27,13 +27,10 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
     errors.UnknownFileError: (422, ProblemCode.validation_failed),
     errors.MissingArtifactError: (500, ProblemCode.storage_error),
+    errors.DamagedRowsError: (500, ProblemCode.storage_error),
 }
 
-_HTTP_CODES = {
-    404: ProblemCode.not_found,
-    405: ProblemCode.method_not_allowed,
-    413: ProblemCode.body_too_large,
-}
+_HTTP_CODES = {404: ProblemCode.not_found, 405: ProblemCode.method_not_allowed, 413: ProblemCode.body_too_large}
 
 
 class ProblemError(Exception):

@@ -18,15 +18,6 @@ from stickslip_services.errors import NotFoundError
 
 
 @dataclass(frozen=True, slots=True)
-class StoredCertificate:
-    """A certificate's artifacts: the document and the page."""
-
-    digest: Sha256
-    artifact: Sha256
-    page: Sha256
-
-
-@dataclass(frozen=True, slots=True)
 class Standing:
     """The newest full certificate of a preset and a build, if it passed."""
 
@@ -50,39 +41,26 @@ def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) 
 def register_certificate(database: Database, store: Store, upload: CertificateUpload, now: float) -> CertificateEntry:
     """Store a certificate with its page, and register it; a known one becomes the newest again."""
     certificate = upload.certificate
-    stored = StoredCertificate(
-        digest=certificate.digest,
-        artifact=store.publish(certificate.canonical()),
-        page=store.publish(upload.page.encode()),
-    )
+    artifact, page = store.publish(certificate.canonical()), store.publish(upload.page.encode())
+    values = {"created_at": now, "protocols": " ".join(report.protocol for report in certificate.protocols)}
     with database.write() as connection:
-        entry = _insert(connection, upload, stored, now)
+        known = update(certificates).where(certificates.c.digest == certificate.digest)
+        if connection.execute(known.values(values)).rowcount == 0:
+            connection.execute(
+                insert(certificates).values(
+                    digest=certificate.digest,
+                    artifact=artifact,
+                    page=page,
+                    preset=certificate.preset,
+                    sim_core=certificate.sim_core,
+                    extent=certificate.extent,
+                    passed=certificate.passed,
+                    **values,
+                )
+            )
+        entry = _entry(find_certificate(connection, certificate.digest))
         note(connection, "certificate.register", entry.digest, now, preset=entry.preset, passed=entry.passed)
         return entry
-
-
-def _insert(
-    connection: Connection, upload: CertificateUpload, stored: StoredCertificate, now: float
-) -> CertificateEntry:
-    protocols = " ".join(report.protocol for report in upload.certificate.protocols)
-    if _find(connection, stored.digest) is not None:
-        known = certificates.c.digest == stored.digest
-        connection.execute(update(certificates).where(known).values(created_at=now, protocols=protocols))
-    else:
-        connection.execute(
-            insert(certificates).values(
-                digest=stored.digest,
-                artifact=stored.artifact,
-                page=stored.page,
-                preset=upload.certificate.preset,
-                sim_core=upload.certificate.sim_core,
-                extent=upload.certificate.extent,
-                passed=upload.certificate.passed,
-                protocols=protocols,
-                created_at=now,
-            )
-        )
-    return _entry(_found(connection, stored.digest))
 
 
 def list_certificates(connection: Connection, page: PageRequest) -> Page[CertificateEntry]:
@@ -90,21 +68,12 @@ def list_certificates(connection: Connection, page: PageRequest) -> Page[Certifi
     return read_page(connection, select(certificates), page, certificates.c.seq, lambda rows: map(_entry, rows))
 
 
-def find_certificate(connection: Connection, digest: str) -> StoredCertificate:
-    """Return the artifacts of a certificate; raise NotFoundError."""
-    row = _found(connection, digest)
-    return StoredCertificate(digest=row.digest, artifact=row.artifact, page=row.page)
-
-
-def _found(connection: Connection, digest: str) -> Row[tuple[Any, ...]]:
-    row = _find(connection, digest)
+def find_certificate(connection: Connection, digest: str) -> Row[tuple[Any, ...]]:
+    """Return the row of a certificate; raise NotFoundError."""
+    row = connection.execute(select(certificates).where(certificates.c.digest == digest)).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no certificate {digest[:100]!r}")
     return row
-
-
-def _find(connection: Connection, digest: str) -> Row[tuple[Any, ...]] | None:
-    return connection.execute(select(certificates).where(certificates.c.digest == digest)).one_or_none()
 
 
 def _entry(row: Row[tuple[Any, ...]]) -> CertificateEntry:

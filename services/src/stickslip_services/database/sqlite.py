@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ class SqliteDatabase(Database):
 
     def _prepare(self, connection: Any, _record: Any) -> None:
         connection.isolation_level = None  # transactions are begun by _begin, not by the driver
+        connection.text_factory = partial(str, encoding="utf-8", errors="replace")  # damaged text shows by its digest
         for pragma in self._pragmas:
             connection.execute(f"PRAGMA {pragma}")
 

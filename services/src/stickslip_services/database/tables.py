@@ -68,6 +68,7 @@ jobs = Table(
     Column("sample_count", Integer, nullable=False),
     Column("builds", Text),  # JSON; null until its planning begins
     Column("certificate", String),  # digest of its certificate when planning began
+    Column("digest", _Wide, nullable=False),  # of spec, builds and certificate (queue/damage.py)
     Column("planned", Integer, nullable=False, server_default="0"),  # number of samples whose tasks are inserted
     Column("planner", String),  # the coordinator that plans it
     Column("planner_until", Float),  # when another coordinator may go on with that
@@ -129,6 +130,7 @@ tasks = Table(
     Column("reported_token", Integer),
     Column("reported_by", String),
     Column("output", Text),  # JSON
+    Column("digest", _Wide),  # of what it made, while it is settled (queue/damage.py)
     Column("cpu_seconds", Float),
     Column("wall_seconds", Float),
     Column("started_at", Float),
@@ -143,16 +145,8 @@ tasks = Table(
         "cost_group",
         **_partial("state = 'pending' AND waiting_on = 0"),
     ),
-    Index(
-        "ix_tasks_leased",
-        "owner",
-        **_partial("owner IS NOT NULL"),
-    ),
-    Index(
-        "ix_tasks_retry",
-        "retry_at",
-        **_partial("state = 'soft_failed'"),
-    ),
+    Index("ix_tasks_leased", "owner", **_partial("owner IS NOT NULL")),
+    Index("ix_tasks_retry", "retry_at", **_partial("state = 'soft_failed'")),
 )
 
 # The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only ever written by
@@ -185,6 +179,7 @@ samples = Table(
     Column("render_task", _Wide),
     Column("split", Integer, nullable=False),
     Column("labels", Text, nullable=False),  # JSON: the point of the grid
+    Column("digest", _Wide, nullable=False),  # of the other columns (queue/damage.py)
     sqlite_with_rowid=False,
 )
 
@@ -291,10 +286,7 @@ certificates = Table(
 )
 
 uploads = Table(  # who has uploaded which artifact
-    "uploads",
-    metadata,
-    Column("project", String, primary_key=True),
-    Column("digest", String, primary_key=True),
+    "uploads", metadata, Column("project", String, primary_key=True), Column("digest", String, primary_key=True)
 )
 
 api_keys = Table(

@@ -14,7 +14,7 @@ from sqlalchemy import ColumnElement, Connection, delete, select, update
 from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.format.manifest import Contents, Manifest, seal_text
-from stickslip_schemas.store import Store
+from stickslip_schemas.store import Store, Stored
 
 from stickslip_services.access.audit_log import note
 from stickslip_services.database.database import Database, batches
@@ -81,7 +81,9 @@ def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
     for table in (events, idempotency_keys, job_counts, job_stages, job_groups, samples, job_tasks):
         connection.execute(delete(table).where(table.c.job.in_(own)))
     connection.execute(delete(jobs).where(jobs.c.seq.in_(own)))
-    lost = held - _still_held(connection, held)
+    lost = set(held)  # a job has all dependencies of its tasks, too
+    for batch in batches(held):
+        lost.difference_update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.task.in_(batch))))
     counts: Counter[tuple[str, str]] = Counter()
     for batch in batches(lost):
         of_batch = tasks.c.seq.in_(batch)
@@ -97,24 +99,7 @@ def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
     return Removed(len(own), len(lost))
 
 
-def _still_held(connection: Connection, held: set[int]) -> set[int]:
-    """Return which of the tasks a job still has; a job has all dependencies of its tasks, too."""
-    found: set[int] = set()
-    for batch in batches(held):
-        found.update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.task.in_(batch)).distinct()))
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Unused:
-    """A file of the store that may be deleted."""
-
-    name: str
-    """See `Store.delete`."""
-    bytes: int
-
-
-def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Unused]:
+def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Stored]:
     """Yield artifacts and temporary files without references, unchanged for `older_than` seconds.
 
     References are those of tasks, jobs, versions and certificates in the database, and of versions in the store.
@@ -125,7 +110,7 @@ def unused(database: Database, store: Store, *, older_than: float) -> Iterator[U
     for file in store.stored():
         is_needed = is_sha256(file.name) and bytes.fromhex(file.name) in needed
         if not is_needed and not file.is_shown and file.modified_at < latest:
-            yield Unused(file.name, file.bytes)
+            yield file
 
 
 def _needed(database: Database, store: Store) -> set[bytes]:

@@ -10,11 +10,12 @@ from contextlib import contextmanager
 
 from sqlalchemy import Connection, func, select, text, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents.responses import DatasetPublishedEvent, EventName
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks
 from stickslip_services.queue.eta import Run, add_costs
-from stickslip_services.queue.events import append_published, append_task_state, set_job_state
+from stickslip_services.queue.events import append_event, set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
     ADD_TO_JOB_COUNTS,
@@ -136,7 +137,7 @@ def _emit(book: Ledger) -> None:
     holders = book.holders(task for task, _ in book.news)
     for task, event in book.news:
         for holder in holders.get(task, ()):
-            append_task_state(book.connection, holder.job, event, book.now)
+            append_event(book.connection, holder.job, EventName.task_state, event, book.now)
 
 
 def _end_job(book: Ledger, job: int, ending: Ending) -> None:
@@ -146,7 +147,8 @@ def _end_job(book: Ledger, job: int, ending: Ending) -> None:
             .where(jobs.c.seq == job)
             .values(**ending.dataset.model_dump(), rejected_count=ending.rejected_count)
         )
-        append_published(book.connection, job, ending.dataset, book.now)
+        event = DatasetPublishedEvent(dataset=ending.dataset)
+        append_event(book.connection, job, EventName.dataset_published, event, book.now)
     set_job_state(book.connection, job, ending.state, book.now, reason=ending.reason, message=ending.message)
 
 

@@ -1,29 +1,34 @@
 """Composition of a task when it is leased: its document, with references to the results of its dependencies."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
-from sqlalchemy import Connection, func, select
-from stickslip_schemas.base.keys import Sha256
+from sqlalchemy import Connection, bindparam, select
+from stickslip_schemas.base.keys import Sha256, content_key
 from stickslip_schemas.base.states import Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
 from stickslip_schemas.format.manifest import section_samples
-from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
+from stickslip_schemas.plan.points import pack_key, publish_key
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
 
 from stickslip_services.access.asker import own_task
 from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
 from stickslip_services.database.database import batches
-from stickslip_services.database.tables import jobs, samples, task_dependencies, tasks
-from stickslip_services.errors import ConflictError, NotFoundError
-from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.tables import samples, task_dependencies, tasks
+from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
+from stickslip_services.queue.damage import check_results, check_samples, read_plan
+from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id, task_key
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
+
+UNSOUND = (DamagedRowsError, ConflictError, ValueError, KeyError, TypeError)
+"""Errors that damaged rows cause."""
 
 Publish = Callable[[bytes], Sha256]
 """Stores an artifact and returns its digest."""
@@ -34,16 +39,26 @@ class StoredTask:
     """The columns of a task that define its document."""
 
     seq: int
+    key: bytes
     stage: Stage
+    build: str
     payload: str
     preview: bool
+
+    @classmethod
+    def of(cls, row: Any) -> Self:
+        """Return the task of a row of `tasks`."""
+        return cls(row.seq, row.key, Stage(row.stage), row.build, row.payload, bool(row.preview))
+
+
+STORED_COLUMNS = tuple(field.name for field in fields(StoredTask))
 
 
 def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish: Publish) -> dict[int, AnyTask]:
     """Return the documents of tasks by `seq`; all their dependencies must be settled.
 
-    The sections of a publish task are stored with `publish`, which takes a while: do not call this in a write
-    transaction.
+    Raises one of UNSOUND where rows are damaged. Sections of a publish task are stored with `publish`, which takes a
+    while: do not call this in a write transaction.
     """
     composers: Mapping[Stage, Callable[[Connection, list[StoredTask]], dict[int, AnyTask]]] = {
         Stage.simulate: _simulate_tasks,
@@ -64,87 +79,105 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     Raises NotFoundError, or ConflictError where its dependencies are not settled.
     """
     key = task_key(name)
-    columns = (tasks.c.seq, tasks.c.stage, tasks.c.payload, tasks.c.preview, tasks.c.waiting_on)
     asked = tasks.c.key == key, own_task(tasks.c.seq)
-    row = None if key is None else connection.execute(select(*columns).where(*asked)).one_or_none()
+    row = None if key is None else connection.execute(select(tasks).where(*asked)).one_or_none()
     if key is None or row is None or task_id(row.stage, key) != name:
         raise NotFoundError(f"there is no task {name[:100]!r}")
     if row.waiting_on:
         raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
-    if row.stage == Stage.render and _record_of(connection, row.seq) is None:
-        raise ConflictError(f"task {name} has nothing to render: its simulation was rejected")
-    stored = StoredTask(row.seq, Stage(row.stage), row.payload, row.preview)
-    return compose_tasks(connection, [stored], publish)[row.seq]
-
-
-def _record_of(connection: Connection, render: int) -> str | None:
-    query = select(tasks.c.output).join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
-    return connection.scalar(query.where(task_dependencies.c.task == render))
+    return compose_tasks(connection, [StoredTask.of(row)], publish)[row.seq]
 
 
 def _simulate_tasks(_connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
+    for task in group:
+        document = {"simulation": json.loads(task.payload), "build": task.build}
+        _check_key(task, content_key("simulate", document))
     return {
         task.seq: task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}') for task in group
     }
 
 
+def _check_key(task: StoredTask, key: Sha256) -> None:
+    """Raise DamagedRowsError where a task is not what its content key says."""
+    if task.key.hex() != key:
+        raise DamagedRowsError
+
+
 def _render_tasks(connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
-    outputs = dict(
-        row
+    edges = [
+        (row.task, row.depends_on)
         for batch in batches(task.seq for task in group)
-        for row in connection.execute(
-            select(task_dependencies.c.task, tasks.c.output)
-            .join(tasks, tasks.c.seq == task_dependencies.c.depends_on)
-            .where(task_dependencies.c.task.in_(batch))
-        )
-    )
+        for row in connection.execute(select(task_dependencies).where(task_dependencies.c.task.in_(batch)))
+    ]
+    made = _results(connection, {needed for _, needed in edges})
+    simulated = {task: made[needed] for task, needed in edges}
     composed: dict[int, AnyTask] = {}
     for task in group:
-        record = json.loads(outputs[task.seq] or "null")["record"]
-        composed[task.seq] = RenderTask.model_validate(
-            {"render": json.loads(task.payload), "record": record, "preview": task.preview}
-        )
+        simulation = simulated[task.seq]
+        render = json.loads(task.payload)
+        document = {"render": render, "simulation": simulation.key.hex(), "build": task.build}
+        _check_key(task, content_key("render", document))
+        if simulation.output is None:
+            raise ConflictError(f"the render {task.key.hex()} has nothing to render: its simulation was rejected")
+        record = json.loads(simulation.output)["record"]
+        composed[task.seq] = RenderTask.model_validate({"render": render, "record": record, "preview": task.preview})
     return composed
+
+
+_RESULTS = Prepared(
+    select(
+        *(tasks.c[name] for name in ("seq", "key", "state", "reason", "message", "output", "payload", "digest"))
+    ).where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
+)
+_SAMPLES = Prepared(
+    select(*(samples.c[name] for name in (*SAMPLE_COLUMNS, "digest")))
+    .where(
+        samples.c.job == bindparam("b_job"), samples.c.slot >= bindparam("b_first"), samples.c.slot < bindparam("b_end")
+    )
+    .order_by(samples.c.slot)
+)
+
+
+def _results(connection: Connection, seqs: Collection[int]) -> dict[int, Any]:
+    """Return the rows of settled tasks by `seq`; raise DamagedRowsError where what they made is damaged."""
+    rows = [row for batch in batches(seqs) for row in _RESULTS.rows(connection, {"b_tasks": batch})]
+    check_results(rows)
+    return {row.seq: row for row in rows}
+
+
+def _samples(connection: Connection, job: int, first: int, end: int) -> list[Any]:
+    """Return the rows of samples by slot; raise DamagedRowsError."""
+    rows = _SAMPLES.rows(connection, {"b_job": job, "b_first": first, "b_end": end})
+    check_samples(rows, range(first, end))
+    return rows
 
 
 def _pack_task(connection: Connection, task: StoredTask) -> PackTask:
     payload = json.loads(task.payload)
-    spec, _ = _job_spec(connection, payload["job"])
+    spec, builds = read_plan(connection, payload["job"])
     first = payload["shard"] * spec.samples_per_shard
-    slots = _slots(connection, payload["job"], first=first, count=spec.samples_per_shard)
-    return PackTask.model_validate({"spec": spec, "shard": payload["shard"], "slots": slots})
+    end = min(first + spec.samples_per_shard, spec.sample_count)
+    rows = _samples(connection, payload["job"], first, end)
+    _check_key(task, pack_key(spec, payload["shard"], [(row.key.hex(), row.split) for row in rows], builds))
+    return PackTask.model_validate({"spec": spec, "shard": payload["shard"], "slots": _slots(connection, rows)})
 
 
-def _slots(connection: Connection, job: int, *, first: int, count: int) -> list[dict[str, Any]]:
-    simulated, rendered = tasks.alias(), tasks.alias()
-    rows = connection.execute(
-        select(
-            samples.c.slot,
-            samples.c.key,
-            samples.c.split,
-            samples.c.labels,
-            samples.c.render_task,
-            simulated.c.output.label("simulate_output"),
-            rendered.c.output.label("render_output"),
-            func.coalesce(rendered.c.state, simulated.c.state).label("state"),
-            func.coalesce(rendered.c.reason, simulated.c.reason).label("reason"),
-            func.coalesce(rendered.c.message, simulated.c.message).label("message"),
-        )
-        .join(simulated, simulated.c.seq == samples.c.simulate_task)
-        .outerjoin(rendered, rendered.c.seq == samples.c.render_task)
-        .where(samples.c.job == job, samples.c.slot >= first, samples.c.slot < first + count)
-        .order_by(samples.c.slot)
+def _slots(connection: Connection, rows: Sequence[Any]) -> list[dict[str, Any]]:
+    made = _results(
+        connection, {seq for row in rows for seq in (row.simulate_task, row.render_task) if seq is not None}
     )
     slots = []
     for row in rows:
+        simulated = made[row.simulate_task]
+        rendered = made.get(row.render_task)
         labels = json.loads(row.labels)
-        slot: dict[str, Any] = {"slot": row.slot, "sample_key": row.key.hex(), "split": row.split}
-        if row.state == TaskState.rejected:
-            slot["labels"] = labels
-            slot["rejection"] = _rejection(row)
+        slot: dict[str, Any] = {"slot": row.slot, "sample_key": row.key.hex(), "split": row.split, "labels": labels}
+        last = rendered or simulated
+        if last.state == TaskState.rejected:
+            slot["rejection"] = _rejection(row, last)
         else:
-            simulation = json.loads(row.simulate_output)
-            render = json.loads(row.render_output) if row.render_task is not None else {"labels": {}, "chunks": {}}
+            simulation = json.loads(simulated.output)
+            render = json.loads(rendered.output) if rendered else {"labels": {}, "chunks": {}}
             slot["labels"] = labels | simulation["labels"] | render["labels"]
             slot["record"] = simulation["record"]
             slot["chunks"] = render["chunks"]
@@ -155,78 +188,64 @@ def _slots(connection: Connection, job: int, *, first: int, count: int) -> list[
 def _publish_task(connection: Connection, task: StoredTask, publish: Publish) -> PublishTask:
     payload = json.loads(task.payload)
     job = payload["job"]
-    spec, builds = _job_spec(connection, job)
-    dataset = dataset_id(spec)
-    packed = {
-        json.loads(shard)["shard"]: output
-        for shard, output in connection.execute(
-            select(tasks.c.payload, tasks.c.output)
-            .join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
-            .where(task_dependencies.c.task == task.seq, tasks.c.stage == Stage.pack)
-        )
-    }
+    spec, builds = read_plan(connection, job)
+    needed = select(task_dependencies.c.depends_on).where(task_dependencies.c.task == task.seq)
+    rows = _results(connection, set(connection.scalars(needed))).values()
+    packed = {json.loads(row.payload)["shard"]: row for row in rows}
+    certificate = payload.get("certificate")
+    pack_keys = [packed[shard].key.hex() for shard in sorted(packed)]
+    _check_key(task, publish_key(spec, pack_keys, builds, certificate))
+    outputs = [json.loads(packed[shard].output) for shard in sorted(packed)]
     size = section_samples(spec)
     sections = (
-        _section(connection, job, spec, packed, first, min(first + size, spec.sample_count))
+        _section(connection, job, spec, outputs, first, min(first + size, spec.sample_count))
         for first in range(0, spec.sample_count, size)
     )
     return PublishTask(
         spec=spec,
-        dataset=dataset,
-        version=version_number(connection, dataset, task.seq),
+        dataset=dataset_id(spec),
+        version=version_number(connection, dataset_id(spec), task.seq),
         builds=builds,
         sections=tuple(in_parallel(publish, sections)),
-        certificate=payload.get("certificate"),
+        certificate=certificate,
     )
 
 
-def _section(connection: Connection, job: int, spec: JobSpec, packed: Mapping[int, str], first: int, end: int) -> bytes:
+def _section(
+    connection: Connection, job: int, spec: JobSpec, outputs: Sequence[Mapping[str, Any]], first: int, end: int
+) -> bytes:
     """Return the slots from `first` to `end`, which are whole shards, as a `PublishSection`."""
-    own = (samples.c.job == job, samples.c.slot >= first, samples.c.slot < end)
-    keys = connection.scalars(select(samples.c.key).where(*own).order_by(samples.c.slot))
-    shards = range(first // spec.samples_per_shard, -(-end // spec.samples_per_shard))
-    outputs = [json.loads(packed[shard]) for shard in shards]
+    rows = _samples(connection, job, first, end)
+    last = [row.simulate_task if row.render_task is None else row.render_task for row in rows]
+    made = _results(connection, set(last))
+    of_section = outputs[first // spec.samples_per_shard : -(-end // spec.samples_per_shard)]
     document = {
         "first": first,
-        "sample_keys": [key.hex() for key in keys],
-        "rejections": _rejections(connection, job, first=first, end=end),
-        "files": [file for output in outputs for file in output["files"]],
-        "labels": [output["labels"] for output in outputs],
+        "sample_keys": [row.key.hex() for row in rows],
+        "rejections": [
+            _rejection(row, made[seq])
+            for row, seq in zip(rows, last, strict=True)
+            if made[seq].state == TaskState.rejected
+        ],
+        "files": [file for output in of_section for file in output["files"]],
+        "labels": [output["labels"] for output in of_section],
     }
     return json.dumps(document).encode()
 
 
-def _rejections(connection: Connection, job: int, *, first: int, end: int) -> list[dict[str, Any]]:
-    """Return the rejected samples of a job among the slots from `first` to `end`, by slot."""
-    last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
-    rows = connection.execute(
-        select(samples.c.slot, samples.c.key, samples.c.labels, tasks.c.reason, tasks.c.message)
-        .join(tasks, tasks.c.seq == last)
-        .where(samples.c.job == job, samples.c.slot >= first, samples.c.slot < end)
-        .where(tasks.c.state == TaskState.rejected)
-        .order_by(samples.c.slot)
-    )
-    return list(map(_rejection, rows))
-
-
-def _rejection(row: Any) -> dict[str, Any]:
+def _rejection(sample: Any, task: Any) -> dict[str, Any]:
     return {
-        "slot": row.slot,
-        "sample_key": row.key.hex(),
-        "reason": row.reason,
-        "message": row.message,
-        "labels": json.loads(row.labels),
+        "slot": sample.slot,
+        "sample_key": sample.key.hex(),
+        "reason": task.reason,
+        "message": task.message,
+        "labels": json.loads(sample.labels),
     }
 
 
 def reserve_version(connection: Connection, task: StoredTask) -> None:
     """Reserve the version number of a publish task, for good, so that no other task takes it."""
-    if find_reserved(connection, task.seq) is None:
-        spec, _ = _job_spec(connection, json.loads(task.payload)["job"])
-        dataset = dataset_id(spec)
-        reserve_number(connection, dataset, version_number(connection, dataset, task.seq), task.seq)
-
-
-def _job_spec(connection: Connection, job: int) -> tuple[Any, Builds]:
-    row = connection.execute(select(jobs.c.spec, jobs.c.builds).where(jobs.c.seq == job)).one()
-    return job_spec_adapter.validate_json(row.spec), Builds.model_validate_json(row.builds)
+    with suppress(*UNSOUND):  # composing it finds the damage
+        if find_reserved(connection, task.seq) is None:
+            dataset = dataset_id(read_plan(connection, json.loads(task.payload)["job"])[0])
+            reserve_number(connection, dataset, version_number(connection, dataset, task.seq), task.seq)

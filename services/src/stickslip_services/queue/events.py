@@ -8,13 +8,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.states import JobState, Reason
-from stickslip_schemas.documents.responses import (
-    DatasetPublishedEvent,
-    DatasetRef,
-    EventName,
-    JobStateEvent,
-    TaskStateEvent,
-)
+from stickslip_schemas.documents.responses import EventName, JobStateEvent
 
 from stickslip_services.database.tables import events, jobs
 
@@ -50,17 +44,7 @@ def set_job_state(
         values["finished_at"] = now
     connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
     event = JobStateEvent(state=state, reason=reason, message=message)
-    _append(connection, job, EventName.job_state, event, now)
-
-
-def append_task_state(connection: Connection, job: int, event: TaskStateEvent, now: float) -> None:
-    """Store the event of a failed or rejected task."""
-    _append(connection, job, EventName.task_state, event, now)
-
-
-def append_published(connection: Connection, job: int, dataset: DatasetRef, now: float) -> None:
-    """Store the event of a published dataset."""
-    _append(connection, job, EventName.dataset_published, DatasetPublishedEvent(dataset=dataset), now)
+    append_event(connection, job, EventName.job_state, event, now)
 
 
 def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
@@ -74,5 +58,6 @@ def read_events(connection: Connection, job: int, *, after: int, limit: int) -> 
     return [StoredEvent(row.id, EventName(row.name), row.data) for row in rows]
 
 
-def _append(connection: Connection, job: int, name: EventName, data: Document, now: float) -> None:
+def append_event(connection: Connection, job: int, name: EventName, data: Document, now: float) -> None:
+    """Store an event."""
     connection.execute(insert(events).values(job=job, name=name, data=data.model_dump_json(), created_at=now))

@@ -8,41 +8,23 @@ of each stage it runs.
 """
 
 import heapq
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
 from stickslip_schemas.base.states import Stage, TaskState
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
-from stickslip_services.queue.compose import StoredTask, reserve_version
+from stickslip_services.queue.compose import STORED_COLUMNS, StoredTask, reserve_version
 from stickslip_services.queue.eta import Cost, Group, limit_seconds, long_groups, read_costs
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import (
-    LIVE,
-    RUNNABLE,
-    Ledger,
-)
+from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ledger
 from stickslip_services.queue.workers import RegisteredWorker
 from stickslip_services.settings import Settings
 
 _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # in the words of the partial index
-
-
-@dataclass(frozen=True, slots=True)
-class _Ready:
-    seq: int
-    job: int
-    key: bytes
-    stage: Stage
-    kind: str
-    cost_group: str
-    tries: int
-    payload: str
-    preview: bool
-    token: int
-    attempts: int
 
 
 _OF_GROUP = (
@@ -58,9 +40,7 @@ _READY_TASK = Prepared(
     .limit(1)
 )
 _READY_TASKS = Prepared(
-    select(
-        *(tasks.c[name] for name in ("seq", "key", "payload", "preview", "token", "attempts", "cost_group", "tries"))
-    )
+    select(*(tasks.c[name] for name in ("job", "kind", "cost_group", "tries", "token", "attempts", *STORED_COLUMNS)))
     .where(*_OF_GROUP, tasks.c.job == bindparam("b_job"))
     .order_by(tasks.c.seq)
     .limit(bindparam("b_count"))
@@ -138,7 +118,7 @@ def grant_leases(
     book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings, *, at_most: float | None
 ) -> list[Grant]:
     """Lease up to the wanted number of tasks of each stage to `worker`; none known to take over `at_most` seconds."""
-    granted: list[_Ready] = []
+    granted: list[Any] = []
     costs = read_costs(book.connection)
     for stage in reversed(Stage):  # what is nearest to a dataset first
         count = min(wanted.get(stage, 0), settings.lease_limit)
@@ -152,7 +132,7 @@ def grant_leases(
     _LEASE.run_all(book.connection, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
     grants = [
         Grant(
-            task=StoredTask(task.seq, task.stage, task.payload, task.preview),
+            task=StoredTask.of(task),
             job=task.job,
             task_id=task_id(task.stage, task.key),
             token=task.token + 1,
@@ -176,15 +156,23 @@ def _pick(
     count: int,
     costs: Mapping[Group, Cost],
     at_most: float | None,
-) -> list[_Ready]:
-    """Choose ready tasks of a stage, one at a time, in the order that the module describes."""
+) -> list[Any]:
+    """Choose ready tasks of a stage (rows of `_READY_TASKS`), one at a time, in the order that the module describes."""
     queues: dict[str, list[_Waiting]] = {}
-    for job, project, priority, on_lease in _jobs_with_pending(connection, stage):
+    for job, project, priority, on_lease in _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage}):
         ready = [
             task
             for kind in worker.kinds
-            for task in _ready_tasks(
-                connection, worker, stage, kind, job, count, long_groups(costs, stage, kind, at_most)
+            for task in _READY_TASKS.rows(
+                connection,
+                {
+                    "b_stage": stage,
+                    "b_build": worker.stage_builds(kind)[stage],
+                    "b_kind": kind,
+                    "b_left_out": long_groups(costs, stage, kind, at_most),
+                    "b_job": job,
+                    "b_count": count,
+                },
             )
         ]
         if ready:
@@ -194,7 +182,7 @@ def _pick(
     on_lease_of = dict(_ON_LEASE.tuples(connection, {"b_stage": stage})) if len(queues) > 1 else {}
     projects = [(on_lease_of.get(name, 0), name) for name in queues]
     heapq.heapify(projects)
-    picked: list[_Ready] = []
+    picked: list[Any] = []
     while projects and len(picked) < count:
         on_lease, name = projects[0]
         picked.append(_pop(queues[name]))
@@ -205,11 +193,11 @@ def _pick(
     return picked
 
 
-_Waiting = tuple[int, int, int, list[_Ready]]
+_Waiting = tuple[int, int, int, list[Any]]
 """-priority, tasks on lease, job, its ready tasks in reverse order."""
 
 
-def _pop(queue: list[_Waiting]) -> _Ready:
+def _pop(queue: list[_Waiting]) -> Any:
     """Take the next task from the jobs of a project."""
     order, on_lease, job, ready = queue[0]
     task = ready.pop()
@@ -218,46 +206,3 @@ def _pop(queue: list[_Waiting]) -> _Ready:
     else:
         heapq.heappop(queue)
     return task
-
-
-def _jobs_with_pending(connection: Connection, stage: Stage) -> Sequence[tuple[int, str, int, int]]:
-    """Return (job, project, priority, tasks of the stage on lease) of the runnable jobs that wait for such tasks."""
-    return _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage})
-
-
-def _ready_tasks(
-    connection: Connection,
-    worker: RegisteredWorker,
-    stage: Stage,
-    kind: str,
-    job: int,
-    count: int,
-    left_out: Sequence[str],
-) -> list[_Ready]:
-    rows = _READY_TASKS.rows(
-        connection,
-        {
-            "b_stage": stage,
-            "b_build": worker.stage_builds(kind)[stage],
-            "b_kind": kind,
-            "b_left_out": left_out,
-            "b_job": job,
-            "b_count": count,
-        },
-    )
-    return [
-        _Ready(
-            seq=row.seq,
-            job=job,
-            key=row.key,
-            stage=stage,
-            kind=kind,
-            cost_group=row.cost_group,
-            tries=row.tries,
-            payload=row.payload,
-            preview=bool(row.preview),
-            token=row.token,
-            attempts=row.attempts,
-        )
-        for row in rows
-    ]

@@ -1,5 +1,7 @@
-"""Names: random ones, and those of tasks, `<stage>-<content key>`."""
+"""Names: random ones, and those of tasks, `<stage>-<content key>`; and digests of rows (`damage`)."""
 
+import hashlib
+import json
 import secrets
 
 from stickslip_schemas.base.keys import is_sha256
@@ -9,6 +11,16 @@ from stickslip_schemas.base.states import Stage
 def new_id(prefix: str) -> str:
     """Return a new, unguessable name such as `job-4f1c09d3a2b87e65`."""
     return f"{prefix}-{secrets.token_hex(8)}"
+
+
+SAMPLE_COLUMNS = ("job", "slot", "key", "simulate_task", "render_task", "split", "labels")
+"""Columns of `samples` that its digest covers."""
+
+
+def row_digest(*values: object) -> int:
+    """Return 63 bits of a digest of the values of a row."""
+    text = json.dumps(values, default=bytes.hex)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest()) >> 1
 
 
 def task_id(stage: str, key: bytes) -> str:

@@ -1,14 +1,13 @@
 """Jobs as they are shown: lists, details, samples and previews."""
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, func, or_, select
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
-from stickslip_schemas.kinds import job_spec_adapter
 
 from stickslip_services.access.asker import own, own_task
 from stickslip_services.clock import as_datetime
@@ -17,12 +16,14 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_stages, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.damage import check_results, check_samples, terms_of
 from stickslip_services.queue.eta import StageTimings, read_costs
-from stickslip_services.queue.ids import task_key
+from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_key
 from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
+_UNSETTLED = [state for state in TaskState if not state.is_settled]
 _RUNNABLE_JOB = Prepared(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1))
 
 
@@ -37,8 +38,8 @@ def runnable_jobs(connection: Connection) -> list[str]:
 
 
 def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any]]:
-    """Return (seq, spec) of the jobs that wait for the first worker."""
-    query = select(jobs.c.seq, jobs.c.spec).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
+    """Return the rows of the jobs that wait for the first worker."""
+    query = select(jobs).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
     return connection.execute(query.order_by(jobs.c.seq)).all()
 
 
@@ -65,10 +66,9 @@ def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
     """Return a job with its spec, as a transaction sees it."""
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
     (shown,) = _shown(connection, [row], alive_workers(context, connection), context.frames)
-    detail = JobDetail(**dict(shown), spec=job_spec_adapter.validate_json(row.spec))
+    detail = JobDetail(**dict(shown), spec=terms_of(row)[0])
     if context.store_watch.trouble and detail.state in RUNNABLE:  # the database may not be writable either
-        update = {"reason": Reason.store_unavailable, "message": context.store_watch.trouble}
-        return detail.model_copy(update=update)
+        return detail.model_copy(update={"reason": Reason.store_unavailable, "message": context.store_watch.trouble})
     return detail
 
 
@@ -111,10 +111,9 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
     last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
     query = (
         select(
-            samples.c.slot,
-            samples.c.key,
-            samples.c.split,
-            samples.c.labels,
+            *(samples.c[name] for name in SAMPLE_COLUMNS),
+            samples.c.digest,
+            tasks.c.seq,
             tasks.c.state,
             tasks.c.reason,
             tasks.c.message,
@@ -136,7 +135,16 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
             message=row.message,
         )
 
-    return read_page(connection, query, page, samples.c.slot, lambda rows: map(shown, rows), newest_first=False)
+    def checked(rows: Sequence[Row[Any]]) -> Iterable[SampleState]:
+        first = 0 if page.after is None else page.after + 1
+        planned = connection.execute(select(jobs.c.planned).where(jobs.c.seq == job)).scalar_one()
+        page_slots = range(first, min(first + page.size, planned))
+        check_samples(rows, page_slots if state is None else [row.slot for row in rows])
+        settled = [row.seq for row in rows if row.state not in _UNSETTLED]
+        check_results(connection.execute(select(tasks).where(tasks.c.seq.in_(settled))).all())
+        return map(shown, rows)
+
+    return read_page(connection, query, page, samples.c.slot, checked, newest_first=False)
 
 
 def list_previews(connection: Connection, job: int) -> list[Preview]:
@@ -178,7 +186,8 @@ def _shown(
     workers: Collection[RegisteredWorker],
     frames: Frames,
 ) -> list[Job]:
-    slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows}
+    served = (JobState.queued, JobState.running)
+    slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows if row.state in served}
     progress = read_progress(connection, rows, slots, costs=read_costs(connection), frames=frames)
     return [
         Job(

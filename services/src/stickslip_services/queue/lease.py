@@ -5,10 +5,11 @@ has lost its lease is recognised.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from sqlalchemy import Connection, bindparam, exists, select, text, update
 from stickslip_schemas import tracing
-from stickslip_schemas.base.states import Stage, TaskState
+from stickslip_schemas.base.states import Reason, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
@@ -24,13 +25,15 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
-from stickslip_services.errors import ConflictError
-from stickslip_services.queue.compose import Publish, compose_tasks
+from stickslip_services.errors import ConflictError, DamagedRowsError
+from stickslip_services.queue.compose import UNSOUND, AnyTask, Publish, compose_tasks
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.damage import mend
 from stickslip_services.queue.grants import Grant, grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.ledger import (
+    HELD_COLUMNS,
     RUNNABLE,
     HeldTask,
     Ledger,
@@ -41,7 +44,7 @@ from stickslip_services.queue.ledger import (
     start_tasks,
 )
 from stickslip_services.queue.planner import plan_waiting_jobs
-from stickslip_services.queue.retries import find_held, is_sweep_due, lose, take_back
+from stickslip_services.queue.retries import fail_tries, find_held, is_sweep_due, lose, take_back
 from stickslip_services.queue.workers import (
     RegisteredWorker,
     find_worker,
@@ -90,7 +93,9 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         grants = grant_leases(book, worker, wanted, context.settings, at_most=request.at_most_seconds)
     # The dependencies of these tasks have ended, so composing them needs no write transaction.
     with context.database.read() as connection:
-        leases = _compose_leases(connection, grants, context.store.publish)
+        leases, damaged = _compose_leases(connection, grants, context.store.publish)
+    if damaged:
+        _mend(context, worker.id, damaged)
     context.sections |= {lease.task_id: lease.task.sections for lease in leases if isinstance(lease.task, PublishTask)}
     return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
@@ -156,11 +161,22 @@ def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
     return worker
 
 
-def _compose_leases(connection: Connection, grants: Sequence[Grant], publish: Publish) -> tuple[Lease, ...]:
-    """Return the leases of granted tasks; see `compose_tasks`."""
-    composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+def _compose_leases(
+    connection: Connection, grants: Sequence[Grant], publish: Publish
+) -> tuple[tuple[Lease, ...], dict[int, Sequence[int]]]:
+    """Return the leases of granted tasks, and by task the damaged results where rows that it needs are damaged."""
+    composed: dict[int, AnyTask] = {}
+    damaged: dict[int, Sequence[int]] = {}
+    try:
+        composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+    except UNSOUND:
+        for grant in grants:
+            try:
+                composed |= compose_tasks(connection, [grant.task], publish)
+            except UNSOUND as error:
+                damaged[grant.task.seq] = getattr(error, "results", ())
     traceparents = _traceparents_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
-    return tuple(
+    leases = tuple(
         Lease(
             task_id=grant.task_id,
             token=grant.token,
@@ -170,7 +186,20 @@ def _compose_leases(connection: Connection, grants: Sequence[Grant], publish: Pu
             task=composed[grant.task.seq],
         )
         for grant in grants
+        if grant.task.seq in composed
     )
+    return leases, damaged
+
+
+def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -> None:
+    """Mend the rows that leased tasks need, and retry these, as after a report of damaged artifacts."""
+    with context.ledger() as book:
+        held = [task for task in find_held(book, owners=[worker_id]) if task.seq in damaged]
+        start_tasks(book, [(task.seq, task.stage) for task in held])
+        why = Reason.storage_error, str(DamagedRowsError())
+        fail_tries(book, [(replace(task, state=TaskState.running), *why) for task in held], context.settings)
+        for task in held:
+            mend(book, task.seq, damaged[task.seq])
 
 
 def _renew_leases(
@@ -180,8 +209,7 @@ def _renew_leases(
     drop: list[str] = []
     mine: list[tuple[LeaseState, HeldTask]] = []
     keys = {state.task_id: task_key(state.task_id) for state in held}
-    names = ("key", "seq", "stage", "state", "tries", "losses", "token", "owner")
-    columns = [tasks.c[name] for name in names]
+    columns = (*HELD_COLUMNS, tasks.c.token, tasks.c.owner)
     rows = {
         row.key: row
         for batch in batches(key for key in keys.values() if key is not None)
@@ -192,9 +220,7 @@ def _renew_leases(
         if row is None or row.owner != worker.id or row.token != lease.token or worker.superseded:
             drop.append(lease.task_id)
         else:
-            mine.append(
-                (lease, HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses))
-            )
+            mine.append((lease, HeldTask.of(row)))
     unneeded = _unneeded(book, mine)
     cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
     halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])

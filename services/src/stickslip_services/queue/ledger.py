@@ -6,12 +6,14 @@ transaction.
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 from sqlalchemy import Connection, bindparam, case, select, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
 
+from stickslip_services.catalog.versions import CommittedVersion
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
@@ -53,12 +55,13 @@ class Ending:
     rejected_count: int = 0
 
     @staticmethod
-    def published(dataset: DatasetRef, *, sample_count: int, rejected_count: int) -> "Ending":
+    def published(version: CommittedVersion) -> "Ending":
         """Return the ending of a job whose dataset version exists."""
-        if rejected_count == 0:
-            return Ending(JobState.succeeded, None, "", dataset)
-        message = f"{rejected_count} of {sample_count} samples were rejected; the dataset lists them with their reasons"
-        return Ending(JobState.succeeded_with_rejects, None, message, dataset, rejected_count)
+        lost = version.rejected_count
+        if lost == 0:
+            return Ending(JobState.succeeded, None, "", version.reference)
+        message = f"{lost} of {version.sample_count} samples were rejected; the dataset lists them with their reasons"
+        return Ending(JobState.succeeded_with_rejects, None, message, version.reference, lost)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,13 @@ class HeldTask:
     tries: int
     losses: int
 
+    @classmethod
+    def of(cls, row: Any) -> Self:
+        """Return the task of a row of `tasks`."""
+        return cls(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses)
+
+
+HELD_COLUMNS = [tasks.c[field.name] for field in fields(HeldTask)]
 
 _HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)

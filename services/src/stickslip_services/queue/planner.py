@@ -13,14 +13,13 @@ from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas import tracing
 from stickslip_schemas.base.states import JobState, Reason, Stage
-from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.damage import terms_of
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import unplanned_jobs
@@ -43,10 +42,11 @@ def plan_waiting_jobs(context: Context) -> None:
     with context.database.read() as connection:
         waiting = unplanned_jobs(connection)
     for row in waiting:
-        spec = job_spec_adapter.validate_json(row.spec)
         terms: Terms | None = None
-        refusal, reason = "", Reason.waiting_for_worker
+        refusal, reason, at_once = "", Reason.waiting_for_worker, False
         try:
+            spec, _, _ = terms_of(row)
+            at_once = spec.sample_count <= context.settings.plan_samples
             with context.database.read() as connection:
                 terms = terms_for(connection, spec)
             if terms is None:
@@ -55,7 +55,6 @@ def plan_waiting_jobs(context: Context) -> None:
             refusal = str(error)
         except PresetNotCertifiedError as error:
             refusal, reason = str(error), Reason.preset_not_certified
-        at_once = spec.sample_count <= context.settings.plan_samples
         plan = expand(spec, terms, previews=context.settings.previews_per_job) if terms and at_once else None
         with context.database.write() as connection:
             if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
@@ -136,11 +135,12 @@ class Planner:
         return (row.seq, row.planned) == (self._job, self._end)
 
     def _begin(self, row: Row[tuple[object, ...]], packed: list[str]) -> Iterator[Plan]:
-        terms = Terms(Builds.model_validate_json(row.builds), row.certificate)
+        spec, builds, certificate = terms_of(row)
+        assert builds is not None
         self._job, self._end = row.seq, row.planned
         return pieces(
-            job_spec_adapter.validate_json(row.spec),
-            terms,
+            spec,
+            Terms(builds, certificate),
             size=self._context.settings.plan_samples,
             previews=self._context.settings.previews_per_job,
             first=row.planned,

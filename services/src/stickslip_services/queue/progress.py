@@ -37,7 +37,7 @@ def read_progress(
         for job, stage, group, left in connection.execute(select(job_groups).where(job_groups.c.job.in_(running))):
             groups.setdefault((job, stage), []).append((group, left))
     known = _Known(counts, stages, groups, costs, _frames(connection, seqs, frames))
-    return {row.seq: _progress(row, known, slots[row.seq]) for row in rows}
+    return {row.seq: _progress(row, known, slots.get(row.seq, 0)) for row in rows}
 
 
 def _frames(connection: Connection, seqs: list[int], frames: Frames) -> dict[tuple[int, str, str], "_Sum"]:

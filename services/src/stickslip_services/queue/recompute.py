@@ -10,7 +10,7 @@ are recomputed.
 import logging
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from sqlalchemy import Connection, bindparam, select, update
@@ -45,7 +45,9 @@ class MadeJob:
 
 
 @dataclass(frozen=True, slots=True)
-class _Maker:
+class Maker:
+    """A task whose result is damaged."""
+
     seq: int
     stage: Stage
     state: TaskState
@@ -53,7 +55,11 @@ class _Maker:
 
 def recompute(book: Ledger, consumer: int, digests: Collection[Sha256]) -> int:
     """Reset the tasks that made `digests`, and let `consumer` wait for them; return their number."""
-    makers = _find_makers(book, consumer, set(digests))
+    return remake(book, consumer, _find_makers(book, consumer, set(digests)))
+
+
+def remake(book: Ledger, consumer: int, makers: Sequence[Maker]) -> int:
+    """Reset tasks, and let `consumer` wait for them; return their number."""
     if not makers:
         return 0
     known = set(
@@ -112,28 +118,19 @@ def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> 
     if made not in made_jobs(book.connection):
         return  # cancelled, or ended by another check
     if damaged is not None and not damaged:
-        version = find_committed(book.connection, made.publish_task)
-        ending = Ending.published(
-            version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
-        )
+        ending = Ending.published(find_committed(book.connection, made.publish_task))
         book.end_job(made.job, replace(ending, message=ending.message or "every result was cached"))
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
     set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
-    reopen_task(book, made.publish_task)
+    reopen(book, [Maker(made.publish_task, Stage.publish, TaskState.succeeded)])
     recompute(book, made.publish_task, damaged or frozenset())
 
 
-def reopen_task(book: Ledger, task: int) -> None:
-    """Reset one task that has a result."""
-    row = book.connection.execute(select(tasks.c.stage, tasks.c.state).where(tasks.c.seq == task)).one()
-    reopen(book, [_Maker(task, Stage(row.stage), TaskState(row.state))])
-
-
-def reopen(book: Ledger, makers: Iterable[_Maker]) -> None:
+def reopen(book: Ledger, makers: Iterable[Maker]) -> None:
     """Reset ended tasks that a live job needs. Their outputs stay until there are new ones."""
-    ended = [maker for maker in makers if maker.state in (TaskState.succeeded, TaskState.failed, TaskState.cancelled)]
+    ended = [maker for maker in makers if maker.state.is_over]
     job_of = live_jobs(book.connection, [maker.seq for maker in ended])
     ended = [maker for maker in ended if maker.seq in job_of]
     settled = [maker.seq for maker in ended if maker.state.is_settled]
@@ -145,9 +142,9 @@ def reopen(book: Ledger, makers: Iterable[_Maker]) -> None:
     reset_tasks(book, [(maker.seq, maker.stage, maker.state) for maker in ended], job_of)
 
 
-def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[_Maker]:
+def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Maker]:
     """Return the tasks that made `digests`, searched breadth-first among the dependencies of `consumer`."""
-    makers: list[_Maker] = []
+    makers: list[Maker] = []
     level, seen = {consumer}, {consumer}
     while level and digests:
         below: set[int] = set()
@@ -161,7 +158,7 @@ def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[_Mak
             for seq, stage, state, output in rows:
                 made = digests.intersection(_DIGEST.findall(output or ""))
                 if seq not in seen and made:
-                    makers.append(_Maker(seq, Stage(stage), TaskState(state)))
+                    makers.append(Maker(seq, Stage(stage), TaskState(state)))
                     digests = digests - made
                 below.add(seq)
         level = below - seen

@@ -103,10 +103,7 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
             book.moved(task, "publish", TaskState.pending, TaskState.succeeded)
             reserve_number(connection, manifest.dataset, manifest.version, task)
             commit_version(connection, task, read_version(store, output), name=manifest.spec.name, now=made_at)
-            version = find_committed(connection, task)
-            ending = Ending.published(
-                version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
-            )
+            ending = Ending.published(find_committed(connection, task))
             message = ". ".join(filter(None, ["found again in the store", ending.message]))
             for holder in book.holders([task])[task]:
                 book.end_job(holder.job, Ending(ending.state, None, message, ending.dataset, ending.rejected_count))

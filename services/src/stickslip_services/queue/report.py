@@ -8,11 +8,10 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 from sqlalchemy import bindparam, delete, insert, select, update
 from stickslip_schemas import tracing
-from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
@@ -32,29 +31,14 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Run
-from stickslip_services.queue.ids import task_id, task_key
+from stickslip_services.queue.ids import row_digest, task_id, task_key
 from stickslip_services.queue.jobs import traceparent_of
-from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, start_tasks
+from stickslip_services.queue.ledger import HELD_COLUMNS, LIVE, Ending, HeldTask, Ledger, start_tasks
 from stickslip_services.queue.recompute import recompute
 from stickslip_services.queue.retries import fail_tries, give_back, lose
 from stickslip_services.queue.workers import find_worker, is_silent, note_seen
 
 Verdict = Literal["accepted", "duplicate", "stale"]
-
-
-class _Row(NamedTuple):
-    seq: int
-    key: bytes
-    stage: Stage
-    kind: str
-    cost_group: str
-    state: TaskState
-    tries: int
-    losses: int
-    owner: str | None
-    token: int
-    reported_by: str | None
-    reported_token: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,24 +49,16 @@ class _Ended:
     result: TaskResult
 
 
-@dataclass(frozen=True, slots=True)
-class Taken:
-    """The outcome of a batch of reports: the verdicts, and the tasks that `retries` continues with."""
-
-    verdicts: tuple[ReportVerdict, ...]
-    released: tuple[HeldTask, ...]
-    failures: tuple[tuple[HeldTask, Reason, str], ...]
-    damaged: tuple[tuple[int, tuple[Sha256, ...]], ...]
-    """Damaged or missing inputs of failed tasks, by task."""
-
-
 _NOTE_REPORT = Prepared(
     update(tasks)
     .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
     .values(reported_by=bindparam("b_worker"), reported_token=tasks.c.token)
 )
 _FIND = Prepared(
-    select(*(tasks.c[name] for name in _Row._fields)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
+    select(
+        *HELD_COLUMNS,
+        *(tasks.c[name] for name in ("kind", "cost_group", "owner", "token", "reported_by", "reported_token")),
+    ).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
 )
 _SETTLE = Prepared(
     update(tasks)
@@ -92,6 +68,7 @@ _SETTLE = Prepared(
         reason=bindparam("b_reason"),
         message=bindparam("b_message"),
         output=bindparam("b_output"),
+        digest=bindparam("b_digest"),
         cpu_seconds=bindparam("b_cpu"),
         wall_seconds=bindparam("b_wall"),
         owner=None,
@@ -100,7 +77,7 @@ _SETTLE = Prepared(
     )
 )
 _DEPENDENTS = Prepared(
-    select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.stage, tasks.c.state)
+    select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.key, tasks.c.stage, tasks.c.state)
     .join(tasks, tasks.c.seq == task_dependencies.c.task)
     .where(task_dependencies.c.depends_on.in_(bindparam("b_tasks", expanding=True)))
 )
@@ -120,10 +97,12 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
         worker = find_worker(book.connection, batch.worker_id)
         if is_silent(context, worker):
             note_seen(book.connection, worker.id, book.now)
-        taken = take_reports(book, worker.id, reports, versions)
-        give_back(book, taken.released)
+        verdicts, released, ended = _judged(book, worker.id, reports, versions)
+        failed = _take_results(book, ended, versions)
+        give_back(book, released)
         charged: list[tuple[HeldTask, Reason, str]] = []
-        for task, reason, message in taken.failures:
+        for end in failed:
+            task, reason, message = end.task, end.result.reason or Reason.internal_error, end.result.message
             if reason is Reason.store_unavailable:
                 context.store_watch.note(f"worker {worker.name} cannot use the store: {message}")
                 give_back(book, [task])
@@ -132,12 +111,13 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
             else:
                 charged.append((task, reason, message))
         fail_tries(book, charged, context.settings)
-        for consumer, digests in taken.damaged:
-            recompute(book, consumer, digests)
-    for verdict in taken.verdicts:
+        for end in ended:
+            if end.result.damaged_inputs:
+                recompute(book, end.task.seq, end.result.damaged_inputs)
+    for verdict in verdicts:
         if verdict.verdict == "accepted" and verdict.task_id in versions:
             _after_commit(context, verdict.task_id, time.monotonic() - began)
-    return ReportAnswer(verdicts=taken.verdicts)
+    return ReportAnswer(verdicts=tuple(verdicts))
 
 
 def _after_commit(context: Context, task: str, seconds: float) -> None:
@@ -175,10 +155,10 @@ def _failed(result: TaskResult, reason: Reason, message: str) -> TaskResult:
     return result.model_copy(update=update)
 
 
-def take_reports(
+def _judged(
     book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, ManifestSummary]
-) -> Taken:
-    """Judge each report, and store the results of the accepted ones.
+) -> tuple[list[ReportVerdict], list[HeldTask], list[_Ended]]:
+    """Judge each report; return the verdicts, the tasks that were given back, and those that have ended.
 
     `versions` has the summaries of manifests by publish task; they were read before the transaction.
     """
@@ -194,7 +174,7 @@ def take_reports(
         elif row is not None and (row.owner, row.token) == (worker_id, report.token):
             verdict = "accepted"
             rows[report.task_id] = row._replace(owner=None, reported_by=worker_id, reported_token=report.token)
-            task = HeldTask(row.seq, row.key, row.stage, row.state, row.tries, row.losses)
+            task = HeldTask.of(row)
             if report.result is None:
                 released.append(task)
             else:
@@ -203,17 +183,15 @@ def take_reports(
     accepted = [*released, *(end.task for end in ended)]
     for batch in batches(accepted):
         _NOTE_REPORT.run(book.connection, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
-    failures = _take_results(book, ended, versions)
-    damaged = tuple((end.task.seq, end.result.damaged_inputs) for end in ended if end.result.damaged_inputs)
-    return Taken(tuple(verdicts), tuple(released), failures, damaged)
+    return verdicts, released, ended
 
 
-def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, _Row]:
+def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, Any]:
     keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
     return {
-        task_id(row.stage, row.key): row._replace(stage=Stage(row.stage), state=TaskState(row.state))
+        task_id(row.stage, row.key): row
         for batch in batches(keys)
-        for row in map(_Row._make, _FIND.tuples(book.connection, {"b_keys": batch}))
+        for row in _FIND.rows(book.connection, {"b_keys": batch})
     }
 
 
@@ -237,9 +215,7 @@ def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[st
     return _failed(result, reason, wrong)
 
 
-def _take_results(
-    book: Ledger, ended: Sequence[_Ended], versions: dict[str, ManifestSummary]
-) -> tuple[tuple[HeldTask, Reason, str], ...]:
+def _take_results(book: Ledger, ended: Sequence[_Ended], versions: dict[str, ManifestSummary]) -> list[_Ended]:
     """Store results; return the failures."""
     # Who reports a result has started the task, whether or not a heartbeat said so in between.
     start_tasks(book, [(end.task.seq, end.task.stage) for end in ended if end.task.state is TaskState.leased])
@@ -253,11 +229,7 @@ def _take_results(
             book.connection.execute(insert(previews).values(task=end.task.seq, digest=output.preview))
         elif isinstance(output, PublishOutput):
             _commit(book, end.task.seq, versions[task_id(end.task.stage, end.task.key)])
-    return tuple(
-        (end.task, end.result.reason or Reason.internal_error, end.result.message)
-        for end in ended
-        if end.result.outcome == "failed"
-    )
+    return [end for end in ended if end.result.outcome == "failed"]
 
 
 def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
@@ -269,12 +241,8 @@ def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
     ).all()
     name = next((row.name for row in waiting if row.name is not None), None)
     commit_version(connection, publish_task, summary, name=name, now=book.now)
-    version = find_committed(connection, publish_task)
     for row in waiting:
-        ending = Ending.published(
-            version.reference, sample_count=version.sample_count, rejected_count=version.rejected_count
-        )
-        book.end_job(row.seq, ending)
+        book.end_job(row.seq, Ending.published(find_committed(connection, publish_task)))
 
 
 def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
@@ -289,12 +257,14 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
                 "b_state": end.result.outcome,
                 "b_reason": end.result.reason,
                 "b_message": end.result.message,
-                "b_output": None if end.result.output is None else end.result.output.model_dump_json(),
+                "b_output": output,
+                "b_digest": row_digest(end.task.key, end.result.outcome, end.result.reason, end.result.message, output),
                 "b_cpu": end.result.cpu_seconds,
                 "b_wall": end.result.wall_seconds,
                 "b_now": book.now,
             }
             for end in settled
+            for output in [None if end.result.output is None else end.result.output.model_dump_json()]
         ],
     )
     rejected: dict[int, tuple[Reason, str]] = {}
@@ -321,11 +291,11 @@ def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int
     edges = [edge for batch in batches(settled) for edge in _DEPENDENTS.tuples(book.connection, {"b_tasks": batch})]
     if not edges:
         return
-    waits = Counter(task for _, task, _, _ in edges)
+    waits = Counter(task for _, task, _, _, _ in edges)
     _COUNT_DOWN.run_all(book.connection, [{"b_seq": task, "b_settled": count} for task, count in waits.items()])
     doomed = [
-        (task, state, rejected[dependency])
-        for dependency, task, stage, state in edges
+        (task, key, state, rejected[dependency])
+        for dependency, task, key, stage, state in edges
         if stage == Stage.render and dependency in rejected and not TaskState(state).is_settled
     ]
     if not doomed:
@@ -337,10 +307,20 @@ def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int
             state=TaskState.rejected,
             reason=bindparam("b_reason"),
             message=bindparam("b_message"),
+            output=None,
+            digest=bindparam("b_digest"),
             finished_at=book.now,
         ),
-        [{"b_seq": task, "b_reason": reason, "b_message": message} for task, _, (reason, message) in doomed],
+        [
+            {
+                "b_seq": task,
+                "b_reason": why[0],
+                "b_message": why[1],
+                "b_digest": row_digest(key, "rejected", *why, None),
+            }
+            for task, key, _, why in doomed
+        ],
     )
-    for task, state, _ in doomed:
+    for task, _, state, _ in doomed:
         book.moved(task, Stage.render, state, TaskState.rejected)
-    _release_dependents(book, [task for task, _, _ in doomed], {})
+    _release_dependents(book, [task for task, *_ in doomed], {})

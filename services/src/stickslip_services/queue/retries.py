@@ -20,23 +20,28 @@ from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ending, HeldTask, Ledger, cancel_tasks, live_jobs, release
+from stickslip_services.queue.ledger import (
+    HELD_COLUMNS,
+    LIVE,
+    RUNNABLE,
+    Ending,
+    HeldTask,
+    Ledger,
+    cancel_tasks,
+    live_jobs,
+    release,
+)
 from stickslip_services.settings import Settings
 
 
 def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: bool = False) -> list[HeldTask]:
     """Return the leased tasks of `owners`, or those whose lease has expired."""
-    query = select(tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.tries, tasks.c.losses).where(
-        text("tasks.owner IS NOT NULL")  # in the words of the partial index
-    )
+    query = select(*HELD_COLUMNS).where(text("tasks.owner IS NOT NULL"))  # in the words of the partial index
     if owners is not None:
         query = query.where(tasks.c.owner.in_(owners))
     if expired:
         query = query.where(tasks.c.expires_at <= book.now)
-    return [
-        HeldTask(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses)
-        for row in book.connection.execute(query)
-    ]
+    return [HeldTask.of(row) for row in book.connection.execute(query)]
 
 
 def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:

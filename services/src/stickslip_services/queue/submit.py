@@ -72,7 +72,7 @@ def submit_job(
 def _submit(
     context: Context, spec: JobSpec, key: str | None, priority: int, traceparent: str | None
 ) -> JobDetail | Replay:
-    project, print_ = this_asker().project, fingerprint(spec)
+    project, print_ = this_asker().project, sha256(spec.model_dump_json().encode())
     at_once = spec.sample_count <= context.settings.plan_samples
     plan: Plan | None = None
     planned_for: Terms | None = None
@@ -98,7 +98,8 @@ def _submit(
             details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
             note(connection, "job.submit", shown.id, now, **details)
             if key:
-                _keep_replay(connection, key, print_, job, shown.model_dump_json(), now)
+                row = {"project": project, "key": key, "fingerprint": print_, "job": job, "created_at": now}
+                connection.execute(insert(idempotency_keys).values(row | {"response": shown.model_dump_json()}))
         context.notifier.notify()
         check_made_datasets(context, at_most=CHECKED_AT_ONCE)
         return shown
@@ -130,17 +131,6 @@ def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> R
     if row.fingerprint != fingerprint:
         raise IdempotencyKeyReusedError(f"the Idempotency-Key {key!r} came with another document before")
     return Replay(row.id, row.response)
-
-
-def _keep_replay(connection: Connection, key: str, fingerprint: str, job: int, response: str, now: float) -> None:
-    """Store the answer to a request."""
-    row = {"project": this_asker().project, "key": key, "fingerprint": fingerprint, "job": job}
-    connection.execute(insert(idempotency_keys).values(row | {"response": response, "created_at": now}))
-
-
-def fingerprint(spec: JobSpec) -> str:
-    """Return the digest that identifies a submitted document."""
-    return sha256(spec.model_dump_json().encode())
 
 
 def validate_spec(context: Context, spec: JobSpec) -> Validation:

@@ -6,6 +6,7 @@ from stickslip_services.access.keys import admit_local_worker
 from stickslip_services.database import migrate
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import held_jobs, hold_jobs, release_jobs
+from stickslip_services.queue.damage import fail_damaged_jobs
 from stickslip_services.queue.jobs import find_job, has_runnable_job, runnable_jobs, show_job
 from stickslip_services.queue.lease import renew_all_leases
 from stickslip_services.queue.planner import plan_waiting_jobs, release_claims
@@ -29,6 +30,7 @@ def start(context: Context) -> None:
 
 def sweep(context: Context) -> None:
     """Watch the store, plan jobs that wait, take back expired leases, retry tasks, and update messages."""
+    fail_damaged_jobs(context)
     _watch_store(context)
     plan_waiting_jobs(context)
     take_back(context)

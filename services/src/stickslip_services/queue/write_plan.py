@@ -25,9 +25,9 @@ from stickslip_services.database.tables import (
     tasks,
 )
 from stickslip_services.queue.events import set_job_state
-from stickslip_services.queue.ids import new_id
+from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
 from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks, reset_tasks
-from stickslip_services.queue.plan import Plan, Terms
+from stickslip_services.queue.plan import Plan, PlannedTask, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
 
@@ -41,6 +41,7 @@ def insert_job(
     book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "", traceparent: str | None = None
 ) -> int:
     """Insert a job without its tasks; return its `seq`."""
+    text = spec.model_dump_json()
     result = book.connection.execute(
         insert(jobs).values(
             id=new_id("job"),
@@ -48,7 +49,8 @@ def insert_job(
             project=project,
             traceparent=traceparent,
             kind=spec.kind,
-            spec=spec.model_dump_json(),
+            spec=text,
+            digest=row_digest(text, None, None),
             sample_count=spec.sample_count,
             state=JobState.queued,
             message="",
@@ -62,10 +64,11 @@ def insert_job(
 
 def begin_planning(book: Ledger, job: int, terms: Terms) -> None:
     """Store the terms of a job, and start its counters; its tasks follow in pieces, from slot 0 on."""
+    spec = book.connection.scalar(select(jobs.c.spec).where(jobs.c.seq == job))
+    values = {"builds": terms.builds.model_dump_json(), "certificate": terms.certificate}
+    digest = row_digest(spec, *values.values())
     book.connection.execute(
-        update(jobs)
-        .where(jobs.c.seq == job)
-        .values(builds=terms.builds.model_dump_json(), certificate=terms.certificate, reason=None, message="")
+        update(jobs).where(jobs.c.seq == job).values(values | {"digest": digest, "reason": None, "message": ""})
     )
     rows = [(job, stage, state, 0) for stage in Stage for state in TaskState]
     insert_rows(book.connection, job_counts, ("job", "stage", "state", "count"), rows)
@@ -130,10 +133,11 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     insert_rows(
         connection,
         samples,
-        ("job", "slot", "key", "simulate_task", "render_task", "split", "labels"),
+        (*SAMPLE_COLUMNS, "digest"),
         (
-            (job, slot, key, seqs[simulate], None if render is None else seqs[render], split, labels)
+            (*row, row_digest(*row))
             for slot, key, simulate, render, split, labels in plan.samples
+            for row in [(job, slot, key, seqs[simulate], None if render is None else seqs[render], split, labels)]
         ),
     )
     new = Counter(Stage(task.stage) for key, task in plan.tasks.items() if key not in known)
@@ -154,6 +158,10 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
         _ADD_GROUPS.run_all(connection, rows)
     lost = [(task.seq, task.stage, task.state) for task in shared if task.state in _LOST]
     reset_tasks(book, lost, dict.fromkeys((seq for seq, _, _ in lost), job))  # its moves change the counts
+    for key, old in known.items():
+        if old.state in _LOST and key in plan.tasks:  # its row may have been damaged
+            values = {"payload": _payload(plan.tasks[key], job), "build": plan.tasks[key].build}
+            connection.execute(update(tasks).where(tasks.c.seq == old.seq).values(values))
     charge_tasks(connection, (task.seq for task in shared if not task.state.is_settled))
     return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
 
@@ -172,15 +180,7 @@ def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
     found: dict[bytes, _Known] = {}
     if not connection.scalar(select(tasks.c.seq).limit(1)):
         return found
-    columns = (
-        tasks.c.key,
-        tasks.c.seq,
-        tasks.c.stage,
-        tasks.c.state,
-        tasks.c.reason,
-        tasks.c.message,
-        tasks.c.cost_group,
-    )
+    columns = [tasks.c[name] for name in ("key", *_Known._fields)]
     for batch in batches(keys):
         for key, seq, stage, state, *rest in connection.execute(select(*columns).where(tasks.c.key.in_(batch))):
             found[key] = _Known(seq, Stage(stage), TaskState(state), *rest)
@@ -201,13 +201,14 @@ def _insert_tasks(
     dependencies: list[tuple[int, int]] = []
     kind = plan.spec.kind
     seq = connection.scalar(select(func.coalesce(func.max(tasks.c.seq), 0))) or 0
-    for key, (stage, build, payload, depends_on, preview, cost_group) in plan.tasks.items():
+    for key, task in plan.tasks.items():
         if key in seqs:
             continue
+        stage, build, _, depends_on, preview, cost_group = task
         seq += 1
         seqs[key] = seq
         waiting_on = 0
-        fate: tuple[str, str | None, str] = ("pending", None, "")
+        fate: tuple[str, str | None, str, int | None] = ("pending", None, "", None)
         for needed_key in depends_on:
             needed = seqs[needed_key]
             dependencies.append((seq, needed))
@@ -216,15 +217,21 @@ def _insert_tasks(
             if needed not in settled:
                 waiting_on += 1
             elif stage == Stage.render and settled[needed].state is TaskState.rejected:
-                fate = ("rejected", settled[needed].reason, settled[needed].message)
+                why = ("rejected", settled[needed].reason, settled[needed].message)
+                fate = (*why, row_digest(key, *why, None))
                 rejected.add(seq)
-        if stage in (Stage.pack, Stage.publish):  # their slots are those of the job that came first
-            payload = json.dumps(json.loads(payload) | {"job": job})
-        rows.append((seq, key, stage, kind, build, payload, preview, cost_group, job, *fate, waiting_on))
+        rows.append((seq, key, stage, kind, build, _payload(task, job), preview, cost_group, job, *fate, waiting_on))
     columns = ("seq", "key", "stage", "kind", "build", "payload", "preview", "cost_group", "job")
-    insert_rows(connection, tasks, (*columns, "state", "reason", "message", "waiting_on"), rows)
+    insert_rows(connection, tasks, (*columns, "state", "reason", "message", "digest", "waiting_on"), rows)
     insert_rows(connection, task_dependencies, ("task", "depends_on"), dependencies)
     return seqs, rejected
+
+
+def _payload(task: PlannedTask, job: int) -> str:
+    """Return the document of a task; the slots of pack and publish are those of the job that came first."""
+    if task.stage in (Stage.pack, Stage.publish):
+        return json.dumps(json.loads(task.payload) | {"job": job})
+    return task.payload
 
 
 def _add_counts(connection: Connection, job: int, counts: Mapping[tuple[Stage, TaskState], int]) -> None:

@@ -8,13 +8,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
-from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
+from stickslip_schemas.format.manifest import MANIFEST_NAME
 
 from stickslip_services.api.files import picture_format, serve
 from stickslip_services.api.routes.common import ContextDep, PageDep, file_responses, problem_responses
 from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets
 from stickslip_services.errors import NotFoundError
-from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import is_preview
 
 router = APIRouter(tags=["datasets"])
@@ -87,12 +86,8 @@ def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
     return serve(request, context.store, digest, name=name)
 
 
-def _find(context: Context, dataset: str, version: int, path: str) -> FileEntry:
+def _serve(request: Request, context: ContextDep, dataset: str, version: int, path: str) -> Response:
     with context.database.read() as connection:
         found = find_version(connection, dataset, version)
-    return find_file(context.store, found, path)
-
-
-def _serve(request: Request, context: ContextDep, dataset: str, version: int, path: str) -> Response:
-    file = _find(context, dataset, version, path)
+    file = find_file(context.store, found, path)
     return serve(request, context.store, file.sha256, name=path, size=file.size)

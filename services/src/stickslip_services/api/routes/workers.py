@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel
@@ -28,12 +28,24 @@ from stickslip_services.queue.report import report_results
 from stickslip_services.queue.workers import show_workers
 
 T = TypeVar("T")
+_Route = TypeVar("_Route", bound=Callable[..., Any])
 
 router = APIRouter()
 
 _LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest)
 _HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat)
 _REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
+
+
+def _verb(name: str, document: type[BaseModel], answer: type[BaseModel], *refusals: int) -> Callable[[_Route], _Route]:
+    """Return the decorator of a route that workers post a document to."""
+    return router.post(
+        f"/v1/worker/{name}",
+        tags=["workers"],
+        response_model=answer,
+        responses=problem_responses(*refusals, *BODY_PROBLEMS),
+        openapi_extra=body_schema(document.__name__) | KEYED,
+    )
 
 
 @router.get("/v1/workers", tags=["workers"], responses=problem_responses())
@@ -57,37 +69,19 @@ def post_worker(
     return register_worker(context, registration)
 
 
-@router.post(
-    "/v1/worker/lease",
-    tags=["workers"],
-    response_model=LeaseBatch,
-    responses=problem_responses(404, 409, *BODY_PROBLEMS),
-    openapi_extra=body_schema("LeaseRequest") | KEYED,
-)
+@_verb("lease", LeaseRequest, LeaseBatch, 404, 409)
 async def post_lease(request: Request) -> Response:
     """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken over."""
     return await _answer(request, _LEASE_REQUEST, lease_tasks)
 
 
-@router.post(
-    "/v1/worker/heartbeat",
-    tags=["workers"],
-    response_model=HeartbeatAnswer,
-    responses=problem_responses(404, *BODY_PROBLEMS),
-    openapi_extra=body_schema("Heartbeat") | KEYED,
-)
+@_verb("heartbeat", Heartbeat, HeartbeatAnswer, 404)
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
     return await _answer(request, _HEARTBEAT, heartbeat)
 
 
-@router.post(
-    "/v1/worker/report",
-    tags=["workers"],
-    response_model=ReportAnswer,
-    responses=problem_responses(404, *BODY_PROBLEMS),
-    openapi_extra=body_schema("ReportBatch") | KEYED,
-)
+@_verb("report", ReportBatch, ReportAnswer, 404)
 async def post_report(request: Request) -> Response:
     """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
     metrics: Metrics = request.app.state.metrics

@@ -1,0 +1,133 @@
+"""Bits that flip in rows of the database: what a dataset is made from is right, or the job says that it is damaged."""
+
+import random
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+import pytest
+from sqlalchemy import Table, select, text
+from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_services.database.paging import PageRequest
+from stickslip_services.database.tables import jobs, samples, tasks
+from stickslip_services.errors import DamagedRowsError
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.jobs import find_job, list_samples
+from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.sweep import start, sweep
+from stickslip_services.settings import Settings
+from stickslip_testing.invariants import violations
+from stickslip_testing.jobs import ManualClock, parsed, rods
+from stickslip_testing.worker import DirectApi, PretendWorker, rejection
+
+FLIPS = 40
+"""Of each run of the test."""
+
+COLUMNS: dict[Table, tuple[str, ...]] = {
+    tasks: ("key", "payload", "state", "reason", "message", "output", "digest"),
+    samples: ("job", "slot", "key", "simulate_task", "render_task", "split", "labels", "digest"),
+    jobs: ("spec", "builds", "digest"),
+}
+
+
+def pretend(context: Context) -> PretendWorker:
+    """Return a worker that rejects one simulation."""
+    return PretendWorker(
+        DirectApi(context),
+        context.store,
+        judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 2.0 else None,
+    ).register()
+
+
+def half_made(place: Path, clock: ManualClock) -> str:
+    """Make all results of a job but its shards; return its id."""
+    context = Context.open(Settings(data=place, database=None, durable=False), clock)
+    start(context)
+    worker = pretend(context)
+    job: str = submit_job(context, parsed(rods(gamma=(1.0, 2.0, 3.0), samples_per_shard=4)), None).id  # type: ignore[union-attr]
+    worker.finish(*worker.lease(simulate=100))
+    worker.finish(*worker.lease(render=100))
+    context.close()
+    return job
+
+
+def flip(context: Context, rng: random.Random) -> str:
+    """Flip a bit of a value that a dataset is made from; return where."""
+    table = rng.choice([tasks, samples, samples, tasks, jobs])
+    column = table.c[rng.choice(COLUMNS[table])]
+    made = [] if table is not tasks else [tasks.c.state.in_((TaskState.succeeded, TaskState.rejected))]
+    if column.name in ("key", "payload"):
+        made = []
+    with context.database.write() as connection:
+        rowid = {tasks: "seq", jobs: "seq", samples: "slot"}[table]
+        rows = connection.execute(select(table.c[rowid], column).where(column.is_not(None), *made)).all()
+        if not rows:
+            return "nothing"
+        row, value = rng.choice(rows)
+        data = bytearray(value.encode() if isinstance(value, str) else value if isinstance(value, bytes) else b"")
+        if isinstance(value, int):
+            new = f"{value ^ (1 << rng.randrange(max(1, value.bit_length())))}"
+        elif not data:
+            return "nothing"
+        else:
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            new = f"x'{data.hex()}'" if isinstance(value, bytes) else f"CAST(x'{data.hex()}' AS TEXT)"
+        connection.execute(text(f"UPDATE OR IGNORE {table.name} SET {column.name} = {new} WHERE {rowid} = {row}"))
+    return f"{table.name}.{column.name} of {row}"
+
+
+def ended(context: Context, worker: PretendWorker, clock: ManualClock, job: str) -> Any:
+    """Work until the job has ended; return it."""
+    for _ in range(40):
+        worker.work()
+        clock.advance(40)
+        sweep(context)
+        with context.database.read() as connection:
+            row: Any = find_job(connection, job)
+        if not JobState(row.state).is_open:
+            return row
+    raise AssertionError(f"the job is {row.state}")
+
+
+def read_samples(context: Context, job: str) -> Any:
+    page = PageRequest(100, None)
+    with context.database.read() as connection:
+        return list_samples(connection, find_job(connection, job).seq, page, None)
+
+
+def outcome_of_a_flip(place: Path, half: Path, job: str, seed: int, right: tuple[Any, Any] | None) -> tuple[Any, Any]:
+    """Flip a bit, make the dataset, and return its manifest and its samples; compare them with the right ones."""
+    clock = ManualClock()
+    copytree(half, place)
+    context = Context.open(Settings(data=place, database=None, durable=False), clock)
+    start(context)
+    where = "nothing" if right is None else flip(context, random.Random(seed))
+    try:
+        listed = read_samples(context, job)
+    except DamagedRowsError:
+        listed = None
+    sweep(context)
+    worker = pretend(context)
+    shown = ended(context, worker, clock, job)
+    if shown.state == JobState.failed:
+        assert "damaged" in shown.message, (where, shown.message)
+        assert where != "nothing"
+        manifest = None
+    else:
+        manifest = shown.manifest
+        with context.database.read() as connection:
+            assert violations(connection) == [], where
+    context.close()
+    if right is not None:
+        assert manifest in (right[0], None), where
+        assert listed in (right[1], None), where
+    return manifest, listed
+
+
+@pytest.mark.slow
+def test_no_flip_in_a_row_is_silent(tmp_path: Path, clock: ManualClock) -> None:
+    job = half_made(tmp_path / "half", clock)
+    right = outcome_of_a_flip(tmp_path / "right", tmp_path / "half", job, 0, None)
+    assert None not in right
+    found = [outcome_of_a_flip(tmp_path / str(n), tmp_path / "half", job, n, right) for n in range(FLIPS)]
+    assert sum(manifest is not None for manifest, _ in found) > FLIPS / 4  # results are recomputed
