@@ -61,6 +61,21 @@ def test_link_is_the_same_file_and_can_be_repeated(tmp_path: Path) -> None:
         assert [path.name for path in target.parent.iterdir()] == ["0"]
 
 
+@pytest.mark.parametrize("wrong", [b"shart", b"sha", b""])
+def test_a_damaged_artifact_is_mended_in_all_versions(tmp_path: Path, wrong: bytes) -> None:
+    store = DirectoryStore(tmp_path)
+    digest, other = store.publish(b"shard"), store.publish(b"other")
+    for version in (1, 2):
+        store.show(digest, "ds-1", version, "views/c/0")
+        store.show(other, "ds-1", version, "views/c/1")
+    store.path(digest).write_bytes(wrong)
+    assert store.read_shown("ds-1", 2, "views/c/0") == wrong
+    store.publish(b"shard")
+    assert [store.read_shown("ds-1", version, "views/c/0") for version in (1, 2)] == [b"shard", b"shard"]
+    assert [store.read_shown("ds-1", version, "views/c/1") for version in (1, 2)] == [b"other", b"other"]
+    assert store.path(digest).stat().st_nlink == 3
+
+
 def test_link_copies_where_it_cannot_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_links(source: Path, target: Path) -> None:
         raise OSError(18, "Invalid cross-device link")

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
-from sqlalchemy import Connection, func, select, text, update
+from sqlalchemy import Connection, exists, func, select, text, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetPublishedEvent, EventName
 
@@ -251,10 +251,6 @@ def _finish_pausing(connection: Connection, now: float) -> None:
 
 
 def _held_tasks(connection: Connection, job: int) -> list[int]:
-    return list(
-        connection.scalars(
-            select(tasks.c.seq)
-            .join(job_tasks, job_tasks.c.task == tasks.c.seq)
-            .where(text("tasks.owner IS NOT NULL"), job_tasks.c.job == job)
-        )
-    )
+    """Return the tasks of a job that are on lease; found among all tasks on lease, which are fewer than a job has."""
+    is_of_job = exists().where(job_tasks.c.job == job, job_tasks.c.task == tasks.c.seq)
+    return list(connection.scalars(select(tasks.c.seq).where(text("tasks.owner IS NOT NULL"), is_of_job)))
