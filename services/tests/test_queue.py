@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import event, select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Dataset
 from stickslip_schemas.documents.tasks import PackTask, PublishSection, PublishTask, RenderTask
@@ -13,6 +13,7 @@ from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
+from stickslip_services.queue.closing import held_tasks
 from stickslip_services.queue.compose import AnyTask, find_task
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job
@@ -696,3 +697,18 @@ def test_a_cancelled_job_gives_up_its_tasks_in_pieces(
     assert show_job(context, job).state is JobState.cancelled
     worker.work()
     assert show_job(context, kept).state is JobState.succeeded
+
+
+def test_a_job_of_millions_is_not_read_for_its_tasks_on_lease(settings: Settings) -> None:
+    """Each report would read it while the job is being paused or cancelled."""
+    context = Context.open(settings)
+    start(context)
+    asked: list[tuple[str, Any]] = []
+    with context.database.read() as connection:
+        if connection.dialect.name == "sqlite":
+            event.listen(connection, "before_cursor_execute", lambda *told: asked.append((told[2], told[3])))
+            assert held_tasks(connection, 1) == []
+            statement, values = asked[0]
+            plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()
+            assert "INDEX ix_tasks_leased" in str(plan)
+    context.close()

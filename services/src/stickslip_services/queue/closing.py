@@ -233,7 +233,7 @@ def _finish_cancelling(connection: Connection, now: float) -> None:
     """Cancel the `cancelling` jobs of which no task waits or is on lease any more, unless another job needs it."""
     given_up = select(jobs.c.seq).where(_OPEN, jobs.c.state == JobState.cancelling, jobs.c.given_up.is_(None))
     for job in connection.scalars(given_up).all():
-        held = _held_tasks(connection, job)
+        held = held_tasks(connection, job)
         if not set(held) - live_jobs(connection, held).keys():
             message = "cancelled; what had been finished is kept and will not be done again"
             set_job_state(connection, job, JobState.cancelled, now, reason=Reason.cancelled, message=message)
@@ -242,7 +242,7 @@ def _finish_cancelling(connection: Connection, now: float) -> None:
 def _finish_pausing(connection: Connection, now: float) -> None:
     """Pause the `pausing` jobs of which no task is on lease any more, unless a runnable job needs it."""
     for job in connection.scalars(select(jobs.c.seq).where(_OPEN, jobs.c.state == JobState.pausing)).all():
-        held = _held_tasks(connection, job)
+        held = held_tasks(connection, job)
         if not set(held) - runnable_tasks(connection, held):
             reason, message = connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job)).one()
             if reason is None:
@@ -250,7 +250,7 @@ def _finish_pausing(connection: Connection, now: float) -> None:
             set_job_state(connection, job, JobState.paused, now, reason=reason, message=message)
 
 
-def _held_tasks(connection: Connection, job: int) -> list[int]:
+def held_tasks(connection: Connection, job: int) -> list[int]:
     """Return the tasks of a job that are on lease; found among all tasks on lease, which are fewer than a job has."""
     is_of_job = exists().where(job_tasks.c.job == job, job_tasks.c.task == tasks.c.seq)
     return list(connection.scalars(select(tasks.c.seq).where(text("tasks.owner IS NOT NULL"), is_of_job)))
