@@ -206,7 +206,7 @@ def test_every_sample_once_whoever_is_killed(
     for version in versions:
         manifest = Manifest.model_validate_json(store.read(version.manifest))
         assert len(set(manifest.sample_keys)) == manifest.valid_count == SAMPLES
-        assert damaged_files(store, version.manifest, version.group_digest) == frozenset()
+        assert damaged_files(store, version.manifest, version.group_digest) == {}
     with capsys.disabled():
         faults = {name: s3.counts[name] for name in FAULTS}
         print(f"\n{KILLS} kills ({dict(kills)}), {faults} of {s3.counts['']} requests to the bucket failed")

@@ -111,9 +111,7 @@ def test_versions_are_compared(origin: tuple[str, str, str], tmp_path: Path) -> 
     url, large, small = origin
     with Client(url) as client:
         pull(client, small, 1, tmp_path / "small", selection=Selection(arrays=()))
-        found = {
-            each.what: (each.a, each.b) for each in differences(client.contents(large, 1), client.contents(small, 1))
-        }
+        found = {what: (a, b) for what, a, b in differences(client.contents(large, 1), client.contents(small, 1))}
     assert found["samples"] == ("8", "4")
     assert found["spec name"] == ("4-rods", "2-rods")
     assert found["samples in this version only"] == ("4", "0")

@@ -135,7 +135,7 @@ def test_a_bucket_is_a_store_like_any_other(
     (found,) = list_datasets(context)
     (version,) = found.versions
     assert found.id == names[0]
-    assert damaged_files(context.store, version.manifest, version.group) == frozenset()
+    assert damaged_files(context.store, version.manifest, version.group) == {}
     context.close()
 
 

@@ -1,11 +1,13 @@
 """Removing versions, and files that nothing refers to."""
 
 import os
+import random
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import select, update
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.format.manifest import MANIFEST_NAME
@@ -14,15 +16,19 @@ from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
+from stickslip_services.database.tables import dataset_versions
 from stickslip_services.local.process import locked
 from stickslip_services.queue.cleanup import unused
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.reindex import reindex
+from stickslip_services.queue.scrub import EVERY_SECONDS, scrub, scrub_when_idle
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start
+from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
-from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
+from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.worker import DirectApi, PretendWorker
 from typer.testing import CliRunner, Result
 
@@ -84,7 +90,7 @@ def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -
     _, datasets, context = look(settings)
     for dataset in datasets:
         (version,) = dataset.versions
-        assert damaged_files(context.store, version.manifest, version.group) == frozenset()
+        assert damaged_files(context.store, version.manifest, version.group) == {}
     context.close()
     age(settings, 30 * DAY)
     result = run(settings, "gc", "--delete", "--older-than", 0)
@@ -112,7 +118,7 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
     assert faults == []
     assert [dataset.id for dataset in datasets] == [second]
     (version,) = datasets[0].versions
-    assert damaged_files(context.store, version.manifest, version.group) == frozenset()
+    assert damaged_files(context.store, version.manifest, version.group) == {}
     assert len(list_jobs(context)) == 1
     context.close()
 
@@ -214,3 +220,71 @@ def test_a_running_service_is_refused(settings: Settings, made: list[str]) -> No
 def test_a_missing_database_is_refused(tmp_path: Path) -> None:
     empty = CliRunner().invoke(app, ["gc", "--data", str(tmp_path / "nothing")])
     assert (empty.exit_code, "does not exist" in empty.stderr) == (1, True)
+
+
+def mend(context: Context) -> None:
+    """Let a service with a worker go on until no job is left."""
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    for _ in range(12):
+        Planner(context).run()
+        check_made_datasets(context)
+        worker.work()
+        assert isinstance(context.clock, ManualClock)
+        context.clock.advance(10)
+        sweep(context)
+    assert {job.state for job in list_jobs(context)} == {JobState.succeeded}
+
+
+def test_scrubbing_finds_all_rot_and_it_is_mended_in_all_versions(settings: Settings, made: list[str]) -> None:
+    """The versions share files by their bytes, as hard links do."""
+    rng = random.Random(5)
+    shown = sorted(path for path in (Path(settings.store_place) / "datasets").rglob("*") if path.is_file())
+    before = {path: path.read_bytes() for path in shown}
+    for round_ in range(5):
+        rotten = {path for path in rng.sample(shown, 4) if path.stat().st_size}
+        for path in rotten:
+            data = bytearray(path.read_bytes())
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            path.write_bytes(data)
+        found = run(settings, "scrub", "--rate", 1000)
+        assert found.exit_code == 1, round_
+        damaged = {path for path in shown if path.read_bytes() != before[path]}
+        told = {tuple(line.split("  ")) for line in found.stdout.splitlines()}
+        for path in damaged:
+            dataset, version, *names = path.relative_to(Path(settings.store_place) / "datasets").parts
+            listed = {name for one, name in told if one == f"{dataset}:{version}"}
+            assert listed & {"/".join(names), MANIFEST_NAME}
+        clock = ManualClock()
+        clock.now = time.time() - 3600
+        context = Context.open(settings, clock)
+        mend(context)
+        context.close()
+        assert all(path.read_bytes() == data for path, data in before.items())
+        assert run(settings, "scrub").exit_code == 0
+
+
+def test_a_coordinator_scrubs_when_it_is_idle(settings: Settings, made: list[str]) -> None:
+    context = Context.open(settings, ManualClock())
+    now = context.clock()
+    with context.database.write() as connection:
+        connection.execute(update(dataset_versions).values(scrubbed_at=now))
+    assert scrub(context, before=now - EVERY_SECONDS) is None  # they have just been made
+    with context.database.write() as connection:
+        connection.execute(update(dataset_versions).values(scrubbed_at=now - EVERY_SECONDS - 1))
+    (Path(settings.store_place) / "datasets" / made[0] / "v1" / "README.md").write_bytes(b"rot")
+    submitted(context, (7.0,))
+    scrub_when_idle(context)  # a job runs
+    assert scrubbed(context) == []
+    mend(context)
+    for count in (2, 3, 3):
+        scrub_when_idle(context)
+        mend(context)
+        assert len(scrubbed(context)) == count
+    assert run(settings, "scrub").exit_code == 0
+    context.close()
+
+
+def scrubbed(context: Context) -> list[str]:
+    with context.database.read() as connection:
+        read = dataset_versions.c.scrubbed_at > context.clock() - DAY
+        return list(connection.scalars(select(dataset_versions.c.dataset).where(read, dataset_versions.c.version == 1)))

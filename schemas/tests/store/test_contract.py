@@ -184,7 +184,6 @@ def test_only_a_digest_names_an_artifact(store: Store, name: str) -> None:
         store.exists,
         store.holds,
         store.delete,
-        lambda digest: store.url(digest, seconds=1.0),
         lambda digest: store.show(digest, "ds-1", 1, "file"),
     ):
         with pytest.raises(ValueError, match=r"digest|name"):

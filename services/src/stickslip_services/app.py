@@ -48,6 +48,7 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import give_up_waiting
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
+from stickslip_services.queue.scrub import scrub_when_idle
 from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 
@@ -84,6 +85,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         services: list[tuple[Callable[[], object], float]] = [
             (partial(sweep, context), every),
             (partial(check_made_datasets, context), every),
+            (partial(scrub_when_idle, context), every),
             (Planner(context).run, PLAN_SECONDS),
             (partial(give_up_waiting, context), PLAN_SECONDS),
             (delivery.run, every),

@@ -125,9 +125,6 @@ class Store(Protocol):
     def stored(self) -> Iterator[Stored]:
         """Yield the artifacts and the leftovers, ordered by digest."""
 
-    def url(self, digest: str, *, seconds: float) -> str | None:
-        """Return where anybody can download an artifact for so long; None if the store has no such address."""
-
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
         """Let a version show an artifact at `path`. Showing it twice is no error."""
 

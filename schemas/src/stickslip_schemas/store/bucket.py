@@ -199,10 +199,6 @@ class BucketStore:
             if is_sha256(digest) and found["path"] == artifact_name(digest):
                 yield Stored(digest, found["size"], found["last_modified"].timestamp(), is_shown=False)
 
-    def url(self, digest: str, *, seconds: float) -> str | None:
-        """Return a presigned URL."""
-        return str(obstore.sign(self._objects, "GET", artifact_name(digest), timedelta(seconds=seconds)))
-
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
         source, target = artifact_name(digest), shown_name(dataset, version, path)
         self._tried(lambda: obstore.copy(self._objects, source, target))

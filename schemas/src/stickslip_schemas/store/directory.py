@@ -127,11 +127,6 @@ class DirectoryStore:
                 is_shown = is_sha256(path.name) and status.st_nlink > 1
                 yield Stored(path.name, status.st_size, status.st_mtime, is_shown)
 
-    def url(self, digest: str, *, seconds: float) -> str | None:
-        """None: files of a directory have no URL."""
-        artifact_name(digest)
-        return None
-
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
         """Where the file system has no hard links, the bytes are written a second time."""
         target = self.root / shown_name(dataset, version, path)
@@ -218,7 +213,7 @@ def sync(path: Path) -> None:
 
 
 def _link(path: Path, target: Path) -> None:
-    """Make `target` a hard link to the file at `path`, in place of what is there."""
+    """Replace `target` by a hard link to the file at `path`."""
     scratch = _scratch_path(target)
     os.link(path, scratch)
     scratch.replace(target)

@@ -38,10 +38,7 @@ class JsonBody(Generic[T]):
         if media_type != "application/json" and not media_type.endswith("+json"):
             detail = f"Content-Type must be application/json, and it is {media_type[:100]!r}"
             raise ProblemError(415, ProblemCode.malformed_body, detail)
-        try:
-            return await request.body()
-        except ClientDisconnect as error:
-            raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+        return await whole_body(request)
 
     def read(self, body: bytes) -> T:
         """Return the document in a body; raise ProblemError."""
@@ -60,6 +57,14 @@ class JsonBody(Generic[T]):
         detail = "; ".join(f"{field.pointer or 'the document'}: {field.rule}" for field in fields[:3])
         more = f" (and {count - 3} more)" if count > 3 else ""
         raise ProblemError(422, ProblemCode.validation_failed, detail + more, fields=fields)
+
+
+async def whole_body(request: Request) -> bytes:
+    """Return the raw body; raise ProblemError where it ends too soon."""
+    try:
+        return await request.body()
+    except ClientDisconnect as error:
+        raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
 
 
 def parse_json(body: bytes) -> Any:

@@ -1,17 +1,19 @@
 """Prometheus metrics: the queue and the store, read at each scrape, and counters since the start."""
 
+from collections import Counter as Counts
 from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
-from sqlalchemy import func, select
+from sqlalchemy import func, select, text
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
+from stickslip_services.database.tables import tasks as tasks_
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.workers import alive_workers, leased_counts
+from stickslip_services.queue.workers import alive_workers
 
 
 class _QueueCollector(Collector):
@@ -30,17 +32,22 @@ class _QueueCollector(Collector):
                 tasks.add_metric([stage, state], count)
             for state, count in connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)):
                 by_state.add_metric([state], count)
-            held = leased_counts(connection)
-            committed = (func.count(), func.coalesce(func.sum(dataset_versions.c.bytes), 0))
-            count, size = connection.execute(select(*committed).where(dataset_versions.c.manifest.is_not(None))).one()
+            held = Counts(connection.scalars(select(tasks_.c.owner).where(text("tasks.owner IS NOT NULL"))).all())
+            own = dataset_versions.c
+            sums = (func.count(), func.sum(own.bytes), func.sum(own.damaged), func.min(own.scrubbed_at))
+            count, size, bad, read_at = connection.execute(select(*sums).where(own.manifest.is_not(None))).one()
         versions = GaugeMetricFamily("stickslip_dataset_versions", "Dataset versions", value=count)
-        bytes_ = GaugeMetricFamily("stickslip_dataset_bytes", "Size of the files of all dataset versions", value=size)
+        size_text = "Size of the files of all dataset versions"
+        bytes_ = GaugeMetricFamily("stickslip_dataset_bytes", size_text, value=size or 0)
+        damaged = GaugeMetricFamily("stickslip_damaged_files", "Files that scrubbing found damaged", value=bad or 0)
+        age = self._context.clock() - read_at if count else 0.0
+        unread = GaugeMetricFamily("stickslip_unread_seconds", "Age of the oldest scrub of a version [s]", value=age)
         disk = GaugeMetricFamily("stickslip_store_disk_bytes", "Disk of the store", labels=["state"])
         if (room := self._context.store.room()) is not None:
             disk.add_metric(["free"], room.free)
             disk.add_metric(["used"], room.used)
         for worker in alive:
-            leases.add_metric([worker.name], held.get(worker.id, 0))
+            leases.add_metric([worker.name], held[worker.id])
         workers.add_metric([], len(alive))
         slots.add_metric([], sum(worker.condition.slots for worker in alive))
         etas = CounterMetricFamily(
@@ -50,7 +57,7 @@ class _QueueCollector(Collector):
         )
         for (kind, held_true), count in self._context.eta_watch.held.items():
             etas.add_metric([kind, str(held_true).lower()], count)
-        return [tasks, by_state, leases, workers, slots, versions, bytes_, disk, etas]
+        return [tasks, by_state, leases, workers, slots, versions, bytes_, damaged, unread, disk, etas]
 
 
 class Metrics:

@@ -1,6 +1,5 @@
 """Certificates: registering and finding them."""
 
-from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
@@ -17,17 +16,8 @@ from stickslip_services.database.tables import certificates
 from stickslip_services.errors import NotFoundError
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """The newest full certificate of a preset and a build, if it passed."""
-
-    digest: Sha256
-    protocols: frozenset[str]
-    """Names of its protocols."""
-
-
-def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> Standing | None:
-    """Return the newest full certificate of a preset and a build, if it passed."""
+def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> tuple[Sha256, list[str]] | None:
+    """Return digest and protocols of the newest full certificate of a preset and a build, if it passed."""
     columns = certificates.c
     row = connection.execute(
         select(columns.digest, columns.passed, columns.protocols)
@@ -35,7 +25,7 @@ def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) 
         .order_by(columns.created_at.desc(), columns.seq.desc())
         .limit(1)
     ).one_or_none()
-    return Standing(row.digest, frozenset(row.protocols.split())) if row is not None and row.passed else None
+    return (row.digest, row.protocols.split()) if row is not None and row.passed else None
 
 
 def register_certificate(database: Database, store: Store, upload: CertificateUpload, now: float) -> CertificateEntry:

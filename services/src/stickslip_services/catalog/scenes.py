@@ -9,7 +9,6 @@ from stickslip_schemas.scene.library import load_scene, scene_names
 
 from stickslip_services.access.asker import own
 from stickslip_services.database.tables import dataset_versions, jobs
-from stickslip_services.errors import NotFoundError
 
 KIND = "cloth_scene"
 NEWEST = 1000
@@ -46,10 +45,3 @@ def known_scenes(connection: Connection) -> dict[str, KnownScene]:
         if version in there and version not in known.versions:
             known.versions.append(version)
     return found
-
-
-def find_scene(connection: Connection, digest: str) -> KnownScene:
-    """Return the scene with a digest; raise NotFoundError."""
-    if (known := known_scenes(connection).get(digest)) is None:
-        raise NotFoundError(f"there is no scene {digest[:64]!r}")
-    return known

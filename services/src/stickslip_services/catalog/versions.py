@@ -1,6 +1,9 @@
 """Making of versions. A version exists as soon as the digest of its manifest is in the database."""
 
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.base.keys import Sha256, sha256
@@ -108,13 +111,6 @@ def version_number(connection: Connection, dataset: str, publish_task: int) -> i
     return int(connection.scalar(latest.where(dataset_versions.c.dataset == dataset)) or 0) + 1
 
 
-def version_exists(connection: Connection, dataset: str, version: int) -> bool:
-    """Return whether a version number of a dataset is taken."""
-    columns = dataset_versions.c
-    query = select(columns.version).where(columns.dataset == dataset, columns.version == version)
-    return connection.scalar(query) is not None
-
-
 def reserve_number(connection: Connection, dataset: str, version: int, publish_task: int) -> None:
     """Reserve a version number for a publish task."""
     connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task))
@@ -138,6 +134,8 @@ def commit_version(
             sample_count=summary.sample_count,
             valid_count=summary.valid_count,
             bytes=summary.bytes,
+            scrubbed_at=now,
+            damaged=0,
         )
     )
 
@@ -149,11 +147,11 @@ def find_committed(connection: Connection, publish_task: int) -> CommittedVersio
     return CommittedVersion(reference, row.sample_count, row.sample_count - row.valid_count)
 
 
-def damaged_files(store: Store, manifest: Sha256, group: Sha256) -> frozenset[Sha256] | None:
-    """Return the digests of the damaged files of a version, in the store or in the version's directory.
+def damaged_files(store: Store, manifest: Sha256, group: Sha256, *, rate: float = inf) -> Mapping[str, Sha256] | None:
+    """Return path and digest of the damaged files of a version, in the store or in the version's directory.
 
     None if the manifest, the root's metadata or the seal is damaged, so that the others are unknown. All files are
-    read. Raises OSError where the store is out of reach.
+    read, at `rate` [bytes/s]. Raises OSError where the store is out of reach.
     """
     seal = sha256(seal_text(manifest, group))
     try:
@@ -166,10 +164,13 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256) -> frozenset[Sh
         return None
     own = {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: seal}
     files = own | {file.path: file.sha256 for file in listed}
+    sizes = {file.path: file.size for file in listed}
 
     def is_whole(shown: tuple[str, Sha256]) -> bool:
         path, digest = shown
+        time.sleep(sizes.get(path, 0) / rate)
         return store.shows(digest, document.dataset, document.version, path) and store.holds(digest)
 
-    whole = in_parallel(is_whole, files.items())
-    return frozenset(digest for digest, is_good in zip(files.values(), whole, strict=True) if not is_good)
+    # Threads of a pool would read to the end before the process may end.
+    whole = in_parallel(is_whole, files.items()) if rate == inf else map(is_whole, files.items())
+    return {path: digest for (path, digest), is_good in zip(files.items(), whole, strict=True) if not is_good}

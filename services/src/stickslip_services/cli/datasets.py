@@ -117,7 +117,7 @@ def diff(
         return
     shown = table("difference", a, b)
     for difference in found:
-        shown.add_row(*map(escape, (difference.what, difference.a, difference.b)))
+        shown.add_row(*map(escape, difference))
     console().print(shown)
     raise typer.Exit(1)
 

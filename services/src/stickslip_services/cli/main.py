@@ -29,6 +29,7 @@ _COMMANDS = {
     "rm": "maintenance.rm",
     "gc": "maintenance.gc",
     "reindex": "maintenance.reindex",
+    "scrub": "maintenance.scrub",
     "scene": "scenes.scenes",
     "simulate": "scenes.simulate",
     "certify": "certificates.certify",

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +11,7 @@ import typer
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.asker import asking, this_user
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, StoreOption, say
+from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, StoreOption, say
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Database, Role
@@ -19,10 +19,24 @@ from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import CommandError, DatabaseRefusedError
 from stickslip_services.local.process import locked
 from stickslip_services.queue.cleanup import remove, unused
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.reindex import reindex as reindexed
+from stickslip_services.queue.scrub import scrub as scrubbed
 from stickslip_services.settings import Settings
 
 StoppedDataOption = Annotated[Path, typer.Option("--data", help="data directory of a coordinator that is stopped")]
+
+
+def _settings(data: Path, store: str | None, database: str | None, role: Role, *, is_new: bool = False) -> Settings:
+    """Return the settings of a coordinator; raise DatabaseRefusedError if there is no database, unless `is_new`."""
+    given = {name: value for name, value in (("store", store), ("database", database)) if value is not None}
+    settings = Settings.chosen(data=data, **given)
+    if not is_new and not check(settings, role, with_store=True):
+        raise DatabaseRefusedError(
+            f"the database {settings.database_name} does not exist or is empty: name the "
+            f"{settings.database_option} of a coordinator"
+        )
+    return settings
 
 
 @contextmanager
@@ -33,13 +47,7 @@ def _owned(
 
     Raise DatabaseRefusedError if one runs, or if there is no database and `is_new` does not allow to make one.
     """
-    given = {name: value for name, value in (("store", store), ("database", database)) if value is not None}
-    settings = Settings.chosen(data=data, **given)
-    if not is_new and not check(settings, Role.upkeep, with_store=True):
-        raise DatabaseRefusedError(
-            f"the database {settings.database_name} does not exist or is empty: name the "
-            f"{settings.database_option} of a coordinator"
-        )
+    settings = _settings(data, store, database, Role.upkeep, is_new=is_new)
     with locked(data), asking(this_user()), opened(settings, Role.upkeep) as opened_database:
         try:
             yield opened_database, open_store(settings.store_place)
@@ -62,8 +70,8 @@ def rm(
     if parts is None:
         raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {version!r}")
     with _owned(data, store, database) as (opened_database, files):
-        removed = remove(opened_database, files, parts[1], int(parts[2]))
-    typer.echo(f"{version} is removed, with {removed.jobs} jobs and {removed.tasks} results that no other job needs")
+        jobs, tasks = remove(opened_database, files, parts[1], int(parts[2]))
+    typer.echo(f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs")
     typer.echo("to free the space: stickslip gc --delete --older-than 0")
 
 
@@ -101,3 +109,27 @@ def reindex(data: StoppedDataOption = DEFAULT_DATA, store: StoreOption = None, d
     say(f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out")
     say("certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`")
     raise typer.Exit(1 if counts["bad"] else 0)
+
+
+@shows_errors
+def scrub(
+    data: DataOption = DEFAULT_DATA,
+    store: StoreOption = None,
+    database: DatabaseOption = None,
+    rate: Annotated[float, typer.Option(min=0.1, metavar="MB/S", help="read so much a second at most")] = 100.0,
+) -> None:
+    """Read all datasets, beside a running service or without one; exit with 1 if a file is damaged.
+
+    Workers recompute damaged files. Versions that were read longest ago come first, also after a stop.
+    """
+    count = bad = 0
+    settings = _settings(data, store, database, Role.visitor)
+    with asking(this_user()), closing(Context.open(settings, role=Role.visitor)) as context:
+        began = context.clock()
+        while (found := scrubbed(context, before=began, rate=1e6 * rate)) is not None:
+            version, damaged = found
+            count, bad = count + 1, bad + bool(damaged)
+            for path in damaged:
+                typer.echo(f"{version}  {path}")
+    say(f"{count} versions read, {bad} damaged" + (": a service with workers recomputes their files" if bad else ""))
+    raise typer.Exit(1 if bad else 0)

@@ -2,21 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Contents, Manifest
 from stickslip_schemas.spec.arrays import ArrayLayout
 
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """A property with its values in both versions."""
-
-    what: str
-    a: str
-    b: str
+Difference = tuple[str, str, str]
+"""A property with its values in both versions."""
 
 
 def differences(left: Contents, right: Contents) -> list[Difference]:
@@ -37,7 +30,7 @@ def _of_mappings(prefix: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Ite
     for name in sorted(a.keys() | b.keys()):
         left, right = a.get(name), b.get(name)
         if left != right:
-            yield Difference(f"{prefix} {name}".strip(), _text(left), _text(right))
+            yield f"{prefix} {name}".strip(), _text(left), _text(right)
 
 
 def _text(value: Any) -> str:
@@ -73,9 +66,9 @@ def _of_samples(a: Contents, b: Contents) -> Iterator[Difference]:
     keys_a, keys_b = ([bytes.fromhex(key) for key in contents.sample_keys()] for contents in (a, b))
     left, right = set(keys_a), set(keys_b)
     if left != right:
-        yield Difference("samples in this version only", str(len(left - right)), str(len(right - left)))
+        yield "samples in this version only", str(len(left - right)), str(len(right - left))
     elif keys_a != keys_b:
-        yield Difference("order of the samples", "differs", "differs")
+        yield "order of the samples", "differs", "differs"
 
 
 def _of_files(a: Contents, b: Contents) -> Iterator[Difference]:
@@ -83,4 +76,4 @@ def _of_files(a: Contents, b: Contents) -> Iterator[Difference]:
     if left.keys() != right.keys():
         only_a = sum(size for digest, size in left.items() if digest not in right)
         only_b = sum(size for digest, size in right.items() if digest not in left)
-        yield Difference("bytes of files in this version only", str(only_a), str(only_b))
+        yield "bytes of files in this version only", str(only_a), str(only_b)

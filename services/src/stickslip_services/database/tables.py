@@ -266,6 +266,8 @@ dataset_versions = Table(
     Column("sample_count", Integer),
     Column("valid_count", Integer),
     Column("bytes", _Wide),
+    Column("scrubbed_at", Float),  # when all its files were read last, or made
+    Column("damaged", Integer, nullable=False, server_default="0"),  # files that were damaged then
 )
 
 certificates = Table(

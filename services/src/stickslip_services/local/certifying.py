@@ -21,23 +21,28 @@ class CertifyError(CommandError):
     """The certificate is missing, damaged, or could not be measured."""
 
 
+def ask_workers(arguments: list[str], refusal: str, sort: type[CommandError]) -> str:
+    """Run the workers' program and return what it printed; raise an error of a sort where it made nothing."""
+    # The matrices of master curves are too small for the threads of NumPy's linear algebra.
+    environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
+    command = [sys.executable, "-m", "stickslip_workers", *arguments]
+    try:
+        ended = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    except OSError as error:
+        raise sort(f"the workers' program does not start: {error}") from error
+    if ended.returncode not in (0, 1) or not ended.stdout.strip():
+        raise sort(f"{refusal}: the workers' program ended with status {ended.returncode}")
+    return ended.stdout
+
+
 def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     """Run the protocols of a preset and write the certificate into `out`; progress goes to standard error.
 
     Raises:
         CertifyError: The program failed, or `out` holds another certificate.
     """
-    program = [sys.executable, "-m", "stickslip_workers", "certify"]
-    arguments = ["--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
-    # The matrices of master curves are too small for the threads of NumPy's linear algebra.
-    environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
-    try:
-        ended = subprocess.run([*program, *arguments], env=environment, stdout=subprocess.PIPE, text=True, check=False)
-    except OSError as error:
-        raise CertifyError(f"the workers' program does not start: {error}") from error
-    digest = ended.stdout.strip()
-    if ended.returncode not in (0, 1) or not digest:
-        raise CertifyError(f"no certificate was made: the workers' program ended with status {ended.returncode}")
+    arguments = ["certify", "--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
+    digest = ask_workers(arguments, "no certificate was made", CertifyError).strip()
     certificate = read_certificate(out).certificate
     if certificate.digest != digest:
         raise CertifyError(f"{out} holds another certificate than the one just made; is somebody else writing there?")

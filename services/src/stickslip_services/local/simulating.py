@@ -3,8 +3,6 @@
 import io
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +18,7 @@ from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.store import open_store
 
 from stickslip_services.errors import CommandError
+from stickslip_services.local.certifying import ask_workers
 
 RESULT_NAME = "scene.json"
 TRAJECTORY_NAME = "trajectory.npz"
@@ -125,15 +124,7 @@ def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build
 
 def _workers(arguments: list[str]) -> dict[str, Any]:
     """Run the workers' program and return its answer, which is JSON."""
-    try:
-        ended = subprocess.run(
-            [sys.executable, "-m", "stickslip_workers", *arguments], stdout=subprocess.PIPE, text=True, check=False
-        )
-    except OSError as error:
-        raise SimulateError(f"the workers' program does not start: {error}") from error
-    if ended.returncode not in (0, 1) or not ended.stdout.strip():
-        raise SimulateError("nothing was made of the scene; the workers' program says why above")
-    answer: dict[str, Any] = json.loads(ended.stdout)
+    answer: dict[str, Any] = json.loads(ask_workers(arguments, "nothing was made of the scene", SimulateError))
     return answer
 
 

@@ -8,7 +8,6 @@ import re
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, delete, select, update
 from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
@@ -40,34 +39,29 @@ from stickslip_services.errors import ConflictError, NotFoundError
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-@dataclass(frozen=True, slots=True)
-class Removed:
-    """Number of jobs and tasks removed with a version."""
+def remove(database: Database, store: Store, dataset: str, version: int) -> tuple[int, int]:
+    """Remove a version; return the number of jobs and tasks that went with it.
 
-    jobs: int
-    tasks: int
-
-
-def remove(database: Database, store: Store, dataset: str, version: int) -> Removed:
-    """Remove a version; raise NotFoundError where it does not exist, ConflictError where a job is making it."""
+    Raises NotFoundError where it does not exist, ConflictError where a job is making it.
+    """
     with database.write() as connection:
         columns = dataset_versions.c
         own = (columns.dataset == dataset, columns.version == version)
         publish_task = connection.scalar(select(columns.publish_task).where(*own))
         if publish_task is None and not store.is_shown(dataset, version):
             raise NotFoundError(f"there is no version {version} of a dataset {dataset[:100]!r}")
-        removed = Removed(0, 0)
+        jobs_, tasks_ = 0, 0
         if publish_task is not None:
-            removed = _remove_jobs(connection, publish_task)
+            jobs_, tasks_ = _remove_jobs(connection, publish_task)
             connection.execute(delete(dataset_versions).where(*own))
             if connection.scalar(select(columns.version).where(columns.dataset == dataset).limit(1)) is None:
                 connection.execute(delete(datasets).where(datasets.c.id == dataset))
-        note(connection, "version.remove", f"{dataset}:v{version}", time.time(), jobs=removed.jobs, tasks=removed.tasks)
+        note(connection, "version.remove", f"{dataset}:v{version}", time.time(), jobs=jobs_, tasks=tasks_)
     store.hide(dataset, version)  # last: a version that is in the database is always in the store
-    return removed
+    return jobs_, tasks_
 
 
-def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
+def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
     rows = connection.execute(
         select(jobs.c.seq, jobs.c.id, jobs.c.state).where(jobs.c.publish_task == publish_task)
     ).all()
@@ -96,7 +90,7 @@ def _remove_jobs(connection: Connection, publish_task: int) -> Removed:
     for (stage, state), count in counts.items():
         place: tuple[ColumnElement[bool], ...] = (task_counts.c.stage == stage, task_counts.c.state == state)
         connection.execute(update(task_counts).where(*place).values(count=task_counts.c.count - count))
-    return Removed(len(own), len(lost))
+    return len(own), len(lost)
 
 
 def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Stored]:

@@ -154,11 +154,11 @@ def _samples(connection: Connection, job: int, first: int, end: int) -> list[Any
 
 def _pack_task(connection: Connection, task: StoredTask) -> PackTask:
     payload = json.loads(task.payload)
-    spec, builds = read_plan(connection, payload["job"])
+    spec, terms = read_plan(connection, payload["job"])
     first = payload["shard"] * spec.samples_per_shard
     end = min(first + spec.samples_per_shard, spec.sample_count)
     rows = _samples(connection, payload["job"], first, end)
-    _check_key(task, pack_key(spec, payload["shard"], [(row.key.hex(), row.split) for row in rows], builds))
+    _check_key(task, pack_key(spec, payload["shard"], [(row.key.hex(), row.split) for row in rows], terms.builds))
     return PackTask.model_validate({"spec": spec, "shard": payload["shard"], "slots": _slots(connection, rows)})
 
 
@@ -188,13 +188,13 @@ def _slots(connection: Connection, rows: Sequence[Any]) -> list[dict[str, Any]]:
 def _publish_task(connection: Connection, task: StoredTask, publish: Publish) -> PublishTask:
     payload = json.loads(task.payload)
     job = payload["job"]
-    spec, builds = read_plan(connection, job)
+    spec, terms = read_plan(connection, job)
     needed = select(task_dependencies.c.depends_on).where(task_dependencies.c.task == task.seq)
     rows = _results(connection, set(connection.scalars(needed))).values()
     packed = {json.loads(row.payload)["shard"]: row for row in rows}
     certificate = payload.get("certificate")
     pack_keys = [packed[shard].key.hex() for shard in sorted(packed)]
-    _check_key(task, publish_key(spec, pack_keys, builds, certificate))
+    _check_key(task, publish_key(spec, pack_keys, terms.builds, certificate))
     outputs = [json.loads(packed[shard].output) for shard in sorted(packed)]
     size = section_samples(spec)
     sections = (
@@ -205,7 +205,7 @@ def _publish_task(connection: Connection, task: StoredTask, publish: Publish) ->
         spec=spec,
         dataset=dataset_id(spec),
         version=version_number(connection, dataset_id(spec), task.seq),
-        builds=builds,
+        builds=terms.builds,
         sections=tuple(in_parallel(publish, sections)),
         certificate=certificate,
     )

@@ -8,7 +8,7 @@ from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.clock import Clock
-from stickslip_services.database.database import Database
+from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import connect
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.eta import EtaWatch
@@ -36,9 +36,9 @@ class Context:
     is_closing: bool = False
 
     @classmethod
-    def open(cls, settings: Settings, clock: Clock | None = None) -> "Context":
+    def open(cls, settings: Settings, clock: Clock | None = None, role: Role = Role.coordinator) -> "Context":
         """Connect to the database and the store; `clock` replaces the clock of the database, for tests."""
-        database, store = connect(settings), open_store(settings.store_place)
+        database, store = connect(settings, role), open_store(settings.store_place)
         clock = clock or database.clock
         watch = StoreWatch(store, settings.data, min_free_bytes=settings.min_free_bytes, clock=clock)
         return cls(settings, database, clock, store, watch)

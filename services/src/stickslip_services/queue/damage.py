@@ -19,22 +19,23 @@ from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, row_digest
 from stickslip_services.queue.ledger import LIVE, Ending, Ledger
+from stickslip_services.queue.plan import Terms
 from stickslip_services.queue.recompute import Maker, remake
 
 
-def terms_of(row: Any) -> tuple[JobSpec, Builds | None, str | None]:
-    """Return spec, builds and certificate of a row of `jobs`; raise DamagedRowsError."""
+def terms_of(row: Any) -> tuple[JobSpec, Terms | None]:
+    """Return spec and terms of a row of `jobs`; raise DamagedRowsError."""
     if row_digest(row.spec, row.builds, row.certificate) != row.digest:
         raise DamagedRowsError
-    builds = None if row.builds is None else Builds.model_validate_json(row.builds)
-    return job_spec_adapter.validate_json(row.spec), builds, row.certificate
+    terms = None if row.builds is None else Terms(Builds.model_validate_json(row.builds), row.certificate)
+    return job_spec_adapter.validate_json(row.spec), terms
 
 
-def read_plan(connection: Connection, job: int) -> tuple[JobSpec, Builds]:
-    """Return spec and builds of a planned job; raise DamagedRowsError."""
-    spec, builds, _ = terms_of(connection.execute(select(jobs).where(jobs.c.seq == job)).one())
-    assert builds is not None
-    return spec, builds
+def read_plan(connection: Connection, job: int) -> tuple[JobSpec, Terms]:
+    """Return spec and terms of a planned job; raise DamagedRowsError."""
+    spec, terms = terms_of(connection.execute(select(jobs).where(jobs.c.seq == job)).one())
+    assert terms is not None
+    return spec, terms
 
 
 def check_samples(rows: Sequence[Any], slots: Iterable[int]) -> None:

@@ -4,7 +4,7 @@ A lease is (worker, token). The token of a task increments with each lease (fenc
 has lost its lease is recognised.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from sqlalchemy import Connection, bindparam, exists, select, text, update
@@ -24,7 +24,7 @@ from stickslip_schemas.documents.worker_api import (
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
 from stickslip_services.queue.compose import UNSOUND, AnyTask, Publish, compose_tasks
 from stickslip_services.queue.context import Context
@@ -52,7 +52,6 @@ from stickslip_services.queue.workers import (
     is_silent,
     note_seen,
     note_stranded,
-    other_sessions,
 )
 
 BUSY_POLL_SECONDS = 0.2
@@ -62,7 +61,7 @@ IDLE_POLL_SECONDS = 1.0
 def register_worker(context: Context, registration: WorkerRegistration) -> WorkerSession:
     """Register a worker; an earlier session of the name loses its leases."""
     with context.ledger() as book:
-        old = other_sessions(book.connection, registration.name)
+        old = list(book.connection.scalars(select(workers.c.id).where(workers.c.name == registration.name)))
         worker = insert_worker(book.connection, registration, book.now)
         message = f"worker {registration.name} was started anew"
         lose(book, find_held(book, owners=old), context.settings, message=message)
@@ -175,7 +174,8 @@ def _compose_leases(
                 composed |= compose_tasks(connection, [grant.task], publish)
             except UNSOUND as error:
                 damaged[grant.task.seq] = getattr(error, "results", ())
-    traceparents = _traceparents_of(connection, {grant.job for grant in grants}) if tracing.is_on() else {}
+    traced = select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_({grant.job for grant in grants}))
+    traceparents = dict(connection.execute(traced).tuples().all()) if tracing.is_on() else {}
     leases = tuple(
         Lease(
             task_id=grant.task_id,
@@ -268,9 +268,3 @@ def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[in
 
 def _is_started(lease: LeaseState, task: HeldTask) -> bool:
     return lease.started or task.state is TaskState.running
-
-
-def _traceparents_of(connection: Connection, job_seqs: Iterable[int]) -> dict[int, str]:
-    """Return the traceparents of the jobs that have one, by `seq`."""
-    rows = connection.execute(select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_(job_seqs)))
-    return {seq: traceparent for seq, traceparent in rows if traceparent is not None}

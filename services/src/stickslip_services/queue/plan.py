@@ -45,8 +45,8 @@ def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
     if builds is None:
         return None
     standing = standing_certificate(connection, spec.certified_preset, builds.sim_core)
-    missing = [] if standing is None else [name for name in spec.certified_protocols if name not in standing.protocols]
-    certificate = None if standing is None or missing else standing.digest
+    missing = [] if standing is None else [name for name in spec.certified_protocols if name not in standing[1]]
+    certificate = None if standing is None or missing else standing[0]
     if certificate is None and spec.needs_certificate:
         raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core, missing)
     return Terms(builds, certificate)
@@ -98,11 +98,6 @@ class Plan:
     def publish_key(self) -> bytes:
         """Key of the last task, of the last piece."""
         return next(reversed(self.tasks))
-
-    @property
-    def simulation_count(self) -> int:
-        """Number of different simulations."""
-        return sum(task.stage == Stage.simulate.value for task in self.tasks.values())
 
 
 @contextmanager

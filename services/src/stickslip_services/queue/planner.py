@@ -45,7 +45,7 @@ def plan_waiting_jobs(context: Context) -> None:
         terms: Terms | None = None
         refusal, reason, at_once = "", Reason.waiting_for_worker, False
         try:
-            spec, _, _ = terms_of(row)
+            spec, _ = terms_of(row)
             at_once = spec.sample_count <= context.settings.plan_samples
             with context.database.read() as connection:
                 terms = terms_for(connection, spec)
@@ -135,12 +135,12 @@ class Planner:
         return (row.seq, row.planned) == (self._job, self._end)
 
     def _begin(self, row: Row[tuple[object, ...]], packed: list[str]) -> Iterator[Plan]:
-        spec, builds, certificate = terms_of(row)
-        assert builds is not None
+        spec, terms = terms_of(row)
+        assert terms is not None
         self._job, self._end = row.seq, row.planned
         return pieces(
             spec,
-            Terms(builds, certificate),
+            terms,
             size=self._context.settings.plan_samples,
             previews=self._context.settings.previews_per_job,
             first=row.planned,

@@ -10,7 +10,7 @@ are recomputed.
 import logging
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sqlalchemy import Connection, bindparam, select, update
@@ -110,14 +110,16 @@ def check_made_datasets(context: Context, *, at_most: int | None = None) -> None
                 end_made(book, made, damaged)
 
 
-def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> None:
+def end_made(book: Ledger, made: MadeJob, damaged: Mapping[str, Sha256] | None) -> None:
     """End a job whose dataset is intact; otherwise reset the tasks that made the damaged files.
 
-    `damaged` has the digests of the damaged artifacts; None if the manifest itself cannot be trusted.
+    `damaged` has the paths and digests of the damaged files; None if the manifest itself cannot be trusted.
     """
     if made not in made_jobs(book.connection):
         return  # cancelled, or ended by another check
     if damaged is not None and not damaged:
+        own = dataset_versions.c.publish_task == made.publish_task
+        book.connection.execute(update(dataset_versions).where(own).values(scrubbed_at=book.now, damaged=0))
         ending = Ending.published(find_committed(book.connection, made.publish_task))
         book.end_job(made.job, replace(ending, message=ending.message or "every result was cached"))
         return
@@ -125,7 +127,7 @@ def end_made(book: Ledger, made: MadeJob, damaged: frozenset[Sha256] | None) -> 
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
     set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
     reopen(book, [Maker(made.publish_task, Stage.publish, TaskState.succeeded)])
-    recompute(book, made.publish_task, damaged or frozenset())
+    recompute(book, made.publish_task, damaged.values() if damaged else ())
 
 
 def reopen(book: Ledger, makers: Iterable[Maker]) -> None:

@@ -21,10 +21,9 @@ from stickslip_services.catalog.versions import (
     find_committed,
     read_version,
     reserve_number,
-    version_exists,
 )
 from stickslip_services.database.database import Database
-from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.database.tables import dataset_versions, jobs, tasks
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.ledger import Ending
 from stickslip_services.queue.plan import Terms, pieces
@@ -86,7 +85,8 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
     """Insert a version as the result of an ended job; return False where it is known."""
     terms = Terms(manifest.builds, manifest.certificate)
     with database.write() as connection:
-        if version_exists(connection, manifest.dataset, manifest.version):
+        known = select(dataset_versions).filter_by(dataset=manifest.dataset, version=manifest.version)
+        if connection.execute(known).first() is not None:
             return False
         with ledger(connection, made_at) as book:
             job = insert_job(book, manifest.spec)

@@ -8,10 +8,10 @@ task: they start no further tasks, and running ones finish and are kept.
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import Connection, func, select, text, update
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Reason, TaskState
 from stickslip_schemas.documents.responses import TaskStateEvent
 
 from stickslip_services.database.database import batches
@@ -92,7 +92,10 @@ def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, 
     release(book, task, TaskState.failed, reason=Reason.quarantined, message=message, **values)
     _emit(book, task, TaskState.failed, Reason.quarantined, message)
     for job_seq in _live_holders(book, task):
-        count = _count_failed(book.connection, job_seq)
+        # The counters follow only when the ledger is closed.
+        failed = select(func.count()).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        failed = failed.where(job_tasks.c.job == job_seq, tasks.c.state == TaskState.failed)
+        count = int(book.connection.scalar(failed) or 0)
         if count > settings.max_quarantined:
             _fail_jobs(book, task, f"{count} of its tasks were quarantined, at last {name}: {message}", settings)
             return
@@ -106,12 +109,6 @@ def _emit(book: Ledger, task: HeldTask, state: TaskState, reason: Reason, messag
     name = task_id(task.stage, task.key)
     event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
     book.emit(task.seq, event)
-
-
-def _count_failed(connection: Connection, job: int) -> int:
-    """Count rows: the counters follow only when the ledger is closed."""
-    query = select(func.count()).join(job_tasks, job_tasks.c.task == tasks.c.seq)
-    return int(connection.scalar(query.where(job_tasks.c.job == job, tasks.c.state == TaskState.failed)) or 0)
 
 
 _IS_DUE = Prepared(
@@ -157,20 +154,8 @@ def reproducer(name: str, settings: Settings) -> str:
     return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(settings.store_place)}"
 
 
-@dataclass(frozen=True, slots=True)
-class FailedTask:
-    """A task that has failed for good, or waits for another try."""
-
-    task_id: str
-    stage: Stage
-    tries: int
-    reason: str
-    message: str
-    reproducer: str
-
-
-def failed_tasks(connection: Connection, job: int, settings: Settings, count: int) -> list[FailedTask]:
-    """Return the tasks of a job that have failed or wait for a retry, newest first."""
+def failed_tasks(connection: Connection, job: int, settings: Settings, count: int) -> list[dict[str, Any]]:
+    """Return the tasks of a job that have failed or wait for a retry, newest first, with names and reproducers."""
     rows = connection.execute(
         select(tasks.c.key, tasks.c.stage, tasks.c.tries, tasks.c.reason, tasks.c.message)
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)
@@ -179,15 +164,8 @@ def failed_tasks(connection: Connection, job: int, settings: Settings, count: in
         .limit(count)
     )
     return [
-        FailedTask(
-            name := task_id(row.stage, row.key),
-            Stage(row.stage),
-            row.tries,
-            str(row.reason),
-            row.message,
-            reproducer(name, settings),
-        )
-        for row in rows
+        {**row, "task_id": (name := task_id(row.stage, row.key)), "reproducer": reproducer(name, settings)}
+        for row in rows.mappings()
     ]
 
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, func, insert, select, text, update
+from sqlalchemy import Connection, bindparam, insert, select, text, update
 from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
@@ -118,11 +118,6 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
     raise KindNotAvailableError(f"no worker makes {kind!r}; those that have registered make {kinds}")
 
 
-def other_sessions(connection: Connection, name: str) -> list[str]:
-    """Return the ids of all sessions of a worker."""
-    return list(connection.scalars(select(workers.c.id).where(workers.c.name == name)))
-
-
 def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition | None = None) -> None:
     """Store the time of a worker's last message, and how it is where that has changed."""
     values: dict[str, Any] = {"last_seen_at": now}
@@ -142,12 +137,6 @@ def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | 
         return 0
     needed = stage_builds(Builds.model_validate_json(builds))
     return sum(worker.condition.slots for worker in workers if worker.stage_builds(kind) == needed)
-
-
-def leased_counts(connection: Connection) -> dict[str, int]:
-    """Return the number of leased tasks by worker."""
-    query = select(tasks.c.owner, func.count()).where(text("tasks.owner IS NOT NULL")).group_by(tasks.c.owner)
-    return dict(connection.execute(query).all())
 
 
 def running_tasks(

@@ -4,12 +4,12 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect
 from stickslip_schemas.documents.problems import FieldError, ProblemCode
 from stickslip_schemas.documents.responses import FileUpload, TextureEntry
 from stickslip_schemas.format.pictures import UnfitPictureError
 from stickslip_schemas.scene.files import UnfitFileError
 
+from stickslip_services.api.bodies import whole_body
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, problem_responses
 from stickslip_services.catalog.uploads import store_file, store_texture
@@ -33,7 +33,7 @@ async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
     if media_type not in MEDIA_TYPES:
         detail = f"Content-Type must be {' or '.join(MEDIA_TYPES)}, and it is {media_type[:100]!r}"
         raise ProblemError(415, ProblemCode.malformed_body, detail)
-    data = await _body(request)
+    data = await whole_body(request)
     try:
         if not data.startswith(MEDIA_TYPES[media_type]):
             raise UnfitPictureError(
@@ -55,18 +55,11 @@ async def post_file(request: Request, context: ContextDep) -> FileUpload:
 
     A file that no job names is deleted by `stickslip gc` after a day.
     """
-    data = await _body(request)
+    data = await whole_body(request)
     try:
         return await run_in_threadpool(store_file, context.database, context.store, data)
     except UnfitFileError as error:
         raise _refused(error, data) from error
-
-
-async def _body(request: Request) -> bytes:
-    try:
-        return await request.body()
-    except ClientDisconnect as error:
-        raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
 
 
 def _refused(error: Exception, data: bytes) -> ProblemError:

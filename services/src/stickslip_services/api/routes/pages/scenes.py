@@ -4,7 +4,8 @@ from fastapi import APIRouter, Response
 
 from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.catalog.scenes import find_scene, known_scenes
+from stickslip_services.catalog.scenes import known_scenes
+from stickslip_services.errors import NotFoundError
 
 router = APIRouter()
 
@@ -21,5 +22,7 @@ def get_scenes(context: ContextDep) -> Response:
 def get_scene(digest: str, context: ContextDep) -> Response:
     """Show a scene: how it looks, its parameters, and the datasets made of it."""
     with context.database.read() as connection:
-        known = find_scene(connection, digest)
+        known = known_scenes(connection).get(digest)
+    if known is None:
+        raise NotFoundError(f"there is no scene {digest[:64]!r}")
     return html_page("scene.html", here="scenes", known=known, scene=known.scene)
