@@ -74,7 +74,11 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert "simulate" in read(client, "/workers")
     assert job in read(client, "/workers")
     worker.finish(*leases)
+    assert "have been read since" not in read(client, "/workers")
     worker.work()
+    assert re.search(
+        r"All datasets have been read since 20[\d: -]+ UTC: 0 files were damaged", read(client, "/workers")
+    )
     page = read(client, f"/jobs/{job}")
     assert "succeeded" in page
     assert "stickslip pull ds-" in page

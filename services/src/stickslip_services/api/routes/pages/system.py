@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from sqlalchemy import Connection
+from sqlalchemy import Connection, func, select
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 
 from stickslip_services.api.html import html_page
@@ -13,6 +13,7 @@ from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.catalog.certificates import find_certificate, list_certificates
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest
+from stickslip_services.database.tables import dataset_versions
 from stickslip_services.pages.plots import line_plot
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.workers import alive_workers, show_workers
@@ -84,9 +85,11 @@ def _workers(context: Context) -> dict[str, Any]:
             for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
             if entry.extent == "full" and entry.passed
         }
-    disk = context.store.room()
-    now = as_datetime(context.clock())
-    return {"workers": workers, "certified": certified, "disk": disk, "memory": _memory(), "now": now}
+        own = dataset_versions.c
+        read_at, damaged = connection.execute(select(func.min(own.scrubbed_at), func.sum(own.damaged))).one()
+    scrub = None if read_at is None else (as_datetime(read_at), int(damaged))
+    shown = {"workers": workers, "certified": certified, "scrub": scrub, "now": as_datetime(context.clock())}
+    return shown | {"disk": context.store.room(), "memory": _memory()}
 
 
 def _memory() -> dict[str, int] | None:
