@@ -175,7 +175,7 @@ def _compose_leases(
             except UNSOUND as error:
                 damaged[grant.task.seq] = getattr(error, "results", ())
     traced = select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_({grant.job for grant in grants}))
-    traceparents = dict(connection.execute(traced).tuples().all()) if tracing.is_on() else {}
+    traceparents = dict(connection.execute(traced).all()) if tracing.is_on() else {}
     leases = tuple(
         Lease(
             task_id=grant.task_id,
