@@ -1,11 +1,11 @@
-"""The commands `stickslip-train info`, `coco` and `export`."""
+"""The commands `stickslip-train info` and `export`."""
 
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -16,9 +16,7 @@ from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
 from stickslip_training.export import huggingface, lerobot, meshes, webdataset
-from stickslip_training.export.coco import export_coco
 from stickslip_training.export.content import Content, OnBytes
 from stickslip_training.export.writing import to_directory, to_file
 
@@ -60,20 +58,6 @@ def info(
                 array.description,
             )
         console.print(arrays)
-
-
-def coco(
-    dataset: DatasetArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="directory for images/ and annotations.json")],
-    every: Annotated[int, typer.Option(min=1, help="frames: the first and then every n-th of a clip")] = 1,
-    split: Annotated[str | None, typer.Option(help="train, validation or test; by default all")] = None,
-) -> None:
-    """Write frames and segments of cloth in COCO's format; the spec must ask for `ground_truth: [segmentation]`."""
-    if split is not None and split not in SPLITS:
-        raise typer.BadParameter(f"must be one of {', '.join(SPLITS)}; got {split!r}", param_hint="--split")
-    with readable_errors(), DatasetReader(dataset) as reader:
-        images, annotations = export_coco(reader, out, every=every, split=cast(Split | None, split))
-        Console().print(f"{images} images, {annotations} segments in {out}")
 
 
 def _megabytes(count: int) -> str:
