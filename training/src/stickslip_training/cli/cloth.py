@@ -49,7 +49,6 @@ def train(
     from stickslip_training.cloth.learner import ClothTraining, train_friction
     from stickslip_training.cloth.model import load_friction, save_friction
     from stickslip_training.engine.fit import EpochReport
-    from stickslip_training.engine.ranks import current_rank, joined
 
     console = Console()
 
@@ -57,8 +56,8 @@ def train(
         validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
         console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
 
-    with readable_errors(), joined(device) as own_device:
-        settings = ClothTraining(steps=steps, learning_rate=rate, seed=seed, threads=threads, device=own_device)
+    with readable_errors():
+        settings = ClothTraining(steps=steps, learning_rate=rate, seed=seed, threads=threads, device=device)
         first = None if start is None else load_friction(start)
         if first is not None:
             # The network knows the order of mu: its targets are as narrow as at the end.
@@ -78,8 +77,6 @@ def train(
             resume=resume,
             on_epoch=show,
         )
-        if not current_rank().is_first:
-            return
         model.card.update(source)
         save_friction(out / "friction.safetensors", model)
         (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")

@@ -47,7 +47,6 @@ from stickslip_training.engine.fit import (
     seeded,
     torch_threads,
 )
-from stickslip_training.engine.ranks import Rank
 
 SILHOUETTES = 8
 """Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and costs more."""
@@ -154,7 +153,6 @@ class FrictionLearner(Learner):
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
-        self.rank = Rank()
         self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
         self.judged = validation
@@ -193,13 +191,6 @@ class FrictionLearner(Learner):
             first = self.net.state_dict()  # heads that the start lacks begin anew
             self.net.load_state_dict(first | {n: t for n, t in start.net.state_dict().items() if n in first})
 
-    def share(self, rank: Rank) -> None:
-        if self.settings.batch_size % rank.count:
-            raise ValueError(
-                f"batch_size must be a multiple of the {rank.count} processes, and is {self.settings.batch_size}"
-            )
-        self.rank = rank
-
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
 
@@ -223,11 +214,11 @@ class FrictionLearner(Learner):
         return loss + functional.binary_cross_entropy_with_logits(net.silhouettes(crops[some].to(device)), shares)
 
     def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the crops, directions of view, materials, mu and coverage of this process's share of a step."""
-        seeds = (self.settings.seed, TRAINING, step, *self.rank.seeds)
+        """Return the crops, directions of view, materials, mu and coverage of a step."""
+        seeds = (self.settings.seed, TRAINING, step)
         random = np.random.default_rng(seeds)
         generator = torch.Generator().manual_seed(seed_of_step(*seeds))
-        count = self.settings.batch_size // self.rank.count
+        count = self.settings.batch_size
         chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
         share = random.random(count, dtype=np.float32)
         near = torch.from_numpy(share)[:, None, None, None, None]

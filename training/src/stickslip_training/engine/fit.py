@@ -2,8 +2,7 @@
 
 What is learned is a `Learner`'s business. A run is a function of its settings: every step draws its batch from the seed
 and its own number, and torch's generator is seeded with both, so the same settings, data, machine and number of threads
-give the same weights, and a run that is resumed goes on exactly as if it had not stopped. Several processes may train
-one network: see `ranks`.
+give the same weights, and a run that is resumed goes on exactly as if it had not stopped.
 """
 
 import copy
@@ -21,7 +20,6 @@ import torch
 from torch import nn
 
 from stickslip_training.engine.files import load_tensors, save_tensors
-from stickslip_training.engine.ranks import Rank, averaged, current_rank, of_first, weights_of_first
 
 CHECKPOINT_NAME = "checkpoint.pt"
 
@@ -65,14 +63,7 @@ class Learner(ABC):
 
     @abstractmethod
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
-        """Return the loss of the batch of `step`, which must depend on nothing but the seed, `step` and the share."""
-
-    def share(self, rank: Rank) -> None:
-        """Take the share of `rank` of every batch from now on; the mean of the shares' losses is that of the batch.
-
-        Raises ValueError where the model is not one for several processes.
-        """
-        raise ValueError(f"one process must train this model, and there are {rank.count}")
+        """Return the loss of the batch of `step`, which must depend on nothing but the seed and `step`."""
 
     def learning_rate(self, step: int) -> float | None:
         """Return the learning rate of `step`; None leaves that of the optimiser."""
@@ -133,8 +124,7 @@ def fit(
 ) -> Fitted:
     """Train the network of `learner`.
 
-    A checkpoint is kept below `out`, where one is given. Of several processes the first writes it, validates and
-    reports; all must see `out`. With `resume` the run goes on from it; `identity` and the
+    A checkpoint is kept below `out`, where one is given. With `resume` the run goes on from it; `identity` and the
     settings but for the length, threads and device must be those of the run that is resumed, or ValueError is raised.
     """
     with torch_threads(settings.threads), torch.random.fork_rng():
@@ -154,13 +144,9 @@ class _Run:
         self.settings = settings
         self.checkpoint_path = None if out is None else out / CHECKPOINT_NAME
         kept = ("epoch", "seed", "averaging", "clip")
-        self.rank = current_rank()
-        if self.rank.count > 1:
-            learner.share(self.rank)
-        self.identity = identity | {name: getattr(settings, name) for name in kept} | {"processes": self.rank.count}
+        self.identity = identity | {name: getattr(settings, name) for name in kept}
         self.on_epoch = on_epoch
         self.net = learner.net.to(settings.device)  # the learner sees it move, and puts its batches there
-        weights_of_first(self.net)
         self.averaged = copy.deepcopy(self.net).eval()
         self.optimizer = learner.optimizer(self.net.parameters())
         self.state = _State()
@@ -180,7 +166,6 @@ class _Run:
                 self._checkpoint()
                 checkpointed = state.seconds
         self._checkpoint()
-        of_first(None)  # wait: a process may go on from the checkpoint at once
         if state.epoch_losses:
             # The steps ended in the middle of an epoch. That is news for this run's report and model, and not for the
             # checkpoint: a run that goes on from it will end the epoch.
@@ -190,7 +175,7 @@ class _Run:
 
     def _step(self) -> None:
         state = self.state
-        torch.manual_seed(seed_of_step(self.settings.seed, state.step, *self.rank.seeds))
+        torch.manual_seed(seed_of_step(self.settings.seed, state.step))
         rate = self.learner.learning_rate(state.step)
         if rate is not None:
             for group in self.optimizer.param_groups:
@@ -199,7 +184,6 @@ class _Run:
         loss = self.learner.loss(self.net, state.step)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-        loss = averaged(self.net, loss)
         if self.settings.clip is not None:
             nn.utils.clip_grad_norm_(self.net.parameters(), self.settings.clip)
         self.optimizer.step()
@@ -220,7 +204,7 @@ class _Run:
     def _end_epoch(self) -> None:
         """Validate, keep the weights if they are the best so far (or if there is nothing to choose them by), report."""
         state = self.state
-        validation = of_first(self.learner.validate(self.averaged.eval()) if self.rank.is_first else None)
+        validation = self.learner.validate(self.averaged.eval())
         report = EpochReport(
             epoch=-(-state.step // self.settings.epoch),
             step=state.step,
@@ -234,13 +218,13 @@ class _Run:
             state.best_loss = math.inf if validation is None else validation
             state.best_step = state.step
             state.best = {name: tensor.detach().cpu().clone() for name, tensor in self.averaged.state_dict().items()}
-        if self.on_epoch is not None and self.rank.is_first:
+        if self.on_epoch is not None:
             self.on_epoch(report)
 
     # --- checkpoints ------------------------------------------------------------------------------------------
 
     def _checkpoint(self) -> None:
-        if self.checkpoint_path is None or not self.rank.is_first:
+        if self.checkpoint_path is None:
             return
         content = {
             "identity": self.identity,
