@@ -47,11 +47,10 @@ def same(found: Any, wanted: np.ndarray) -> bool:
     return found.dtype == wanted.dtype and found.shape == wanted.shape and found.tobytes() == wanted.tobytes()
 
 
-@pytest.mark.parametrize("gzip", [0, 4])
-def test_hdf5_is_the_source(source: Any, tmp_path: Path, gzip: int) -> None:
+def test_hdf5_is_the_source(source: Any, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'")
     target = tmp_path / "out.h5"
-    export(source, "--hdf5", target, "--gzip", gzip)
+    export(source, "--hdf5", target)
     wanted = expected(source)
     with h5py.File(target) as file:
         assert set(file) == {*wanted, "manifest.json"}
@@ -151,7 +150,6 @@ def test_the_same_export_has_the_same_bytes(clips: Any, tmp_path: Path) -> None:
     [
         ([], "an export needs one of --hdf5, --webdataset, --huggingface, --lerobot, --obj, and has none"),
         (["--webdataset", "OUT", "--huggingface", "OUT"], "and has --webdataset, --huggingface"),
-        (["--webdataset", "OUT", "--gzip", "3"], "--gzip is for --hdf5 only"),
         (["--webdataset", "OUT", "--arrays", "movie"], "got 'movie'"),
         (["--webdataset", "OUT", "--split", "all"], "split: Input should be 'train', 'validation' or 'test'"),
         (["--webdataset", "OUT", "--where", "mu>9"], "no valid sample is in this part"),

@@ -83,7 +83,6 @@ def export(
     split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
     where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
     licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
-    gzip: Annotated[int, typer.Option(min=0, max=9, help="level of compression in HDF5; 0: none")] = 0,
 ) -> None:
     """Write a dataset in a format that other libraries read. Nothing is overwritten."""
     targets = {
@@ -98,15 +97,13 @@ def export(
         if len(given) != 1:
             raise ValueError(f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}")
         [(option, target)] = given.items()
-        if gzip and option != "--hdf5":
-            raise ValueError("--gzip is for --hdf5 only")
         _require(option)
         selection = Selection.of_options(arrays, split, where)
         with DatasetReader(dataset) as reader:
             content = Content(reader, selection)
             with _progress(content) as on_bytes:
                 if option == "--hdf5":
-                    to_file(content, target, on_bytes, gzip=gzip, licence=licence)
+                    to_file(content, target, on_bytes, licence=licence)
                 else:
                     to_directory(content, target, on_bytes, _DIRECTORIES[option], licence=licence)
         skipped = len(reader) - len(content.slots)

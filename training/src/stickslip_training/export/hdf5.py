@@ -15,8 +15,8 @@ from stickslip_training.export.content import Content, OnBytes
 CHUNK_BYTES = 2**20
 
 
-def write(content: Content, path: Path, on_bytes: OnBytes, *, gzip: int = 0) -> None:
-    """Write the file; `gzip` is a level from 1, small and quick, to 9, or 0 for none."""
+def write(content: Content, path: Path, on_bytes: OnBytes) -> None:
+    """Write the file."""
     import h5py
 
     with h5py.File(path, "x") as file:
@@ -25,10 +25,10 @@ def write(content: Content, path: Path, on_bytes: OnBytes, *, gzip: int = 0) -> 
         manifest = np.frombuffer(content.manifest(), dtype=np.uint8)
         file.create_dataset("manifest.json", data=manifest, chunks=manifest.shape, compression="gzip", fletcher32=True)
         for array in content.arrays:
-            _write_array(file, content, array, gzip, on_bytes)
+            _write_array(file, content, array, on_bytes)
 
 
-def _write_array(file: object, content: Content, array: ArrayLayout, gzip: int, on_bytes: OnBytes) -> None:
+def _write_array(file: object, content: Content, array: ArrayLayout, on_bytes: OnBytes) -> None:
     import h5py
 
     assert isinstance(file, h5py.Group)
@@ -39,9 +39,6 @@ def _write_array(file: object, content: Content, array: ArrayLayout, gzip: int, 
         shape=(count, *array.shape),
         dtype=array.dtype,
         chunks=(rows, *array.shape),
-        compression="gzip" if gzip else None,
-        compression_opts=gzip or None,
-        shuffle=bool(gzip),
         fletcher32=True,
     )
     for dimension, name in zip(out.dims, ("sample", *array.dimensions), strict=True):

@@ -32,11 +32,11 @@ def to_directory(
         (scratch / croissant.CROISSANT_NAME).write_bytes(metadata)
 
 
-def to_file(content: Content, target: Path, on_bytes: OnBytes, *, gzip: int = 0, licence: str | None = None) -> None:
+def to_file(content: Content, target: Path, on_bytes: OnBytes, *, licence: str | None = None) -> None:
     """Write an HDF5 file, with Croissant metadata beside it: `NAME.croissant.json`."""
     beside = target.with_name(f"{target.name}.{croissant.CROISSANT_NAME}")
     with made_whole(target) as scratch, made_whole(beside) as metadata:
-        hdf5.write(content, scratch, on_bytes, gzip=gzip)
+        hdf5.write(content, scratch, on_bytes)
         metadata.write_bytes(croissant.document(content, {target.name: scratch}, licence=licence))
 
 
