@@ -21,7 +21,7 @@ from stickslip_sim_core.rods.general import (
     rod_stiffness,
     solve_general_rods,
 )
-from stickslip_sim_core.rods.solve import RodSolution, check_count, finite_array
+from stickslip_sim_core.rods.solve import RodSolution, finite_array
 from stickslip_sim_core.rods.splines import bspline_matrix, interpolation_matrix
 
 ELEMENTS_MIN = 96
@@ -29,6 +29,12 @@ ELEMENTS_MIN = 96
 
 CANDIDATES = 4
 """Rods of the library from which a fit starts."""
+
+RANGES = ((60.0, 2000.0), (0.0, 14.0), (4.0, 22.0))
+"""Of gamma, phi0 and phi1 in the library."""
+
+INTERVALS = 24
+"""Knot intervals of the splines of natural curvature."""
 
 ITERATIONS_MAX = 40
 """Accepted and refused steps of one minimisation together."""
@@ -100,31 +106,24 @@ def fit_parameters(
     *,
     gamma: float | None = None,
     stiffness: ArrayLike = STIFFNESS,
-    clamp_frame: ArrayLike = CLAMP_FRAME,
-    gamma_range: tuple[float, float] = (60.0, 2000.0),
-    phi0_range: tuple[float, float] = (0.0, 14.0),
-    phi1_range: tuple[float, float] = (4.0, 22.0),
 ) -> ParameterFit:
     """Fit (gamma, phi0, phi1) to a centreline, by Levenberg's and Marquardt's method from several starts.
 
-    The starts are the nearest of 640 rods over the ranges, hung once per setting and kept; the fit may leave them.
+    The starts are the nearest of 640 rods over RANGES, hung once per setting and kept; the fit may leave the ranges.
 
     Args:
         centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc length, z up, shape
             (P, 3), P >= 8.
         gamma: Weight against bending if it is known; None: fitted.
         stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
-        clamp_frame: R(0), columns d1 (tangent), d2, d3, shape (3, 3).
-        gamma_range, phi0_range, phi1_range: Where the starts lie.
 
     Raises:
         ValueError: An argument breaks its rule; the message names the field, the rule and the value.
         RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
-    model = _Model.of(len(data), stiffness, clamp_frame, intervals=None)
-    ranges = _ranges(gamma, gamma_range, phi0_range, phi1_range)
-    state = _fit_constant(model, data, ranges, gamma is None, components=(0, 2))
+    model = _Model.of(len(data), stiffness, intervals=None)
+    state = _fit_constant(model, data, gamma, components=(0, 2))
     jacobian = model.jacobian(state)[:, [0, 1, 3]]
     used = np.array([gamma is None, True, True])
     variance = (state.residual(data) ** 2).sum() / (data.size - 3 - used.sum())
@@ -143,11 +142,6 @@ def fit_natural_curvature(
     gamma: float | None = None,
     noise: float | None = None,
     stiffness: ArrayLike = STIFFNESS,
-    clamp_frame: ArrayLike = CLAMP_FRAME,
-    intervals: int = 24,
-    gamma_range: tuple[float, float] = (60.0, 2000.0),
-    phi0_range: tuple[float, float] = (0.0, 14.0),
-    phi1_range: tuple[float, float] = (4.0, 22.0),
 ) -> NaturalFit:
     """Fit natural curvature along the rod to a noisy centreline.
 
@@ -167,31 +161,25 @@ def fit_natural_curvature(
         gamma: Weight against bending if it is known; None: fitted.
         noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it is known. Give it when the
             noise is correlated along the rod: cross validation takes it for white.
-        stiffness, clamp_frame: As for `fit_parameters`.
-        intervals: Knot intervals of the splines.
-        gamma_range, phi0_range, phi1_range: Where the starts lie.
+        stiffness: As for `fit_parameters`.
 
     Raises:
         ValueError: An argument breaks its rule; the message names the field, the rule and the value.
         RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
-    check_count("intervals", intervals)
-    if intervals < 1:
-        raise ValueError(f"intervals: must be at least 1, got {intervals}")
     if noise is not None and not noise > 0:
         raise ValueError(f"noise: must be > 0, got {noise}")
-    ranges = _ranges(gamma, gamma_range, phi0_range, phi1_range)
-    constant = _Model.of(len(data), stiffness, clamp_frame, intervals=None)
-    uniform = _fit_constant(constant, data, ranges, gamma is None, components=(0, 1, 2))
-    model = _Model.of(len(data), stiffness, clamp_frame, intervals=intervals)
-    coefficients = np.tile(uniform.coefficients, (intervals + 3, 1))
+    constant = _Model.of(len(data), stiffness, intervals=None)
+    uniform = _fit_constant(constant, data, gamma, components=(0, 1, 2))
+    model = _Model.of(len(data), stiffness, intervals=INTERVALS)
+    coefficients = np.tile(uniform.coefficients, (INTERVALS + 3, 1))
     state = model.relax(uniform.gamma, coefficients, uniform.frames)
     assert state is not None  # the same rod as before
 
-    free = np.arange(0 if gamma is None else 1, 1 + 3 * (intervals + 3))
-    penalty = np.zeros((1 + 3 * (intervals + 3),) * 2)
-    differences = np.diff(np.eye(intervals + 3), axis=0)
+    free = np.arange(0 if gamma is None else 1, 1 + 3 * (INTERVALS + 3))
+    penalty = np.zeros((1 + 3 * (INTERVALS + 3),) * 2)
+    differences = np.diff(np.eye(INTERVALS + 3), axis=0)
     penalty[1:, 1:] = np.kron(np.eye(3), differences.T @ differences)
     jacobian = model.jacobian(state)
     scale = np.trace(jacobian.T @ jacobian) / np.trace(penalty)
@@ -217,7 +205,7 @@ def fit_natural_curvature(
     _, state, used, decade = best
     state = _minimise(model, state, data, free, 10.0**decade * scale * penalty, STEP_TOLERANCE)
     misfit = float((state.residual(data) ** 2).sum())
-    samples = bspline_matrix(intervals, np.linspace(0.0, 1.0, len(data))) @ state.coefficients
+    samples = bspline_matrix(INTERVALS, np.linspace(0.0, 1.0, len(data))) @ state.coefficients
     return NaturalFit(
         samples,
         state.gamma,
@@ -248,13 +236,12 @@ class _Model:
 
     stiffness: Floats
     clamp: Floats  # quaternion
-    clamp_frame: Floats
     intervals: int | None  # None: constant
     strides: tuple[int, ...]  # of the chains, in elements per point
     bases: tuple[Floats, ...]  # spline values in the middles of each chain's elements
 
     @staticmethod
-    def of(points: int, stiffness: ArrayLike, clamp_frame: ArrayLike, intervals: int | None) -> "_Model":
+    def of(points: int, stiffness: ArrayLike, intervals: int | None) -> "_Model":
         stride = -(-ELEMENTS_MIN // (points - 1))
         strides = (stride, 2 * stride)
         bases = []
@@ -262,8 +249,8 @@ class _Model:
             n = k * (points - 1)
             middles = (np.arange(n) + 0.5) / n
             bases.append(np.ones((n, 1)) if intervals is None else bspline_matrix(intervals, middles))
-        K, clamp = rod_stiffness(stiffness, 1)[0], clamp_quaternions(clamp_frame, 1)[0]
-        return _Model(K, clamp, np.asarray(clamp_frame, dtype=np.float64), intervals, strides, tuple(bases))
+        K, clamp = rod_stiffness(stiffness, 1)[0], clamp_quaternions(CLAMP_FRAME, 1)[0]
+        return _Model(K, clamp, intervals, strides, tuple(bases))
 
     def relax(self, gamma: float, coefficients: Floats, frames: tuple[Floats, ...]) -> _State | None:
         """Hang the rod from `frames` on; None if there is no stable equilibrium nearby."""
@@ -314,7 +301,6 @@ class _Model:
             natural[None],
             [state.gamma],
             stiffness=self.stiffness,
-            clamp_frame=self.clamp_frame,
             start_curvature=start[None],
             elements=elements,
             points=points,
@@ -358,13 +344,13 @@ def _minimise(
     return state
 
 
-def _fit_constant(
-    model: _Model, data: Floats, ranges: tuple[tuple[float, float], ...], free_gamma: bool, components: tuple[int, ...]
-) -> _State:
+def _fit_constant(model: _Model, data: Floats, known_gamma: float | None, components: tuple[int, ...]) -> _State:
     """Fit a uniform rod from the nearest rods of the library."""
-    library = _library(len(data), tuple(model.stiffness), model.clamp_frame.tobytes(), ranges)
+    if known_gamma is not None and not (np.isfinite(known_gamma) and known_gamma > 0):
+        raise ValueError(f"gamma: must be > 0, got {known_gamma}")
+    library = _library(len(data), tuple(model.stiffness), known_gamma)
     distance = np.linalg.norm(library.centerline - data, axis=(1, 2))
-    free = np.array([0] * free_gamma + [1 + c for c in components])
+    free = np.array([0] * (known_gamma is None) + [1 + c for c in components])
     best: _State | None = None
     for i in np.argsort(distance)[:CANDIDATES]:
         gamma, coefficients = library.gamma[i], library.natural[i]
@@ -390,38 +376,19 @@ class _Library:
 
 
 @lru_cache(maxsize=8)
-def _library(
-    points: int, stiffness: tuple[float, ...], clamp: bytes, ranges: tuple[tuple[float, float], ...]
-) -> _Library:
-    """Hang rods over the ranges of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 where gamma is known."""
-    known = ranges[0][0] == ranges[0][1]
+def _library(points: int, stiffness: tuple[float, ...], known_gamma: float | None) -> _Library:
+    """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 where gamma is known."""
+    per_axis = 8 if known_gamma is None else 16
     axes = (
-        np.geomspace(*ranges[0], 1 if known else 10),
-        np.linspace(*ranges[1], 16 if known else 8),
-        np.linspace(*ranges[2], 16 if known else 8),
+        np.geomspace(*RANGES[0], 10) if known_gamma is None else np.array([float(known_gamma)]),
+        np.linspace(*RANGES[1], per_axis),
+        np.linspace(*RANGES[2], per_axis),
     )
     gamma, phi0, phi1 = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     natural = np.stack([phi0, 0.0 * phi0, phi1], axis=1)
-    frame = np.frombuffer(clamp).reshape(3, 3)
-    rods = solve_general_rods(
-        natural[:, None], gamma, stiffness=stiffness, clamp_frame=frame, elements=96, points=points
-    )
+    rods = solve_general_rods(natural[:, None], gamma, stiffness=stiffness, elements=96, points=points)
     good = rods.stable
     return _Library(gamma[good], natural[good], rods.centerline[good], rods.curvature[good])
-
-
-def _ranges(gamma: float | None, *ranges: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-    """Ranges of gamma, phi0, phi1, checked; a known gamma is a range of one."""
-    if gamma is not None:
-        if not (np.isfinite(gamma) and gamma > 0):
-            raise ValueError(f"gamma: must be > 0, got {gamma}")
-        ranges = ((float(gamma), float(gamma)), *ranges[1:])
-    for name, (low, high) in zip(("gamma_range", "phi0_range", "phi1_range"), ranges, strict=True):
-        if not (np.isfinite(low) and np.isfinite(high) and low <= high):
-            raise ValueError(f"{name}: must be finite and ascending, got {(low, high)}")
-    if not ranges[0][0] > 0:
-        raise ValueError(f"gamma_range: must be > 0, got {ranges[0]}")
-    return ranges
 
 
 def _centerline(centerline: ArrayLike) -> Floats:
