@@ -11,16 +11,30 @@ the load is printed with them.
 import argparse
 import asyncio
 import itertools
+import json
 import os
+import resource
 import tempfile
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
 import httpx
+from stickslip_schemas.documents.worker_api import Heartbeat, LeaseState
+from stickslip_services.access.keys import create_key
+from stickslip_services.access.scopes import Scope
 from stickslip_services.addresses import DATABASE_VARIABLE
+from stickslip_services.api.connections import allow_many_files
+from stickslip_services.api.sse import MOST_STREAMS
+from stickslip_services.database.database import Role
+from stickslip_services.database.opening import connect
+from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import HttpApi, ServerProcess, start_server
 from stickslip_testing.worker import PretendWorker
@@ -133,16 +147,132 @@ async def report_clients(server: ServerProcess, worker: PretendWorker, count: in
     print(f"{count} clients, one request a second each: p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} ms")
 
 
+async def report_idle_streams(server: ServerProcess, worker: PretendWorker, count: int, seconds: float) -> None:
+    """Open idle event streams from as many addresses and keys as they need, and 100 too many; use the API meanwhile."""
+    job, watched = submit(server, 800, poisson=0.33), submit(server, 4, poisson=0.331)
+    httpx.post(f"{server.url}/v1/jobs/{watched}:pause", trust_env=False).raise_for_status()
+    host, port = server.url.removeprefix("http://").split(":")
+    database = connect(Settings.chosen(data=server.data), Role.visitor)
+    with database.write() as connection:
+        names = [f"stream-{number}" for number in range(1 + count // MOST_STREAMS)]
+        keys = [create_key(connection, name, [Scope.admin], time.time())[1] for name in names]
+    database.close()
+    await asyncio.sleep(2)  # a coordinator looks for new keys once a second
+    request = f"GET /v1/jobs/{watched}/events HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer "
+    statuses: Counter[bytes] = Counter()
+    writers: list[asyncio.StreamWriter] = []
+
+    async def open_stream(number: int) -> None:
+        which = number // MOST_STREAMS
+        reader, writer = await asyncio.open_connection(host, int(port), local_addr=(f"127.0.0.{1 + which}", 0))
+        writer.write(f"{request}{keys[which]}\r\n\r\n".encode())
+        statuses[(await reader.readline()).split()[1]] += 1
+        writers.append(writer)
+        with suppress(OSError):
+            while await reader.read(65536):  # what nobody reads would stay in the server
+                pass
+
+    took: dict[str, list[float]] = {"worker API": [], "reads": []}
+
+    def use(client: httpx.Client) -> None:
+        def timed(what: str, call: Callable[[], object]) -> Any:
+            begin = time.perf_counter()
+            answer = call()
+            took[what].append(time.perf_counter() - begin)
+            return answer
+
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            leases = timed("worker API", partial(worker.lease, simulate=1))
+            timed("worker API", partial(worker.start, *leases))
+            timed("worker API", partial(worker.finish, *leases))
+            for path in ("/v1/jobs", f"/v1/jobs/{job}", "/v1/workers"):
+                timed("reads", partial(client.get, server.url + path))
+            time.sleep(0.1)
+
+    async def measure(what: str) -> None:
+        for times in took.values():
+            times.clear()
+        cpu = cpu_seconds(server)
+        with httpx.Client(trust_env=False, timeout=30) as client:
+            await asyncio.to_thread(use, client)
+        share = (cpu_seconds(server) - cpu) / seconds
+        print(f"{what}: {share:.0%} of a core, {memory(server):.0f} MiB, load {os.getloadavg()[0]:.1f}")
+        for name, times in took.items():
+            times.sort()
+            p50, p99 = (1e3 * times[int(part * len(times))] for part in (0.5, 0.99))
+            print(f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest {1e3 * times[-1]:.0f} ms")
+
+    await measure("no stream")
+    readers = []
+    for number in range(count + 100):
+        readers.append(asyncio.create_task(open_stream(number)))
+        if number % 50 == 49:
+            await asyncio.sleep(0.1)
+    while statuses.total() < count + 100:
+        await asyncio.sleep(0.1)
+    await measure(f"{count} idle streams and 100 too many, {dict(statuses)}")
+    for reader, writer in zip(readers, writers, strict=True):
+        writer.close()
+        reader.cancel()
+
+
+def memory(server: ServerProcess) -> float:
+    """Return the memory of a server [MiB]."""
+    return int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+
+def report_heartbeats(server: ServerProcess, worker: PretendWorker, held: int, senders: int, seconds: float) -> None:
+    """Send heartbeats of workers with so many leases each, over connections that are kept."""
+    submit(server, held * senders, poisson=0.34)
+    key = (server.data / "worker-key").read_text().strip()
+    counts = [0] * senders
+    bodies = []
+    for number in range(senders):
+        one = PretendWorker(worker.api, server.store, name=f"beats-{number}").register()
+        leases = tuple(LeaseState(task_id=i.task_id, token=i.token, started=False) for i in one.lease(simulate=held))
+        assert len(leases) == held
+        bodies.append(Heartbeat(worker_id=one.id, leases=leases, condition=one.condition).model_dump_json())
+    end = time.perf_counter() + seconds
+
+    def send(number: int) -> None:
+        connection = HTTPConnection(server.url.removeprefix("http://"), timeout=60)
+        headers = {"Authorization": f"Bearer {key}", "Content-Type": "application/json"}
+        while time.perf_counter() < end:
+            connection.request("POST", "/v1/worker/heartbeat", bodies[number], headers)
+            assert json.loads(connection.getresponse().read()) == {"drop": []}
+            counts[number] += 1
+
+    threads = [threading.Thread(target=send, args=(number,)) for number in range(senders)]
+    cpu, other = cpu_seconds(server), database_seconds()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    total = sum(counts)
+    spent, database = (
+        1e3 * (after - before) / total for after, before in ((cpu_seconds(server), cpu), (database_seconds(), other))
+    )
+    print(
+        f"heartbeats with {held} leases, {senders} workers: {total / seconds:.0f} a second, {spent:.2f} CPU ms each"
+        + (f" and {database:.2f} of PostgreSQL" if DATABASE_VARIABLE in os.environ else "")
+    )
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--watchers", type=int, default=500)
     parser.add_argument("--clients", type=int, default=50)
+    parser.add_argument("--streams", type=int, default=0, help="idle event streams; 2000 are the most")
+    parser.add_argument("--beats", type=int, default=0, help="workers that send heartbeats with 64 leases each")
+    parser.add_argument("--tasks", type=int, default=6401, help="to lease and complete; 0: none")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--database", help="URL of an empty PostgreSQL database")
     options = parser.parse_args()
     if options.database is not None:
         os.environ[DATABASE_VARIABLE] = options.database
+    allow_many_files()
     with tempfile.TemporaryDirectory() as directory:
         server = start_server(Path(directory) / "data")
         try:
@@ -151,8 +281,13 @@ def main() -> None:
                 key = (server.data / "worker-key").read_text().strip()
                 steady = PretendWorker(HttpApi(server.url, key, client.post), server.store, name="steady").register()
                 print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-                report_lease_and_complete(server, steady, 1, 601)
-                report_lease_and_complete(server, steady, 16, 6401)
+                if options.tasks:
+                    report_lease_and_complete(server, steady, 1, 1 + options.tasks // 10)
+                    report_lease_and_complete(server, steady, 16, options.tasks)
+                if options.streams:
+                    asyncio.run(report_idle_streams(server, steady, options.streams, options.seconds))
+                if options.beats:
+                    report_heartbeats(server, steady, 64, options.beats, options.seconds)
             if options.watchers:
                 asyncio.run(report_watchers(server, worker, options.watchers, options.seconds))
             if options.clients:

@@ -3,14 +3,12 @@
 import pytest
 from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.documents.responses import Eta
 from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.documents.worker_api import Heartbeat, Lease, LeaseRequest, LeaseState
-from stickslip_services.api.metrics import Metrics
 from stickslip_services.database.tables import cost_groups
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job
+from stickslip_services.queue.control import cancel_job, prioritise_job
 from stickslip_services.queue.eta import KEPT_RUNS, MEASURED, TIMES, Cost, StageTimings, limit_seconds
 from stickslip_services.queue.lease import heartbeat, lease_tasks
 from stickslip_services.queue.submit import submit_job
@@ -351,34 +349,3 @@ def test_a_failed_result_tells_no_cost(context: Context, worker: PretendWorker) 
     worker.report((lease, result))
     with context.database.read() as connection:
         assert connection.execute(select(cost_groups)).all() == []
-
-
-def test_it_is_counted_how_often_the_time_left_held(
-    context: Context, worker: PretendWorker, clock: ManualClock
-) -> None:
-    submit(context, gamma=(1.0, 2.0, 3.0, 4.0), phi1=(1.0,), views=None)  # to learn from: 10 s a simulation
-    while leases := worker.lease():
-        for lease in leases:
-            finish(worker, lease, 10.0)
-    paused = submit(context, gamma=(5.0, 6.0), phi1=(1.0,), views=None)
-    sweep(context)
-    assert context.eta_watch.watched == {paused}
-    pause_job(context, paused)
-    clock.advance(5)
-    sweep(context)
-    assert context.eta_watch.watched == frozenset()
-    cancel_job(context, paused)
-    job = show_job(context, submit(context, gamma=(11.0, 12.0), phi1=(1.0,), views=None))
-    watch, begin = context.eta_watch, clock()
-    for low, high in ((0.0, 50.0), (90.0, 110.0), (20.0, 200.0)):  # it will end after 100 s
-        eta = Eta(seconds=(low + high) / 2, low=low, high=high)
-        told = job.model_copy(update={"progress": job.progress.model_copy(update={"eta": eta})})
-        watch.look({job.id: told}, begin)
-    assert watch.held == {}
-    clock.advance(100)
-    worker.work()
-    clock.advance(60)
-    sweep(context)
-    assert watch.held == {("rod_hang", True): 2, ("rod_hang", False): 1}
-    metrics = Metrics(context).text().decode()
-    assert 'stickslip_eta_predictions_total{held="true",kind="rod_hang"} 2.0' in metrics

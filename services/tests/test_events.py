@@ -164,10 +164,11 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     assert app.state.feeds._feeds == {}  # nobody watches any more
 
 
-def test_an_address_has_only_so_many_streams(
-    client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("limit", ["MOST_STREAMS", "ALL_STREAMS"])
+def test_an_address_has_only_so_many_streams_and_so_have_all(
+    client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
-    monkeypatch.setattr("stickslip_services.api.sse.MOST_STREAMS", 2)
+    monkeypatch.setattr(f"stickslip_services.api.sse.{limit}", 2)
     path = f"/v1/jobs/{client.post('/v1/jobs', json=rods(gamma=(77.0,))).json()['id']}/events"
     with client.stream("GET", path), client.stream("GET", path):
         for refused in (client.get(path), client.get("/ui/changes")):

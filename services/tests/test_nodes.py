@@ -8,12 +8,9 @@ STICKSLIP_KILLS=100 pytest -m slow services/tests/test_nodes.py -s
 
 import os
 import random
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,10 +24,10 @@ from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
 from stickslip_services.database.opening import connect
 from stickslip_services.database.tables import dataset_versions
-from stickslip_services.local.process import listen
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import rods
+from stickslip_testing.nodes import WORKER, Node, free_port, is_ready
 from stickslip_testing.servers import wait_until
 from typer.testing import CliRunner
 
@@ -45,51 +42,6 @@ SAMPLES = 60
 """Samples of each of the jobs that run while processes are killed."""
 FAULTS = {"503": 0.02, "late": 0.01, "lost answer": 0.01}
 """Shares of all requests to the bucket."""
-
-WORKER = """
-import sys, time
-import httpx
-from stickslip_schemas.store import open_store
-from stickslip_testing.worker import PretendWorker
-from stickslip_testing.servers import HttpApi
-
-name, key, place, url = sys.argv[1:]
-store = open_store(place)
-while True:
-    try:
-        worker = PretendWorker(HttpApi(url, key), store, name=name, whole=False).register()
-        while True:
-            leases = worker.lease(simulate=4, render=4, pack=1, publish=1)
-            worker.start(*leases)
-            for lease in leases:
-                worker.finish(lease)
-            time.sleep(0 if leases else 0.1)
-    except httpx.HTTPError:
-        time.sleep(0.1)
-"""
-
-
-class Node:
-    """A process that is started again when it has been killed."""
-
-    def __init__(self, name: str, words: list[str], log: Path) -> None:
-        self.name = name
-        self._words = words
-        self._log = log
-        self.start()
-
-    def start(self) -> None:
-        with self._log.open("ab") as log:
-            self._process = subprocess.Popen([sys.executable, *self._words], stdout=log, stderr=log)
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
-
-def free_port() -> int:
-    with listen("127.0.0.1", 0) as listener:
-        return int(listener.getsockname()[1])
 
 
 @pytest.fixture
@@ -124,12 +76,6 @@ def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
     finally:
         for node in made:
             node.kill()
-
-
-def is_ready(url: str) -> bool:
-    with suppress(httpx.TransportError):
-        return httpx.get(f"{url}/readyz", trust_env=False).status_code == 200
-    return False
 
 
 def asked(urls: list[str], ask: Callable[[str], httpx.Response]) -> httpx.Response:

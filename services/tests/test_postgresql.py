@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
@@ -24,6 +24,7 @@ from stickslip_services.app import main
 from stickslip_services.cli import app
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, connect, opened
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.queue.context import Context
@@ -192,6 +193,31 @@ def test_leases_are_renewed_at_start_only_if_nobody_was_there(settings: Settings
     assert worker.finish(lease) == ["accepted"]
     first.close()
     third.close()
+
+
+def test_a_heartbeat_is_one_statement_and_waits_for_no_writer(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = Context.open(settings)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    submit_job(context, parsed(rods()), None)
+    leases = worker.lease(simulate=2)
+    assert worker.beat(*leases) == ()  # from now on the worker is known
+    sent: list[str] = []
+    run = Prepared.tuples
+
+    def tuples(self: Prepared, *rest: Any) -> Any:
+        sent.append("one")
+        return run(self, *rest)
+
+    monkeypatch.setattr(Prepared, "tuples", tuples)
+    with context.database.write():  # it has the lock of the writer until its end
+        thread = threading.Thread(target=lambda: sent.extend(worker.beat(*leases)))
+        thread.start()
+        thread.join(10)
+        assert (thread.is_alive(), sent) == (False, ["one"])
+    context.close()
 
 
 def test_upkeep_has_the_database_for_itself(settings: Settings) -> None:

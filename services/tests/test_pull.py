@@ -90,7 +90,7 @@ def test_a_pull_brings_everything_and_a_second_one_nothing(origin: tuple[str, st
         before = len(meddler.requests)
         second = pull(client, dataset, 1, tmp_path / "d")
         assert (second.downloaded_files, second.downloaded_bytes) == (0, 0)
-        assert len(meddler.requests) - before == 4  # the version and the three files that vouch for it
+        assert len(meddler.requests) - before == 5  # the version, the three files that vouch for it, and a signature
     assert not list((tmp_path / "d").rglob("*.part"))
 
 

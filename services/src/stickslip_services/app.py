@@ -37,6 +37,8 @@ from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMidd
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, uploads, workers
 from stickslip_services.api.sse import Feeds
+from stickslip_services.client.errors import ClientError
+from stickslip_services.client.signing import sign
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
@@ -113,7 +115,8 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.metrics = metrics
     app.state.feeds = Feeds(context)
     app.state.worker_key = secret_in(settings.worker_key_path)
-    routers = [module.router for module in (jobs, uploads, datasets, certificates, workers, health, pages)]
+    # The routes of the workers come first: they are asked for most, and a request is compared with one after the other.
+    routers = [module.router for module in (workers, jobs, uploads, datasets, certificates, health, pages)]
     for router in routers:
         app.include_router(router)
     app.state.routes = [route for router in routers for route in router.routes]
@@ -161,6 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--behind-proxy", action="store_true", default=None, help="a proxy in front speaks TLS")
     parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
     parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
+    parser.add_argument("--signing-key", type=Path, help="file with the key of OpenSSH that signs new versions")
     parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
     parser.add_argument("--migrate", action="store_true", default=None, help="bring the database up to date, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
@@ -171,7 +175,9 @@ def main(arguments: list[str] | None = None) -> int:
     descriptor, is_migrating = chosen.pop("fd", None), chosen.pop("migrate", False)
     try:
         settings = Settings.chosen(**chosen)
-    except SettingsError as error:
+        if settings.signing_key is not None:
+            sign(b"", settings.signing_key)
+    except (ClientError, SettingsError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     configure_logging()

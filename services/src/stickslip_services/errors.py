@@ -20,10 +20,6 @@ class ConflictError(StickslipError):
     """The state of the thing does not allow the request."""
 
 
-class PreconditionFailedError(StickslipError):
-    """The thing has changed since the client read it."""
-
-
 class IdempotencyKeyReusedError(StickslipError):
     """The idempotency key was used with another document."""
 

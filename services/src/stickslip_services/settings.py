@@ -39,6 +39,8 @@ class Settings(BaseSettings):
     """File of the TLS certificate and its chain."""
     tls_key: Path | None = None
     """File of the private key of `tls_certificate`."""
+    signing_key: Path | None = None
+    """Private key of OpenSSH that signs the versions that are published."""
 
     durable: bool = True
     """Wait for the disk at each commit; tests turn it off. Without it a power cut may lose accepted results."""
@@ -107,7 +109,7 @@ class Settings(BaseSettings):
     def _closed_to_strangers(self) -> Self:
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise ValueError("tls_certificate and tls_key must be given together; one of them is missing")
-        for name in ("tls_certificate", "tls_key"):
+        for name in ("tls_certificate", "tls_key", "signing_key"):
             path: Path | None = getattr(self, name)
             if path is not None and not path.is_file():
                 raise ValueError(f"{name} must be a file; {path} is not")

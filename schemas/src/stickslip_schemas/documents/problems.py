@@ -28,7 +28,6 @@ class ProblemCode(StrEnum):
     not_found = "not_found"
     method_not_allowed = "method_not_allowed"
     conflict = "conflict"
-    precondition_failed = "precondition_failed"
     idempotency_key_reused = "idempotency_key_reused"
     quota_exceeded = "quota_exceeded"
     kind_not_available = "kind_not_available"

@@ -28,6 +28,8 @@ from stickslip_schemas.spec.jobs import JobSpec, Quality
 MANIFEST_NAME = "manifest.json"
 GROUP_NAME = "zarr.json"
 SEAL_NAME = "manifest.sha256"
+SIGNATURE_NAME = "manifest.sha256.sig"
+"""Signature of the seal, if somebody signed the version."""
 SEALED_NAMES = (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
 """The files of a version that its manifest does not list."""
 

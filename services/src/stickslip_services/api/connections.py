@@ -18,7 +18,7 @@ TURN_SECONDS = 10.0
 """Time to send a request [s]..."""
 LEAST_RATE = 64 * 2**10
 """...plus the time that its bytes take at this rate [bytes/s]."""
-MOST_CONNECTIONS = 2000
+MOST_CONNECTIONS = 4000
 
 
 class PatientProtocol(H11Protocol):

@@ -4,7 +4,7 @@ from collections import Counter as Counts
 from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select, text
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
@@ -50,14 +50,7 @@ class _QueueCollector(Collector):
             leases.add_metric([worker.name], held[worker.id])
         workers.add_metric([], len(alive))
         slots.add_metric([], sum(worker.condition.slots for worker in alive))
-        etas = CounterMetricFamily(
-            "stickslip_eta_predictions",
-            "ETA intervals, recorded every 5 s, by whether the job ended within; 80 % should hold",
-            labels=["kind", "held"],
-        )
-        for (kind, held_true), count in self._context.eta_watch.held.items():
-            etas.add_metric([kind, str(held_true).lower()], count)
-        return [tasks, by_state, leases, workers, slots, versions, bytes_, damaged, unread, disk, etas]
+        return [tasks, by_state, leases, workers, slots, versions, bytes_, damaged, unread, disk]
 
 
 class Metrics:

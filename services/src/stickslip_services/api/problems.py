@@ -20,7 +20,6 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.NotFoundError: (404, ProblemCode.not_found),
     errors.UnknownWorkerError: (404, ProblemCode.unknown_worker),
     errors.ConflictError: (409, ProblemCode.conflict),
-    errors.PreconditionFailedError: (412, ProblemCode.precondition_failed),
     errors.QuotaExceededError: (429, ProblemCode.quota_exceeded),
     errors.IdempotencyKeyReusedError: (422, ProblemCode.idempotency_key_reused),
     errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),

@@ -30,7 +30,9 @@ PROGRESS_SECONDS = 1.0
 LOOK_SECONDS = 0.2
 BATCH = 200
 MOST_STREAMS = 500
-"""Event streams of one key, and of one address: a quarter of all connections."""
+"""Event streams of one key, and of one address."""
+ALL_STREAMS = 2000
+"""Event streams of all: half of all connections, so that streams never keep other requests out."""
 KEPT_EVENTS = 1000
 """Number of events that a feed keeps in memory; older ones are read from the database."""
 
@@ -58,17 +60,18 @@ class EventStream(StreamingResponse):
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the stream."""
         address = scope["client"][0] if scope["client"] else "no address"
-        places = {(scope["app"], f"key {this_asker().name}"), (scope["app"], f"address {address}")}
-        for place in places:
-            if self._open[place] >= MOST_STREAMS:
-                detail = f"the {place[1]} has {MOST_STREAMS} event streams, and may have no more: close some"
+        owners = {f"key {this_asker().name}": MOST_STREAMS, f"address {address}": MOST_STREAMS}
+        places = {(scope["app"], owner): most for owner, most in {**owners, "coordinator": ALL_STREAMS}.items()}
+        for place, most in places.items():
+            if self._open[place] >= most:
+                detail = f"the {place[1]} has {most} event streams, and may have no more: close some"
                 headers = {"Retry-After": "60"}
                 raise ProblemError(429, ProblemCode.too_many_streams, detail, headers=headers)
-        self._open.update(places)
+        self._open.update(places.keys())
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._open.subtract(places)
+            self._open.subtract(places.keys())
 
 
 class Feeds:

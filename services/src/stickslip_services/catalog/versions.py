@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.base.keys import Sha256, sha256
@@ -13,6 +14,7 @@ from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
+    SIGNATURE_NAME,
     Contents,
     Manifest,
     check_seal,
@@ -21,6 +23,7 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
+from stickslip_services.client.signing import sign
 from stickslip_services.database.tables import dataset_versions, datasets
 
 HEADS_AT_ONCE = 128
@@ -78,6 +81,12 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
         valid_count=manifest.valid_count,
         bytes=output.bytes,
     )
+
+
+def sign_version(store: Store, version: ManifestSummary, key: Path) -> None:
+    """Sign a version; raise ClientError if the key cannot sign."""
+    signature = store.publish(sign(seal_text(version.manifest, version.group), key))
+    store.show(signature, version.dataset, version.version, SIGNATURE_NAME)
 
 
 def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutput) -> None:

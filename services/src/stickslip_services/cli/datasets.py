@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
-from stickslip_schemas.format.manifest import MANIFEST_NAME, Contents, Manifest
+from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.addresses import DEFAULT_URL, coordinator_url
@@ -22,6 +22,7 @@ from stickslip_services.client.comparing import differences
 from stickslip_services.client.errors import ClientError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
+from stickslip_services.client.signing import sign_directory, signer_of
 from stickslip_services.client.verifying import safe_path
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
@@ -32,6 +33,10 @@ ArraysOption = Annotated[
 SplitOption = Annotated[str | None, typer.Option(help="train, validation or test; without, all")]
 WhereOption = Annotated[
     list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
+]
+
+AllowedSignersOption = Annotated[
+    Path | None, typer.Option(help="refuse a dataset that nobody of this file of ssh-keygen(1) has signed")
 ]
 
 datasets = typer.Typer(help="List datasets and their versions, newest first.")
@@ -68,6 +73,7 @@ def pull_dataset(
     arrays: ArraysOption = None,
     split: SplitOption = None,
     where: WhereOption = None,
+    allowed_signers: AllowedSignersOption = None,
     url: UrlOption = DEFAULT_URL,
 ) -> None:
     """Download a dataset or a part of it. Every file is checked, and intact files are not downloaded again.
@@ -91,6 +97,7 @@ def pull_dataset(
                 version,
                 target,
                 selection=selection,
+                allowed_signers=allowed_signers,
                 on_plan=lambda _files, count: bar.update(row, total=count),
                 on_bytes=lambda count: bar.advance(row, count),
             )
@@ -174,12 +181,26 @@ def _resolve(client: Client, dataset: str) -> tuple[str, int]:
 
 
 @shows_errors
-def verify(target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled")]) -> None:
-    """Check every file of a dataset against its manifest; exit with 1 if anything is wrong."""
+def sign(
+    target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled, or a version in a store")],
+    key: Annotated[Path, typer.Option(help="private key of OpenSSH, or a public key whose private one an agent has")],
+) -> None:
+    """Sign a dataset with a key of OpenSSH. The signature, manifest.sha256.sig, covers all of its files."""
+    sign_directory(target, key)
+    console().print(f"{escape(str(target / SIGNATURE_NAME))} is written")
+
+
+@shows_errors
+def verify(
+    target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled")],
+    allowed_signers: AllowedSignersOption = None,
+) -> None:
+    """Check every file of a dataset against its manifest, and who signed it; exit with 1 if anything is wrong."""
     screen = console()
+    signed = "" if allowed_signers is None else f", signed by {signer_of(target, allowed_signers)}"
     faults = find_faults(target)
     if not faults:
-        screen.print(f"{escape(str(target))}: all files are present and unchanged")
+        screen.print(escape(f"{target}: all files are present and unchanged{signed}"))
         return
     shown = table("file", "fault", "detail")
     for fault in faults:

@@ -25,6 +25,7 @@ _COMMANDS = {
     "priority": "jobs.prioritise",
     "cancel": "jobs.cancel",
     "pull": "datasets.pull_dataset",
+    "sign": "datasets.sign",
     "verify": "datasets.verify",
     "rm": "maintenance.rm",
     "gc": "maintenance.gc",

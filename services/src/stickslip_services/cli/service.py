@@ -61,6 +61,9 @@ def up(
     ] = False,
     tls_certificate: Annotated[Path | None, typer.Option(help="file with the certificate and its chain")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="file with the private key of the certificate")] = None,
+    signing_key: Annotated[
+        Path | None, typer.Option(help="file with the key of OpenSSH that signs new versions")
+    ] = None,
     workers: Annotated[
         str | None, typer.Option("--workers", hidden=True, help="another program than stickslip_workers, for tests")
     ] = None,
@@ -77,10 +80,10 @@ def up(
         "allowed_hosts": tuple(allow_host or ()),
         "require_keys": require_keys,
         "behind_proxy": behind_proxy,
-        "tls_certificate": None if tls_certificate is None else tls_certificate.absolute(),
-        "tls_key": None if tls_key is None else tls_key.absolute(),
     }
     given: dict[str, Any] = {name: value for name, value in auth.items() if value}
+    files = {"tls_certificate": tls_certificate, "tls_key": tls_key, "signing_key": signing_key}
+    given |= {name: path.absolute() for name, path in files.items() if path is not None}
     given |= {name: value for name, value in (("store", store), ("database", database)) if value is not None}
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)

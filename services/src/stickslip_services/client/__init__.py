@@ -3,6 +3,7 @@
 from stickslip_services.client.errors import ClientError, ProblemError, UnexpectedError, UnreachableError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
+from stickslip_services.client.signing import signer_of
 from stickslip_services.client.verifying import verify
 
 __all__ = [
@@ -12,5 +13,6 @@ __all__ = [
     "UnexpectedError",
     "UnreachableError",
     "pull",
+    "signer_of",
     "verify",
 ]

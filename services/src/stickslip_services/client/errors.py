@@ -7,6 +7,9 @@ ClientError
 ├── UnsafePathError     a manifest names a file outside its dataset
 ├── ForeignFilesError   the target directory holds files of something else
 ├── DamagedError        received bytes differ from the manifest
+├── UnsignedError       the dataset has no signature
+├── ChangedError        the signature is not that of the dataset
+├── UnknownSignerError  no allowed signer made the signature
 └── SelectionError      the dataset has no such array or label
 """
 
@@ -45,6 +48,18 @@ class ForeignFilesError(ClientError):
 
 class DamagedError(ClientError):
     """Received bytes differ from what the manifest lists."""
+
+
+class UnsignedError(ClientError):
+    """A dataset that must be signed is not."""
+
+
+class ChangedError(ClientError):
+    """A dataset or its signature was changed after it was signed."""
+
+
+class UnknownSignerError(ClientError):
+    """The key that signed a dataset is not that of an allowed signer."""
 
 
 class SelectionError(ClientError):

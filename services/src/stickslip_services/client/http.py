@@ -221,7 +221,7 @@ class Client:
     def manifest(self, dataset: str, version: int) -> tuple[Manifest, bytes]:
         """Return the manifest of a version, and its bytes."""
         response = self.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
-        return _parsed(Manifest, response), response.content
+        return parsed(Manifest, response), response.content
 
     def workers(self) -> list[WorkerEntry]:
         """Return the workers."""
@@ -292,7 +292,7 @@ class Client:
 
     def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
         """Send a request and return its answer as a model."""
-        return _parsed(answer, self.request(method, path, **options))
+        return parsed(answer, self.request(method, path, **options))
 
     def _items(self, answer: type[Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:
         """Yield the items of all pages of a list."""
@@ -304,7 +304,7 @@ class Client:
             token = page.next_page_token
 
 
-def _parsed(answer: type[T], response: httpx.Response) -> T:
+def parsed(answer: type[T], response: httpx.Response) -> T:
     """Return the document of a response; raise UnexpectedError."""
     try:
         return TypeAdapter(answer).validate_json(response.content)

@@ -20,7 +20,7 @@ from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
-    SEALED_NAMES,
+    SIGNATURE_NAME,
     BrokenSealError,
     Contents,
     FileEntry,
@@ -33,14 +33,17 @@ from stickslip_schemas.store import sync, write_durably
 from stickslip_services.client.errors import (
     DamagedError,
     ForeignFilesError,
+    ProblemError,
     SelectionError,
     UnreachableError,
     raise_for_problem,
 )
-from stickslip_services.client.http import Client
+from stickslip_services.client.http import Client, parsed
+from stickslip_services.client.signing import check_signature
 from stickslip_services.client.verifying import (
     CONNECTIONS,
     EVERYTHING,
+    OWN_NAMES,
     PART,
     file_digest,
     files_below,
@@ -68,6 +71,7 @@ def pull(
     target: Path,
     *,
     selection: Selection = EVERYTHING,
+    allowed_signers: Path | None = None,
     on_bytes: Callable[[int], None] = lambda _: None,
     on_plan: Callable[[int, int], None] = lambda _files, _bytes: None,
 ) -> Pulled:
@@ -82,6 +86,7 @@ def pull(
         version: Number of the version.
         target: Directory to write to.
         selection: Part to download.
+        allowed_signers: File of the signers to trust [ssh-keygen(1)]; without, signatures are not checked.
         on_bytes: Called with the number of bytes of each received block.
         on_plan: Called once, with the number of files and bytes to download.
 
@@ -89,17 +94,21 @@ def pull(
         ForeignFilesError: `target` holds other files. Nothing was written.
         SelectionError: The dataset has no such array or label.
         DamagedError: Received bytes differ from what the manifest lists.
+        UnsignedError, ChangedError, UnknownSignerError: No allowed signer signed the version. Nothing was written.
         ClientError: The coordinator refused, or does not answer.
     """
     contents, sealed = _fetch_sealed(client, dataset, version)
     manifest = contents.manifest
+    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    signature = _fetch_signature(client, root)
+    if allowed_signers is not None:
+        check_signature(sealed[SEAL_NAME], signature, allowed_signers)
     with _selecting():
         selection.choose_arrays(layout(manifest.spec))
     files = _with_paths(target, part_files(contents, selection, None))
     refuse_foreign_files(target, contents, f"{dataset}:v{version}")
     refuse_other_part(target, selection)
     target.mkdir(parents=True, exist_ok=True)
-    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
     labels_done = (0, 0)
     if not selection.is_everything:
         labels = [(file, path) for file, path in files if not _is_whole(path, file)]
@@ -116,6 +125,8 @@ def pull(
     size = sum(file.size for file, _ in missing) + sum(map(len, changed.values()))
     on_plan(count, size)
     _download_all(client, root, missing, on_bytes)
+    if signature is not None and _read(target / SIGNATURE_NAME) != signature:
+        write_durably(target / SIGNATURE_NAME, signature)
     for name, content in changed.items():
         write_durably(target / name, content)
         on_bytes(len(content))
@@ -169,8 +180,9 @@ def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
     A directory that already holds this version may have other files beside it.
     """
     found = sorted(files_below(target))  # by array and shard, so that each section is read once
-    own = {*SEALED_NAMES, SELECTION_NAME}
-    foreign = [path for path in found if (name_ := path.removesuffix(PART)) not in own and contents.file(name_) is None]
+    foreign = [
+        path for path in found if (name_ := path.removesuffix(PART)) not in OWN_NAMES and contents.file(name_) is None
+    ]
     there = ""
     with suppress(OSError, ValidationError):
         manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
@@ -188,8 +200,8 @@ def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
 def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents, dict[str, bytes]]:
     """Return the contents of a version, and the bytes of its three sealed files by name, the manifest last."""
     promised = client.version(dataset, version)
-    manifest, content = client.manifest(dataset, version)
-    root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    answer = client.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
+    content, root = answer.content, f"/v1/datasets/{dataset}/versions/{version}/files/"
     group, seal = (client.request("GET", root + name).content for name in (GROUP_NAME, SEAL_NAME))
     if (sha256(content), sha256(group)) != (promised.manifest, promised.group):
         raise DamagedError(
@@ -199,8 +211,20 @@ def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents,
         check_seal(content, group, seal)
     except BrokenSealError as error:
         raise DamagedError(f"{dataset}, version {version}: {error}") from error
+    manifest = parsed(Manifest, answer)
+    if (manifest.dataset, manifest.version) != (dataset, version):
+        raise DamagedError(f"the manifest of {dataset}:v{version} is that of {manifest.dataset}:v{manifest.version}")
     contents = Contents(manifest, lambda file: client.request("GET", root + file.path).content)
     return contents, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content}
+
+
+def _fetch_signature(client: Client, root: str) -> bytes | None:
+    try:
+        return client.request("GET", root + SIGNATURE_NAME).content
+    except ProblemError as error:
+        if error.problem.status != 404:
+            raise
+        return None
 
 
 def _read(path: Path) -> bytes | None:

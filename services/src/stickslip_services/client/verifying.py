@@ -19,6 +19,7 @@ from stickslip_schemas.format.manifest import (
     MANIFEST_NAME,
     SEAL_NAME,
     SEALED_NAMES,
+    SIGNATURE_NAME,
     BrokenSealError,
     BrokenSectionError,
     Contents,
@@ -35,6 +36,8 @@ CONNECTIONS = 4
 PART = ".part"
 """Suffix of a file that is being downloaded."""
 EVERYTHING = Selection()
+OWN_NAMES = (*SEALED_NAMES, SIGNATURE_NAME, SELECTION_NAME)
+"""Files of a directory that no manifest lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +76,7 @@ def safe_path(target: Path, path: str) -> Path:
     whole = target.joinpath(*parts)
     if not whole.resolve().is_relative_to(target.resolve()):
         raise UnsafePathError(f"the file {path!r} would be written outside {target}; nothing was written")
-    if path in (*SEALED_NAMES, SELECTION_NAME) or path.endswith(PART):
+    if path in OWN_NAMES or path.endswith(PART):
         raise UnsafePathError(f"the manifest names the file {path!r}, which is a reserved name")
     return whole
 
@@ -124,7 +127,7 @@ def verify(target: Path) -> list[Fault]:
         return [Fault(MANIFEST_NAME, "manifest", str(error))]
     faults = _faults(target, list(wanted.values()))
     for path in there:
-        if path not in wanted and path not in (*SEALED_NAMES, SELECTION_NAME):
+        if path not in wanted and path not in OWN_NAMES:
             faults.append(Fault(path, "extra", "not in the manifest"))
     if not faults:
         faults = _sample_key_faults(target, contents, numbers)

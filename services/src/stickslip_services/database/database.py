@@ -60,9 +60,10 @@ class Database(ABC):
         """Open a transaction that excludes other writers; it is durable after the block."""
 
     def touch(self) -> AbstractContextManager[Connection]:
-        """Open a transaction for changes that may be lost, beside writers where the database has row locks.
+        """Connect for changes that may be lost, beside writers where the database has row locks.
 
-        A statement must not wait for a row while it holds another: `with_for_update(skip_locked=True)`.
+        There each statement is a transaction, which must not wait for a row while it holds another:
+        `with_for_update(skip_locked=True)`.
         """
         return self.write()
 

@@ -83,7 +83,8 @@ class PostgresqlDatabase(Database):
         # 24 readers, 4 touchers, a writer: three coordinators fit into the 100 connections of a server by default.
         reader = create_engine(url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=16)
         writer = create_engine(url, paramstyle="format", connect_args=given, pool_size=1, max_overflow=0)
-        self._toucher = create_engine(url, paramstyle="format", connect_args=given, pool_size=4, max_overflow=0)
+        own = {"pool_size": 4, "max_overflow": 0, "isolation_level": "AUTOCOMMIT"}
+        self._toucher = create_engine(url, paramstyle="format", connect_args=given, **own)
         self._arguments: dict[str, Any] = {**writer.dialect.create_connect_args(url)[1], **given}
         event.listen(reader, "connect", _prepare_reader)
         event.listen(writer, "connect", self._prepare_writer)
@@ -101,7 +102,7 @@ class PostgresqlDatabase(Database):
             yield connection
 
     def touch(self) -> AbstractContextManager[Connection]:
-        """Open a transaction beside writers. A crash of the server may lose it."""
+        """Connect beside writers; each statement is a transaction. A crash of the server may lose it."""
         return self._toucher.begin()
 
     def is_alone(self, connection: Connection) -> bool:

@@ -26,7 +26,8 @@ class _Compiled:
     """The parameters in the order of the SQL."""
     defaults: Values
     lists: Mapping[str, str]
-    """Parameters that are the values of an IN (...), each with a query for an empty list: `IN ()` is invalid."""
+    """Parameters that are the values of an IN (...), each with a query for an empty list: `IN ()` is invalid. None
+    where a list is one parameter, an array: the SQL is then the same for all lists, and the server plans it once."""
     mark: str
 
 
@@ -103,7 +104,13 @@ class Prepared:
             }
             defaults = {name: value for name, value in made.params.items() if not made.binds[name].required}
             mark = {"qmark": "?", "format": "%s"}[dialect.paramstyle]
-            compiled = _Compiled(str(made), names, defaults, lists, mark)
+            sql = str(made)
+            if dialect.name == "postgresql":
+                for name in lists:
+                    sql = sql.replace(f"NOT IN ({_list_mark(name)})", f"!= ALL ({mark})")
+                    sql = sql.replace(f"IN ({_list_mark(name)})", f"= ANY ({mark})")
+                lists = {}
+            compiled = _Compiled(sql, names, defaults, lists, mark)
             self._compiled[dialect.name] = compiled
         return compiled
 

@@ -193,6 +193,7 @@ def _coordinator_command(settings: Settings, listener: int) -> list[str]:
     auth += ["--behind-proxy"] if settings.behind_proxy else []
     if settings.tls_certificate is not None:
         auth += ["--tls-certificate", str(settings.tls_certificate), "--tls-key", str(settings.tls_key)]
+    auth += [] if settings.signing_key is None else ["--signing-key", str(settings.signing_key)]
     return [sys.executable, "-m", module, *place, *auth]
 
 

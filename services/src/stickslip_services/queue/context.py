@@ -5,13 +5,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import connect
 from stickslip_services.queue.closing import ledger
-from stickslip_services.queue.eta import EtaWatch
 from stickslip_services.queue.ledger import Ledger
 from stickslip_services.queue.notifier import Notifier
 from stickslip_services.queue.store_watch import StoreWatch
@@ -28,9 +28,10 @@ class Context:
     store: Store
     store_watch: StoreWatch
     notifier: Notifier = field(default_factory=Notifier)
-    eta_watch: EtaWatch = field(default_factory=EtaWatch)
     frames_by_worker: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
     """Progress of simulations from the last heartbeat of each worker: (frames done, frames total) by task."""
+    conditions: dict[str, tuple[float, WorkerCondition]] = field(default_factory=dict)
+    """Time and condition of the last heartbeat of each worker that was noted in the database."""
     sections: dict[str, tuple[Sha256, ...]] = field(default_factory=dict)
     """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an earlier process."""
     is_closing: bool = False

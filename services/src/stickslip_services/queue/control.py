@@ -4,7 +4,7 @@ Only the tasks of a cancelled job are given up in more transactions, since a job
 """
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,21 +15,18 @@ from stickslip_schemas.documents.responses import JobDetail
 from stickslip_services.access.audit_log import note
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs
-from stickslip_services.errors import ConflictError, PreconditionFailedError
+from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
-from stickslip_services.queue.jobs import etag, find_job, show_job
+from stickslip_services.queue.jobs import find_job, show_job
 from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_piece
 from stickslip_services.queue.planner import plan_waiting_jobs
 from stickslip_services.queue.workers import NO_WORKER, note_stranded
 
-IfMatch = Collection[str] | None
-"""Entity tags, one of which the job must have; None: any. Otherwise PreconditionFailedError is raised."""
 
-
-def cancel_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:
+def cancel_job(context: Context, job_id: str) -> JobDetail:
     """Cancel a job; one that is cancelled, or being cancelled, stays so. Raise ConflictError if it has ended."""
-    with _change(context, job_id, if_match, "job.cancel") as (book, job):
+    with _change(context, job_id, "job.cancel") as (book, job):
         if job.state not in (JobState.cancelling, JobState.cancelled):
             if not JobState(job.state).is_open:
                 raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
@@ -57,9 +54,9 @@ def _give_up_more(book: Ledger, job: int, after: int) -> None:
     book.connection.execute(update(jobs).where(jobs.c.seq == job).values(given_up=last))
 
 
-def pause_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:
+def pause_job(context: Context, job_id: str) -> JobDetail:
     """Pause a job: no further tasks are leased, running ones finish. Raise ConflictError if it has ended."""
-    with _change(context, job_id, if_match, "job.pause") as (book, job):
+    with _change(context, job_id, "job.pause") as (book, job):
         pausing = (JobState.pausing, JobState.paused)
         if job.state not in (*RUNNABLE, *pausing):
             raise ConflictError(
@@ -71,23 +68,23 @@ def pause_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> Job
     return _shown(context, job.seq)
 
 
-def resume_job(context: Context, job_id: str, *, if_match: IfMatch = None) -> JobDetail:
+def resume_job(context: Context, job_id: str) -> JobDetail:
     """Resume a paused job with the builds that it was planned for; a job that is not paused is left as it is.
 
     Raises ConflictError if it has ended, or while the store takes no results.
     """
     if trouble := context.store_watch.trouble:
         raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
-    with _change(context, job_id, if_match, "job.resume") as (book, job):
+    with _change(context, job_id, "job.resume") as (book, job):
         _resume(book, job)
     plan_waiting_jobs(context)
     note_stranded(context)
     return _shown(context, job.seq)
 
 
-def prioritise_job(context: Context, job_id: str, priority: int, *, if_match: IfMatch = None) -> JobDetail:
+def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
     """Set the priority of a job. Raise ConflictError if it has ended."""
-    with _change(context, job_id, if_match, "job.prioritise", priority=priority) as (book, job):
+    with _change(context, job_id, "job.prioritise", priority=priority) as (book, job):
         if not JobState(job.state).is_open:
             raise ConflictError(f"job {job_id} has ended ({job.state}); its priority cannot be changed")
         book.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(priority=priority))
@@ -122,16 +119,10 @@ def held_jobs(connection: Connection) -> list[str]:
 
 
 @contextmanager
-def _change(
-    context: Context, job_id: str, if_match: IfMatch, action: str, **details: Any
-) -> Iterator[tuple[Ledger, Row[Any]]]:
+def _change(context: Context, job_id: str, action: str, **details: Any) -> Iterator[tuple[Ledger, Row[Any]]]:
     """Open a transaction that changes a job; yield its ledger and the job's row. It ends with an audit entry."""
     with context.ledger() as book:
         job = find_job(book.connection, job_id)
-        if if_match is not None and etag(show_job(context, book.connection, job.seq)) not in if_match:
-            raise PreconditionFailedError(
-                f"job {job_id} has changed since the ETag in If-Match, {', '.join(if_match)[:200]}: get it again"
-            )
         yield book, job
         note(book.connection, action, job_id, book.now, **details)
 

@@ -15,14 +15,13 @@ leaves out (idle slots, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 %
 The cost of a task is its share of the wall time of the call that made it; the call is what can hang.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
 from sqlalchemy import Connection, select
-from stickslip_schemas.base.states import JobState, Stage
-from stickslip_schemas.documents.responses import Eta, Job
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.documents.responses import Eta
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import cost_groups
@@ -43,15 +42,6 @@ KEPT_RUNS = 200
 
 TIMES = 3.0
 """Timeout of a call, as a multiple of its expected duration."""
-
-EVERY_SECONDS = 5.0
-"""Time between two records of the ETA of a job [s]."""
-
-MOST_NOTES = 2000
-"""Records of one job; beyond this, every other one is dropped."""
-
-_DONE = (JobState.succeeded, JobState.succeeded_with_rejects)
-_GOING_ON = (JobState.queued, JobState.running)
 
 Group = tuple[Stage, str, str]
 """Stage, kind and cost group."""
@@ -239,37 +229,3 @@ _ADD_TO_COST_GROUPS = Prepared(
     "VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
     "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET " + ", ".join(_faded(column) for column in ("count", *_SUMS))
 )
-
-
-class EtaWatch:
-    """Records the ETA of each running job every few seconds, and counts how often it held."""
-
-    def __init__(self) -> None:
-        self._notes: dict[str, list[tuple[float, float]]] = {}
-        self._next = float("-inf")
-        self.held: Counter[tuple[str, bool]] = Counter()
-        """Intervals by kind, and by whether the job ended within them."""
-
-    def is_due(self, now: float) -> bool:
-        """Return whether it is time for a record."""
-        return now >= self._next
-
-    @property
-    def watched(self) -> frozenset[str]:
-        """The jobs that have not ended."""
-        return frozenset(self._notes)
-
-    def look(self, jobs: Mapping[str, Job], now: float) -> None:
-        """Record the ETAs of jobs by id, and judge those of jobs that have ended."""
-        self._next = now + EVERY_SECONDS
-        for job in jobs.values():
-            if job.state in _GOING_ON and job.progress.eta is not None:
-                notes = self._notes.setdefault(job.id, [])
-                notes.append((now + job.progress.eta.low, now + job.progress.eta.high))
-                if len(notes) > MOST_NOTES:
-                    del notes[::2]
-            elif job.state not in _GOING_ON:  # what was paused, cancelled or has failed says nothing of durations
-                notes = self._notes.pop(job.id, [])
-                if job.state in _DONE and job.finished_at is not None:
-                    end = job.finished_at.timestamp()
-                    self.held.update((job.kind, low <= end <= high) for low, high in notes)

@@ -5,7 +5,6 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, func, or_, select
-from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 
@@ -32,20 +31,10 @@ def has_runnable_job(connection: Connection) -> bool:
     return _RUNNABLE_JOB.scalar(connection) is not None
 
 
-def runnable_jobs(connection: Connection) -> list[str]:
-    """Return the ids of the jobs whose tasks may be leased, oldest first."""
-    return list(connection.scalars(select(jobs.c.id).where(jobs.c.state.in_(RUNNABLE)).order_by(jobs.c.seq)))
-
-
 def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any]]:
     """Return the rows of the jobs that wait for the first worker."""
     query = select(jobs).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
     return connection.execute(query.order_by(jobs.c.seq)).all()
-
-
-def etag(job: JobDetail) -> str:
-    """Return the entity tag [RFC 9110, 8.8.3] of a job; it changes with the job."""
-    return f'"{sha256(job.model_dump_json().encode())[:32]}"'
 
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:

@@ -6,6 +6,7 @@ has lost its lease is recognised.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 
 from sqlalchemy import Connection, bindparam, exists, select, text, update
 from stickslip_schemas import tracing
@@ -101,21 +102,26 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
 
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
     """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
+    now, condition = context.clock(), message.condition
+    noted_at, known = context.conditions.get(message.worker_id, (-inf, None))
     with context.database.touch() as connection:
-        worker = find_worker(connection, message.worker_id)
-        # A poll is not worth a write.
-        if is_silent(context, worker) or message.condition != worker.condition:
-            note_seen(connection, worker.id, context.clock(), message.condition)
-        left = _leave_renewed(connection, worker, message.leases, context.clock() + context.settings.lease_seconds)
-    if message.condition.state != worker.condition.state:
+        # Most heartbeats are one statement: neither a read nor a write of the worker each time.
+        if condition != known or now - noted_at > context.settings.lease_seconds / 4 or not message.leases:
+            worker = find_worker(connection, message.worker_id)
+            if is_silent(context, worker) or condition != worker.condition:
+                note_seen(connection, worker.id, now, condition)
+            context.conditions[worker.id] = now, condition
+            known = worker.condition
+        left = _leave_renewed(connection, message, now + context.settings.lease_seconds)
+    if condition.state != known.state:
         note_stranded(context)
-    context.frames_by_worker[worker.id] = {
+    context.frames_by_worker[message.worker_id] = {
         lease.task_id: lease.frames for lease in message.leases if lease.frames is not None
     }
     if not left:
         return HeartbeatAnswer(drop=())
     with context.ledger() as book:
-        worker = find_worker(book.connection, worker.id)
+        worker = find_worker(book.connection, message.worker_id)
         drop = _renew_leases(book, worker, left, context.settings.lease_seconds)
     return HeartbeatAnswer(drop=drop)
 
@@ -137,17 +143,16 @@ _RENEW = Prepared(
 )
 
 
-def _leave_renewed(
-    connection: Connection, worker: RegisteredWorker, held: Sequence[LeaseState], until: float
-) -> list[LeaseState]:
+def _leave_renewed(connection: Connection, message: Heartbeat, until: float) -> list[LeaseState]:
     """Renew the leases whose tasks go on as they are, with one statement; return the others."""
-    if worker.superseded:
-        return list(held)
+    held = message.leases
     keys = {lease.task_id: task_key(lease.task_id) for lease in held}
     states = {
         (key, token): state
         for batch in batches(key for key in keys.values() if key is not None)
-        for key, token, state in _RENEW.tuples(connection, {"b_keys": batch, "b_worker": worker.id, "b_until": until})
+        for key, token, state in _RENEW.tuples(
+            connection, {"b_keys": batch, "b_worker": message.worker_id, "b_until": until}
+        )
     }
     goes_on = {False: (TaskState.leased, TaskState.running), True: (TaskState.running,)}
     return [lease for lease in held if states.get((keys[lease.task_id], lease.token)) not in goes_on[lease.started]]

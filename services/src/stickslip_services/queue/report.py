@@ -16,7 +16,7 @@ from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
-from stickslip_schemas.store import Store, is_unavailable
+from stickslip_schemas.store import is_unavailable
 
 from stickslip_services.catalog.versions import (
     ManifestSummary,
@@ -25,7 +25,9 @@ from stickslip_services.catalog.versions import (
     find_committed,
     find_reserved,
     read_version,
+    sign_version,
 )
+from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
@@ -92,7 +94,7 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
     """Judge the reports of a worker, one by one, and store the results; raise UnknownWorkerError."""
     versions: dict[str, ManifestSummary] = {}
     began = time.monotonic()
-    reports = [_checked_in_store(context.store, report, versions) for report in batch.reports]
+    reports = [_checked_in_store(context, report, versions) for report in batch.reports]
     with context.ledger() as book:
         worker = find_worker(book.connection, batch.worker_id)
         if is_silent(context, worker):
@@ -131,17 +133,20 @@ def _after_commit(context: Context, task: str, seconds: float) -> None:
         tracing.record("commit", parent=traceparent, seconds=seconds, task=task)
 
 
-def _checked_in_store(store: Store, report: Report, versions: dict[str, ManifestSummary]) -> Report:
-    """Return the report, or a failure where the store lacks its artifacts; add the summary of a manifest."""
+def _checked_in_store(context: Context, report: Report, versions: dict[str, ManifestSummary]) -> Report:
+    """Return the report, or a failure where the store lacks its artifacts; add the summary of a manifest, signed."""
     if report.result is None or report.result.output is None:
         return report
     output = report.result.output
     try:
         if isinstance(output, PublishOutput):
-            versions[report.task_id] = read_version(store, output)
+            version = read_version(context.store, output)
+            if context.settings.signing_key is not None:
+                sign_version(context.store, version, context.settings.signing_key)
+            versions[report.task_id] = version
         else:
-            check_output(store, output)
-    except (OSError, ValueError) as error:
+            check_output(context.store, output)
+    except (OSError, ValueError, ClientError) as error:
         unavailable = isinstance(error, OSError) and is_unavailable(error)
         reason = Reason.store_unavailable if unavailable else Reason.storage_error
         return report.model_copy(

@@ -7,7 +7,7 @@ from stickslip_services.database import migrate
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import held_jobs, hold_jobs, release_jobs
 from stickslip_services.queue.damage import fail_damaged_jobs
-from stickslip_services.queue.jobs import find_job, has_runnable_job, runnable_jobs, show_job
+from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.lease import renew_all_leases
 from stickslip_services.queue.planner import plan_waiting_jobs, release_claims
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
@@ -35,7 +35,6 @@ def sweep(context: Context) -> None:
     plan_waiting_jobs(context)
     take_back(context)
     note_stranded(context)
-    _watch_etas(context)
     check_made_datasets(context, at_most=CHECKED_AT_ONCE)
 
 
@@ -52,13 +51,3 @@ def _watch_store(context: Context) -> None:
         else:
             release_jobs(book)
     logger.warning("jobs are paused: %s", trouble) if trouble else logger.info("the store takes results again")
-
-
-def _watch_etas(context: Context) -> None:
-    watch = context.eta_watch
-    if not watch.is_due(context.clock()):
-        return
-    with context.database.read() as connection:
-        ids = watch.watched | set(runnable_jobs(connection))
-        jobs = {job_id: show_job(context, connection, find_job(connection, job_id).seq) for job_id in ids}
-    watch.look(jobs, context.clock())

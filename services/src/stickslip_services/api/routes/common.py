@@ -35,7 +35,6 @@ _TITLES = {
     403: "The key lacks the scope, or the request names a foreign host or comes from a page of another site",
     404: "Not found",
     409: "The state does not allow it; `detail` names the state",
-    412: "The job has changed since the `ETag` in `If-Match`",
     413: "The body is too large",
     415: "The `Content-Type` of the body is not JSON",
     416: "The range lies outside the file",

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
-from stickslip_schemas.format.manifest import MANIFEST_NAME
+from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME
 
 from stickslip_services.api.files import picture_format, serve
 from stickslip_services.api.routes.common import ContextDep, PageDep, file_responses, problem_responses
@@ -89,5 +89,11 @@ def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
 def _serve(request: Request, context: ContextDep, dataset: str, version: int, path: str) -> Response:
     with context.database.read() as connection:
         found = find_version(connection, dataset, version)
+    if path == SIGNATURE_NAME:  # it may be made, and replaced, at any time
+        try:
+            signature = context.store.read_shown(dataset, version, path)
+        except FileNotFoundError:
+            raise NotFoundError(f"version {version} is not signed") from None
+        return Response(signature, headers={"Cache-Control": "no-store"}, media_type="application/octet-stream")
     file = find_file(context.store, found, path)
     return serve(request, context.store, file.sha256, name=path, size=file.size)

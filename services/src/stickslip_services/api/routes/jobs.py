@@ -9,12 +9,11 @@ from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.files import matches
 from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, PageDep, problem_responses
 from stickslip_services.api.sse import OPENAPI as STREAM
 from stickslip_services.api.sse import Feeds
 from stickslip_services.queue import control
-from stickslip_services.queue.jobs import etag, find_job, list_jobs, list_previews, list_samples, show_job
+from stickslip_services.queue.jobs import find_job, list_jobs, list_previews, list_samples, show_job
 from stickslip_services.queue.submit import Replay, submit_job, validate_spec
 
 router = APIRouter(tags=["jobs"])
@@ -22,15 +21,10 @@ router = APIRouter(tags=["jobs"])
 SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec))]
 
 _LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
-_ETAG = {"ETag": {"description": "Changes with the job", "schema": {"type": "string"}}}
 _CHANGED: dict[int | str, dict[str, Any]] = {
-    202: {"description": "The job after the change", "headers": _ETAG},
-    **problem_responses(404, 409, 412),
+    202: {"description": "The job after the change"},
+    **problem_responses(404, 409),
 }
-
-IfMatch = Annotated[
-    str | None, Header(description="the `ETag` of the job as you saw it: where it has changed since, nothing is done")
-]
 _REPLAYED: dict[str, Any] = {
     "description": "The answer that this Idempotency-Key got the first time",
     "model": JobDetail,
@@ -97,23 +91,11 @@ def get_jobs(
         return list_jobs(context, connection, page, search, state, project)
 
 
-@router.get(
-    "/v1/jobs/{job_id}",
-    response_model=JobDetail,
-    responses={
-        200: {"description": "The job", "headers": _ETAG},
-        304: {"description": "The job is as it was at `If-None-Match`", "headers": _ETAG},
-        **problem_responses(404),
-    },
-)
-def get_job(job_id: str, context: ContextDep, if_none_match: Annotated[str | None, Header()] = None) -> Response:
+@router.get("/v1/jobs/{job_id}", responses=problem_responses(404))
+def get_job(job_id: str, context: ContextDep) -> JobDetail:
     """Return a job."""
     with context.database.read() as connection:
-        job = show_job(context, connection, int(find_job(connection, job_id).seq))
-    content, tag = job.model_dump_json(), etag(job)
-    if matches(if_none_match, tag):
-        return Response(status_code=304, headers={"ETag": tag})
-    return _json(content, headers={"ETag": tag})
+        return show_job(context, connection, int(find_job(connection, job_id).seq))
 
 
 @router.patch(
@@ -121,33 +103,27 @@ def get_job(job_id: str, context: ContextDep, if_none_match: Annotated[str | Non
     responses=_CHANGED | problem_responses(*BODY_PROBLEMS),
     openapi_extra=body_schema("JobPatch"),
 )
-def patch_job(
-    job_id: str,
-    patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))],
-    context: ContextDep,
-    response: Response,
-    if_match: IfMatch = None,
-) -> JobDetail:
+def patch_job(job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], context: ContextDep) -> JobDetail:
     """Set the priority of a job, from its next task on. 409: it has ended."""
-    return _tagged(response, control.prioritise_job(context, job_id, patch.priority, if_match=_etags(if_match)))
+    return control.prioritise_job(context, job_id, patch.priority)
 
 
 @router.post("/v1/jobs/{job_id}:cancel", status_code=202, responses=_CHANGED)
-def cancel_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
+def cancel_job(job_id: str, context: ContextDep) -> JobDetail:
     """Cancel a job. Tasks that only it needs are dropped; finished results and datasets stay."""
-    return _tagged(response, control.cancel_job(context, job_id, if_match=_etags(if_match)))
+    return control.cancel_job(context, job_id)
 
 
 @router.post("/v1/jobs/{job_id}:pause", status_code=202, responses=_CHANGED)
-def pause_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
+def pause_job(job_id: str, context: ContextDep) -> JobDetail:
     """Pause a job: no further tasks start, running ones finish. It keeps its place in the queue."""
-    return _tagged(response, control.pause_job(context, job_id, if_match=_etags(if_match)))
+    return control.pause_job(context, job_id)
 
 
 @router.post("/v1/jobs/{job_id}:resume", status_code=202, responses=_CHANGED)
-def resume_job(job_id: str, context: ContextDep, response: Response, if_match: IfMatch = None) -> JobDetail:
+def resume_job(job_id: str, context: ContextDep) -> JobDetail:
     """Resume a paused job."""
-    return _tagged(response, control.resume_job(context, job_id, if_match=_etags(if_match)))
+    return control.resume_job(context, job_id)
 
 
 @router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404, 422))
@@ -199,16 +175,6 @@ def get_events(
         job = int(find_job(connection, job_id).seq)
     feeds: Feeds = request.app.state.feeds
     return feeds.stream(job, after=int(last_event_id or 0))
-
-
-def _etags(if_match: str | None) -> list[str] | None:
-    """Return the entity tags that a job may have [RFC 9110, 13.1.1]; None: any."""
-    return None if if_match is None or if_match.strip() == "*" else [tag.strip() for tag in if_match.split(",")]
-
-
-def _tagged(response: Response, job: JobDetail) -> JobDetail:
-    response.headers["ETag"] = etag(job)
-    return job
 
 
 def _json(content: str, *, status: int = 200, headers: dict[str, str] | None = None) -> Response:
