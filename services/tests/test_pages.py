@@ -101,6 +101,8 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert 'data-values="/ui' in sample
     picture = client.get(f"/ui{path[0]}/samples/3/views/2.png")
     assert picture.headers["content-type"] == "image/png"
+    again = client.get(f"/ui{path[0]}/samples/3/views/2.png", headers={"If-None-Match": picture.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
     shown = np.asarray(Image.open(BytesIO(picture.content)))
     stored = (np.arange(4 * shown.size).reshape(4, *shown.shape) + 3) % 251  # as PretendWorker fills it
     assert (shown == stored[2]).all()

@@ -6,8 +6,12 @@ from math import prod
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.kinds.cloth.arrays import clip_arrays, solver_arrays
+from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.plan.grid import grid
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
@@ -99,12 +103,17 @@ def histograms(data: SampleData) -> list[dict[str, Any]]:
 
 
 def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
-    pictures, plots, shapes = [], [], []
-    labels: dict[str, tuple[object, str]] = {}
+    """Return what the page of a sample shows: stills, the layers of the clip, shapes, plots, and labels in groups."""
+    pictures, layers, plots, shapes = [], [], [], []
+    groups: dict[str, dict[str, tuple[object, str]]] = {
+        name: {} for name in ("Parameters", "Looks", "Physics", "Checks")
+    }
     for name, array in data.arrays.items():
         dimensions = array.dimensions
-        if dimensions[-3:] == ("y", "x", "rgb"):
-            pictures.append({"name": name, "count": array.shape[0], "is_clip": dimensions[0] == "frame"})
+        if dimensions[:3] == ("frame", "y", "x"):
+            layers.append(name)
+        elif dimensions[-3:] == ("y", "x", "rgb"):
+            pictures.append({"name": name, "count": array.shape[0]})
         elif dimensions[-1:] == ("xyz",) and len(array.shape) in (2, 3) and _is_place(dimensions[-2]):
             shapes.append({"name": name, "steps": array.shape[0] if len(array.shape) == 3 else 1})
         elif dimensions[:1] in (("point",), ("instant",)) and len(array.shape) == 2 and array.shape[1] <= _CURVES:
@@ -112,11 +121,69 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         elif dimensions[:1] == ("instant",) and dimensions[-1] == "xyz" and prod(array.shape[1:-1]) <= 2 * _CURVES:
             plots.append(_plot(data, name, slot))
         elif len(array.shape) <= 1 and name != "sample_key" and (not array.shape or array.shape[0] <= 8):
-            labels[name] = (data.named(array, data.read(name, slot)), array.description)
-    axes = [name for name in data.manifest.spec.named_axes if name in labels]
-    labels = {name: labels[name] for name in (*axes, *(name for name in labels if name not in axes))}
-    return {"pictures": pictures, "plots": plots, "shapes": shapes, "labels": labels}
+            text = "" if array.categories else array.description
+            groups[group(data, name)][name] = (data.named(array, data.read(name, slot)), text)
+    chosen = groups["Parameters"]
+    groups["Parameters"] = {name: chosen[name] for name in data.manifest.spec.named_axes if name in chosen}
+    timed = [array for array in data.arrays.values() if array.dimensions[:1] == ("instant",)]
+    frames = list(range(data.arrays[layers[0]].shape[0])) if layers else []
+    return {
+        "pictures": pictures,
+        "layers": layers,
+        "frames": data.arrays[layers[0]].attributes.get("instants", frames) if layers else [],
+        "instants": timed[0].shape[0] if timed else len(frames),
+        "rate": timed[0].attributes.get("instants_per_second", 0) if timed else 0,
+        "plots": plots,
+        "shapes": shapes,
+        "groups": {title: labels for title, labels in groups.items() if labels},
+    }
 
+
+def group(data: SampleData, name: str) -> str:
+    """Return which group of labels an array belongs to."""
+    spec = data.manifest.spec
+    if name in spec.named_axes:
+        return "Parameters"
+    if name in ("split", "valid") or (
+        isinstance(spec, ClipSpec) and name in {each.name for each in solver_arrays(spec)}
+    ):
+        return "Checks"
+    is_look = isinstance(spec, ClipSpec) and name in {each.name for each in clip_arrays(spec)}
+    return "Looks" if is_look else "Physics"
+
+
+def coloured(array: ArrayLayout, values: Any, index: int) -> npt.NDArray[np.uint8]:
+    """Return a frame of pictures or of ground truth as sRGB; numbers are scaled by their range over the clip."""
+    frame = values[index]
+    if array.dimensions[-1] == "rgb":
+        return np.asarray(frame)
+    if "categories" in array.attributes:
+        return np.asarray(_PALETTE[frame % len(_PALETTE)])
+    finite = values[np.isfinite(values)].astype(np.float32)
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    if low < 0.0:  # of two signs: grey is 0
+        low, high = -max(-low, high), max(-low, high)
+    share = np.nan_to_num((frame.astype(np.float32) - low) / ((high - low) or 1.0), nan=0.0, posinf=0.0, neginf=0.0)
+    planes = share.reshape(*share.shape[:2], -1)
+    blue = np.full((*share.shape[:2], 3 - planes.shape[2]), 0.5) if planes.shape[2] == 2 else planes[..., :0]
+    planes = np.repeat(planes, 3, axis=2) if planes.shape[2] == 1 else np.concatenate([planes, blue], axis=2)
+    return np.asarray(255 * planes, dtype=np.uint8)
+
+
+_PALETTE = np.array(
+    [
+        [0, 0, 0],
+        [230, 159, 0],
+        [86, 180, 233],
+        [0, 158, 115],
+        [240, 228, 66],
+        [0, 114, 178],
+        [213, 94, 0],
+        [204, 121, 167],
+    ],
+    dtype=np.uint8,
+)
+"""Colours of the codes of segments [Okabe and Ito 2008]."""
 
 _COMPONENTS = {"strain": ("twist", "bend 1", "bend 2"), "xyz": ("x", "y", "z")}
 
@@ -144,4 +211,4 @@ def _plot(data: SampleData, name: str, slot: int) -> str:
     if rate is not None:
         x, x_name = np.arange(len(values)) / rate, "time [s]"
     curves = {part: list(zip(x.tolist(), values[:, i].tolist(), strict=True)) for i, part in enumerate(parts)}
-    return line_plot(curves, x_name=x_name, y_name=f"{name}: {array.description}")
+    return line_plot(curves, x_name=x_name, y_name=f"{name}: {array.description}", has_cursor=rate is not None)

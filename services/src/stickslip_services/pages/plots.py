@@ -24,6 +24,7 @@ def line_plot(
     y_name: str,
     dots: Mapping[str, Points] | None = None,
     is_log: bool = False,
+    has_cursor: bool = False,
 ) -> Markup:
     """Return a figure with curves and dots as SVG. Points that are not finite are left out.
 
@@ -33,6 +34,7 @@ def line_plot(
         y_name: Name of the vertical axis.
         dots: Points that are drawn one by one, by name.
         is_log: Make each scale logarithmic whose values are all positive.
+        has_cursor: Draw the cursor of time, which a script moves from the first x to the last one.
     """
     dots = dots or {}
     values = np.array([point for line in (*curves.values(), *dots.values()) for point in line], dtype=float)
@@ -64,6 +66,7 @@ def line_plot(
             y_ticks=[(y_of(tick), f"{tick:g}") for tick in up.ticks()],
             lines=lines,
             dots=[point for line in placed(dots.values()) for point in line],
+            cursor=(x_of(values[:, 0].min()), x_of(values[:, 0].max())) if has_cursor and values.size else None,
             width=_WIDTH,
             height=_HEIGHT,
             left=_LEFT,

@@ -69,6 +69,7 @@ class SampleData:
         return value.item() if value.ndim == 0 else ", ".join(f"{item:.4g}" for item in value.ravel())
 
 
+@lru_cache(maxsize=4)
 def _chunk(store: Store, file: FileEntry, array: ArrayLayout, position: int, slots: int) -> Array:
     """Return the value of the sample at `position` of a shard; raise KeyError if it was rejected."""
     tail = shard_index_size(slots)

@@ -25,39 +25,56 @@ for (const field of document.querySelectorAll("fieldset[data-values]")) {
   show(from);
 }
 
-for (const player of document.querySelectorAll(".player")) {
-  const image = player.querySelector("img"), slider = player.querySelector("input"), play = player.querySelector(".play");
-  const frames = Array.from({ length: +player.dataset.count }, (_, i) => {
-    const frame = new Image();
-    frame.src = `${player.dataset.pictures}${i}.png`;
-    return frame;
-  });
-  const show = () => { image.src = frames[slider.value].src; image.alt = `frame ${+slider.value + 1} of ${frames.length}`; };
-  let timer = null;
-  slider.addEventListener("input", show);
-  play.addEventListener("click", () => {
-    if (timer) { clearInterval(timer); timer = null; } else {
-      timer = setInterval(() => { slider.value = (+slider.value + 1) % frames.length; show(); }, 120);
-    }
-    play.textContent = timer ? "Stop" : "Play";
-    play.setAttribute("aria-pressed", String(Boolean(timer)));
-  });
+for (const view of document.querySelectorAll(".sample")) showSample(view);
+
+// One cursor of time, an instant of the record, runs through the clip, its ground truth, the shapes and the curves.
+async function showSample(view) {
+  const slider = view.querySelector(".time"), play = view.querySelector(".play"), output = view.querySelector("output");
+  const image = view.querySelector(".clip > img"), layer = view.querySelector("select");
+  const instants = JSON.parse(view.dataset.frames), cursors = view.querySelectorAll(".cursor"), draws = [];
+  let frames = [];
+  const load = () => { frames = instants.map((_, i) => Object.assign(new Image(), { src: `${view.dataset.root}${layer.value}/${i}.png` })); };
+  const show = () => {
+    const now = slider ? +slider.value : 0, share = slider ? now / slider.max : 0;
+    if (output) output.textContent = +view.dataset.rate ? `${(now / view.dataset.rate).toFixed(2)} s` : `frame ${now + 1}`;
+    if (image) image.src = frames[Math.max(0, instants.findLastIndex((instant) => instant <= now))].src;
+    for (const line of cursors) for (const end of ["x1", "x2"]) line.setAttribute(end, +line.dataset.from + share * (line.dataset.to - line.dataset.from));
+    for (const draw of draws) draw(now);
+  };
+  if (image) load();
+  if (layer) layer.addEventListener("change", () => { load(); show(); });
+  if (slider) {
+    let timer = null;
+    const stride = Math.max(1, Math.round(slider.max / 60));
+    slider.addEventListener("input", show);
+    play.addEventListener("click", () => {
+      if (timer) { clearInterval(timer); timer = null; } else {
+        timer = setInterval(() => { slider.value = (+slider.value + stride) % (+slider.max + 1); show(); }, 80);
+      }
+      play.textContent = timer ? "Stop" : "Play";
+      play.setAttribute("aria-pressed", String(Boolean(timer)));
+    });
+  }
+  show();
+  for (const figure of view.querySelectorAll(".shape")) {
+    const draw = await drawShape(figure);
+    if (draw) draws.push(draw);
+    show();
+  }
 }
 
-for (const figure of document.querySelectorAll(".shape")) drawShape(figure);
-
 async function drawShape(figure) {
-  const canvas = figure.querySelector("canvas"), slider = figure.querySelector("input"), pen = canvas.getContext("2d");
+  const canvas = figure.querySelector("canvas"), pen = canvas.getContext("2d");
   const answer = await fetch(figure.dataset.values);
-  if (!answer.ok) return;
-  const { points, triangles } = await answer.json();
+  if (!answer.ok) return null;
+  const { points, triangles, steps, floor } = await answer.json();
   const finite = points.flat().filter((point) => point.every(Number.isFinite));
   const low = [0, 1, 2].map((k) => Math.min(...finite.map((point) => point[k])));
   const high = [0, 1, 2].map((k) => Math.max(...finite.map((point) => point[k])));
+  if (floor) low[2] = Math.min(0, low[2]);
   const middle = low.map((value, k) => (value + high[k]) / 2);
   const scale = 0.8 * canvas.height / Math.hypot(...high.map((value, k) => value - low[k]));
-  let turn = 0.6, tilt = 0.5;
-  if (slider) slider.max = points.length - 1;
+  let turn = 0.6, tilt = 0.5, now = 0;
   const edges = triangles && [...new Set(triangles.flatMap(([a, b, c]) => [[a, b], [b, c], [c, a]]
     .map((edge) => Math.min(...edge) * 1e6 + Math.max(...edge))))].map((code) => [Math.floor(code / 1e6), code % 1e6]);
   const place = ([x, y, z]) => {
@@ -65,9 +82,20 @@ async function drawShape(figure) {
     const across = u * Math.cos(turn) - v * Math.sin(turn), deep = u * Math.sin(turn) + v * Math.cos(turn);
     return [canvas.width / 2 + scale * across, canvas.height / 2 - scale * (w * Math.cos(tilt) + deep * Math.sin(tilt))];
   };
+  const ground = floor ? Array.from({ length: 9 }, (_, i) => [0, 1].map((k) => [0, 1].map((end) => {
+    const spot = [0, 0, 0];
+    spot[k] = low[k] + (high[k] - low[k]) * i / 8;
+    spot[1 - k] = end ? high[1 - k] : low[1 - k];
+    return spot;
+  }))).flat() : [];
   const draw = () => {
-    const placed = points[slider ? slider.value : 0].map(place);
+    const placed = points[Math.max(0, steps.findLastIndex((step) => step <= now))].map(place);
     pen.clearRect(0, 0, canvas.width, canvas.height);
+    pen.strokeStyle = getComputedStyle(document.body).getPropertyValue("--rule");
+    pen.lineWidth = 1;
+    pen.beginPath();
+    for (const [from, to] of ground) { pen.moveTo(...place(from)); pen.lineTo(...place(to)); }
+    pen.stroke();
     pen.strokeStyle = getComputedStyle(document.body).getPropertyValue("--accent");
     pen.lineWidth = edges ? 0.6 : 3;
     pen.lineJoin = "round";
@@ -90,7 +118,6 @@ async function drawShape(figure) {
     tilt = Math.max(-1.5, Math.min(1.5, tilt + step[1]));
     draw();
   });
-  if (slider) slider.addEventListener("input", draw);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  draw();
+  return (instant) => { now = instant; draw(); };
 }

@@ -17,7 +17,7 @@ from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.browsing import histograms, losses, sample_view, sliders, thumbs
+from stickslip_services.pages.browsing import coloured, histograms, losses, sample_view, sliders, thumbs
 from stickslip_services.pages.sample_data import SampleData
 from stickslip_services.queue.context import Context
 
@@ -111,7 +111,7 @@ def get_sample(dataset: str, version: Version, slot: int, context: ContextDep) -
         slot=slot,
         last_slot=manifest.sample_count - 1,
         rejection=rejection,
-        **({"pictures": [], "plots": [], "shapes": [], "labels": {}} if rejection else sample_view(data, slot)),
+        **({} if rejection else sample_view(data, slot)),
     )
 
 
@@ -122,16 +122,21 @@ def get_picture(
     slot: Annotated[int, Path(ge=0)],
     array: str,
     index: Annotated[int, Path(ge=0)],
+    request: Request,
     context: ContextDep,
     step: Annotated[int, Query(ge=1, le=8)] = 1,
 ) -> Response:
-    """Return a picture of a sample as PNG; `step` takes every `step`-th pixel."""
-    _, _, data = _open(context, dataset, version)
+    """Return a picture or a frame of ground truth of a sample as PNG; `step` takes every `step`-th pixel."""
+    _, committed, data = _open(context, dataset, version)
+    tag = f'"{committed.manifest[:32]}-{slot}-{index}-{step}"'
+    headers = {"Cache-Control": "private, max-age=86400", "ETag": tag}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
     values = _value(data, array, slot)
-    if values.ndim != 4 or index >= len(values):
-        raise NotFoundError(f"{array} has no picture {index}")
-    content = png(values[index][::step, ::step])
-    return Response(content, media_type="image/png", headers={"Cache-Control": "private, max-age=86400"})
+    if data.arrays[array].dimensions[1:3] != ("y", "x") or index >= len(values):
+        raise NotFoundError(f"{array[:50]} has no picture {index}")
+    content = png(coloured(data.arrays[array], values, index)[::step, ::step])
+    return Response(content, media_type="image/png", headers=headers)
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.json")
@@ -147,6 +152,7 @@ def get_values(
     triangles = f"{array.removesuffix('positions')}triangles"
     if triangles in data.arrays:
         document["triangles"] = data.read(triangles, slot).tolist()
+        document["floor"] = True  # of cloth, at z = 0
     return Response(json.dumps(document), media_type="application/json")
 
 
