@@ -272,7 +272,7 @@ def kill_some(service: Service, victim: str) -> None:
         kill(random.choice(pids))
 
 
-KILLS = int(os.environ.get("STICKSLIP_KILLS", "5"))
+KILLS = int(os.environ.get("STICKSLIP_KILLS", "3"))
 
 
 @pytest.mark.slow

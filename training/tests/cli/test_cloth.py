@@ -44,7 +44,11 @@ def clips(make_clips):
 
 @pytest.mark.physics
 def test_train_and_resume(packed, tmp_path):
-    run = ["cloth", "train", str(packed), "--out", str(tmp_path / "run"), "--threads", "1"]
+    with np.load(packed) as file:  # every fourth simulation: most of the time goes into pictures for validation
+        arrays = dict(file)
+    arrays["differences"], arrays["about"] = arrays["differences"][:, ::4], arrays["about"][::4]
+    np.savez(tmp_path / "some.npz", **arrays)
+    run = ["cloth", "train", str(tmp_path / "some.npz"), "--out", str(tmp_path / "run"), "--threads", "1"]
     trained = runner.invoke(app, [*run, "--steps", "2"])
     assert trained.exit_code == 0, trained.output
     assert "step 2 of 2: loss" in trained.output
