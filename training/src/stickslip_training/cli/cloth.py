@@ -3,17 +3,14 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import DatasetArgument, readable_errors
+from stickslip_training.cli.errors import readable_errors
 from stickslip_training.data.reader import DatasetReader
-
-if TYPE_CHECKING:
-    from stickslip_training.cloth.evaluation import Errors, Scores
 
 NO_ANSWER = 3
 """Exit status of `predict` where no clip has an answer."""
@@ -161,47 +158,9 @@ def _answers(answers: list[dict[str, Any]], true: list[str]) -> Table:
     return table
 
 
-@cloth.command()
-def score(
-    predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS", help="what `cloth predict --json` prints")],
-    dataset: DatasetArgument,
-    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-) -> None:
-    """Score a file of predictions, of any method, on the clips of a dataset."""
-    from stickslip_training.benchmark.records import read_answers
-    from stickslip_training.cloth.clips import check_kind, truth_of_slots
-    from stickslip_training.cloth.evaluation import score_predictions
-
-    with readable_errors(), DatasetReader(dataset) as reader:
-        check_kind(reader)
-        slots = reader.slots(_split(split))
-        scores = score_predictions(
-            read_answers(predictions)[0], reader.categories("material"), slots.tolist(), truth_of_slots(reader, slots)
-        )
-    Console().print(_scores(scores))
-
-
 def _split(name: str) -> Any:
     from stickslip_schemas.spec.arrays import SPLITS
 
     if name not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")
     return name
-
-
-def _scores(scores: "Scores") -> Table:
-    top = "" if scores.top_1 is None else f"Material: {scores.top_1.value:.1%} right. "
-    title = f"{scores.blind.clips} clips of {scores.blind.simulations} simulations"
-    table = Table(title=title, caption=f"{top}In brackets: 90 % intervals over simulations.", caption_justify="left")
-    table.add_column("")
-    for title in ("mean error", "< 0.1", "< 0.2", "in 80 %"):
-        table.add_column(title, justify="right")
-
-    def add(name: str, part: "Errors") -> None:
-        shares = [f"{each.value:.1%}" for each in (part.within_01, part.within_02, part.coverage)]
-        table.add_row(name, str(part.mae), *shares)
-
-    add("material not known", scores.blind)
-    for name, part in scores.bands.items():
-        add(f"mu {name}", part)
-    return table
