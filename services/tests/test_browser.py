@@ -188,6 +188,10 @@ def test_the_keyboard_is_enough(browser: Any, url: str, paths: list[str]) -> Non
     page.locator("input[name='gamma.from']").focus()
     page.keyboard.press("End")
     wait_until(lambda: page.locator("#thumbs p").first.inner_text().startswith("2 of 6"))
+    wait_until(lambda: "gamma.from=2" in page.url)
+    page.reload()  # the filters are in the address
+    assert page.locator("#thumbs p").first.inner_text().startswith("2 of 6")
+    assert page.locator("input[name='gamma.from']").input_value() == "2"
     page.close()
 
 

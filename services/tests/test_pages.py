@@ -129,6 +129,9 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     assert "(50.0 %)" in dataset
     assert "<td>50.00 %</td>" in dataset
     assert "gamma 1, phi1 1: 0 of 1 done, 1 lost" in dataset
+    counts = [re.findall(r"(\d) of 4 samples", read(client, f"{path[0]}?valid={value}")) for value in ("yes", "no", "")]
+    assert counts == [["2"], ["2"], ["4"]]
+    assert "option selected>train" in read(client, f"{path[0]}?split=train")
     assert "gamma 2, phi1 1: 1 of 1 done<" in dataset
     assert "it fell &lt;b&gt;off&lt;/b&gt;" in dataset
     assert "This sample was rejected: solver diverged" in read(client, f"{path[0]}/samples/0")

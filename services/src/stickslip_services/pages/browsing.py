@@ -11,7 +11,7 @@ from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, solver_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.plan.grid import grid
-from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
@@ -33,7 +33,8 @@ def sliders(spec: JobSpec) -> list[dict[str, Any]]:
 def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, Any]:
     """Return the context of `thumbs.html`: the samples within the sliders, from number `start` on.
 
-    The query has the ends of each slider, `NAME.from` and `NAME.to`, as indices into the values of the axis.
+    The query has the ends of each slider, `NAME.from` and `NAME.to`, as indices into the values of the axis;
+    `split`, the name of a split; and `valid`, yes or no.
     """
     wanted: dict[str, set[Any]] = {}
     for axis in sliders(data.manifest.spec):
@@ -42,10 +43,14 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
         first, last = (int(place) if place.isdecimal() and len(place) < 9 else None for place in places)
         wanted[axis["name"]] = set(values[first or 0 : len(values) if last is None else last + 1])
     lost = data.rejections(MOST_SAMPLES)
+    codes = data.label("split") if query.get("split") in SPLITS else None
+    valid = {"yes": True, "no": False}.get(query.get("valid", ""))
     chosen = [
         (slot, point)
         for slot, point in enumerate(islice(grid(data.manifest.spec), MOST_SAMPLES))
         if all(point[name] in values for name, values in wanted.items())
+        and (codes is None or codes[slot] == SPLITS.index(query["split"]))
+        and valid in (None, slot not in lost)
     ]
     shown = chosen[start : start + SHOWN_THUMBS]
     keep = {name: value for name, value in query.items() if name != "start"}
@@ -83,13 +88,12 @@ def _telling_picture(data: SampleData) -> int:
 
 
 def histograms(data: SampleData) -> list[dict[str, Any]]:
-    """Return the distributions of the numeric labels that are not axes, over the valid samples."""
+    """Return the distributions of the numeric labels over the valid samples: parameters, looks, physics, checks."""
     valid = data.label("valid").astype(bool)
     shown = []
     for name, array in data.arrays.items():
-        is_axis = name in data.manifest.spec.named_axes
         is_number = not (array.dtype == "bool" or name in ("split", "valid") or name.endswith("_seed"))
-        if array.shape or is_axis or array.per_sample or not is_number:
+        if array.shape or array.per_sample or not is_number:
             continue
         values = np.asarray(data.label(name), dtype=float)
         values = values[np.isfinite(values) & valid]
@@ -98,8 +102,8 @@ def histograms(data: SampleData) -> list[dict[str, Any]]:
         counts, bounds = np.histogram(values, bins=min(20, max(5, values.size // 4)))
         top = max(int(counts.max()), 1)
         bars = [(int(count), 100 * count / top, bounds[i], bounds[i + 1]) for i, count in enumerate(counts)]
-        shown.append({"name": name, "text": array.description, "bars": bars})
-    return shown
+        shown.append({"name": name, "text": array.description, "bars": bars, "group": group(data, name)})
+    return sorted(shown, key=lambda each: ("Parameters", "Looks", "Physics", "Checks").index(each["group"]))
 
 
 def sample_view(data: SampleData, slot: int) -> dict[str, Any]:

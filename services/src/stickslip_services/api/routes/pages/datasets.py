@@ -81,7 +81,10 @@ def get_thumbs(
 ) -> Response:
     """Show the samples within the sliders."""
     found, committed, data = _open(context, dataset, version)
-    return html_page("thumbs.html", dataset=found, version=committed, **thumbs(data, request.query_params, start))
+    page = html_page("thumbs.html", dataset=found, version=committed, **thumbs(data, request.query_params, start))
+    if not start:
+        page.headers["HX-Replace-Url"] = f"/datasets/{found.id}/v{version}?{request.url.query}"
+    return page
 
 
 def _open(context: Context, dataset: str, version: int) -> tuple[Dataset, DatasetVersion, SampleData]:
