@@ -38,8 +38,8 @@ class LostError(RuntimeError):
     """The node of a call is gone."""
 
 
-class ForeignError(RuntimeError):
-    """The node of a call has other builds than the dispatcher."""
+class NotDoneError(RuntimeError):
+    """Nothing of a call was done, and it must be given again."""
 
 
 class NoNodeError(RuntimeError):
@@ -166,7 +166,7 @@ class Calls:
                 one.started_at, one.node, one.is_first = time.monotonic(), said["node"], said["first"]
                 if said["foreign"]:
                     self._exclude(one.node)
-                said = ForeignError(one.node) if said["foreign"] else None
+                said = NotDoneError(f"{one.node} is foreign") if said["foreign"] else None
             if isinstance(said, list | Exception):
                 del self._calls[reference]
             if one.parts:
@@ -187,7 +187,7 @@ class Calls:
         self._calls = {reference: it for reference, it in self._calls.items() if it is not one}
 
     def _look(self) -> Iterator[tuple[Call, Any]]:
-        """Look which nodes are alive: Ray may wait forever for a call on a lost one."""
+        """Look which nodes are alive: Ray may wait forever for a call on a lost one, also if it has not said where."""
         nodes = cluster.nodes()
         cpus = sum(node["Resources"].get("CPU", 0) for name, node in nodes.items() if name not in self._foreign)
         self.cpus = min(cpus, self._settings.max_cpus or math.inf)
@@ -197,10 +197,15 @@ class Calls:
             for _ in range(min(int(nodes[name]["Resources"].get("CPU", 0)), self._settings.max_cpus or sys.maxsize)):
                 for stage in (Stage.simulate, Stage.render):
                     self.give([], stage, is_express=True, node=name)
+        lost = self._warm - nodes.keys()
+        self._warm -= lost
         for reference, one in list(self._calls.items()):
             if one.node and one.node not in nodes:
                 del self._calls[reference]
                 yield one, LostError(f"node {one.node} is gone")
+            elif lost and one.started_at is None:
+                self.forget(one)
+                yield one, NotDoneError(f"it may be on node {min(lost)}, which is gone")
         working = {name for name, node in nodes.items() if node["Resources"].get("CPU")}
         if working and working <= self._foreign:
             raise NoNodeError(self.trouble())

@@ -19,7 +19,7 @@ from stickslip_schemas.documents.worker_api import Lease, LeaseRequest, WorkerRe
 from stickslip_schemas.store import open_store
 
 from stickslip_workers.batches import LARGEST_BATCH, Pace, results_of
-from stickslip_workers.calls import Call, Calls, ForeignError
+from stickslip_workers.calls import Call, Calls, NotDoneError
 from stickslip_workers.cluster import Place
 from stickslip_workers.lease_client import (
     Backoff,
@@ -182,7 +182,7 @@ class Dispatcher:
                 self._book.note_frames(one.leases[0], said)
             elif isinstance(said, list):
                 self._take_in(one, said)
-            elif isinstance(said, ForeignError):
+            elif isinstance(said, NotDoneError):
                 self._queues[one.stage].extendleft(reversed(one.leases))
             else:
                 self._take_failure(one, said)
