@@ -255,7 +255,7 @@ def test_scrubbing_finds_all_rot_and_it_is_mended_in_all_versions(settings: Sett
             listed = {name for one, name in told if one == f"{dataset}:{version}"}
             assert listed & {"/".join(names), MANIFEST_NAME}
         clock = ManualClock()
-        clock.now = time.time() - 3600
+        clock.now = time.time() + 3600  # a clock that is ahead
         context = Context.open(settings, clock)
         mend(context)
         context.close()

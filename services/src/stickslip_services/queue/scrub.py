@@ -3,7 +3,7 @@
 from contextlib import suppress
 from math import inf
 
-from sqlalchemy import select, update
+from sqlalchemy import or_, select, update
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 
@@ -29,7 +29,8 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
     None if all versions were read since `before` [s]. Raises OSError where the store is out of reach.
     """
     columns = dataset_versions.c
-    due = select(dataset_versions).where(columns.manifest.is_not(None), columns.scrubbed_at < before)
+    is_due = or_(columns.scrubbed_at < before, columns.scrubbed_at > context.clock())  # by a clock that was ahead
+    due = select(dataset_versions).where(columns.manifest.is_not(None), is_due)
     with context.database.read() as connection:
         row = connection.execute(due.order_by(columns.scrubbed_at, columns.publish_task).limit(1)).one_or_none()
     if row is None:
