@@ -4,8 +4,9 @@ import re
 import numpy as np
 import pytest
 from stickslip_training.cli import app
-from stickslip_training.rods.curvature import CurvatureTraining, read_test_rods
-from stickslip_training.rods.evaluation import estimate_strains
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.rods.dataset import load_splits
+from stickslip_training.rods.evaluation import estimate_strains, noisy_test_centerline
 from stickslip_training.rods.local_global import load_local_global
 from typer.testing import CliRunner
 
@@ -61,7 +62,9 @@ def test_local_global_trains_and_writes(rods, tmp_path):
     report = json.loads((out / "report.json").read_text())
     assert report["settings"]["noise"] == [0.001, 0.01]
     assert report["methods"][0]["method"] == "network"
-    test, noisy = read_test_rods(CurvatureTraining(dataset=str(rods.root), out=out, noise=0.02))
+    with DatasetReader(rods.root) as reader:
+        test = load_splits(reader, 1000)[0]["test"]
+    noisy = noisy_test_centerline(test, 0.02, 0)
     strains = estimate_strains(load_local_global(out / "local-global.pt"), noisy)
     assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
 

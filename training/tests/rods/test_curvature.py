@@ -4,13 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stickslip_training.rods.curvature import (
-    CurvatureTraining,
-    load_model,
-    read_test_rods,
-    train_curvature,
-)
-from stickslip_training.rods.evaluation import estimate_strains
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.rods.curvature import CurvatureTraining, load_model, train_curvature
+from stickslip_training.rods.dataset import load_splits
+from stickslip_training.rods.evaluation import estimate_strains, noisy_test_centerline
 
 pytestmark = pytest.mark.physics
 
@@ -50,7 +47,9 @@ def test_the_report_measures_the_model_that_is_saved(trained, rods):
         "finite differences",
     ]
     assert json.loads((config.out / "report.json").read_text())["test_loss"] == report.test_loss
-    test, noisy = read_test_rods(config)
+    with DatasetReader(rods.root) as reader:
+        test = load_splits(reader, config.evaluation_rods)[0]["test"]
+    noisy = noisy_test_centerline(test, config.noise, config.seed)
     assert np.array_equal(test.centerline, rods.arrays["centerline"][test.slots])
     assert 0.0009 < (noisy - test.centerline).std() < 0.0011
     strains = estimate_strains(load_model(config.out / "model.pt"), noisy)

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from stickslip_training.arrays import SingleFloats
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.engine.files import MODEL_NAME, load_tensors, save_tensors, versions, write_report
 from stickslip_training.engine.fit import (
@@ -153,13 +152,6 @@ def load_model(path: str | Path) -> CurvatureNet:
     net = CurvatureNet()
     net.load_state_dict(load_tensors(path)["net"])
     return net.eval()
-
-
-def read_test_rods(config: CurvatureTraining) -> tuple[Rods, SingleFloats]:
-    """Return the rods that a run with `config` is evaluated on, and their centrelines as all methods see them."""
-    with DatasetReader(config.dataset) as reader:
-        rods = load_splits(reader, config.evaluation_rods, only="test")[0]["test"]
-    return rods, noisy_test_centerline(rods, config.noise, config.seed)
 
 
 class _CurvatureLearner(Learner):

@@ -38,9 +38,7 @@ def read_rods(reader: DatasetReader, slots: Integers) -> Rods:
     return Rods(slots, reader.read("centerline", slots), reader.read("curvature", slots))
 
 
-def load_splits(
-    reader: DatasetReader, evaluation_rods: int, only: Split | None = None
-) -> tuple[dict[str, Rods], list[str]]:
+def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, Rods], list[str]]:
     """Read the three splits, of the test split no more than `evaluation_rods`; return them, and notes on them.
 
     Where a split is empty, another one takes its place, with a note.
@@ -73,7 +71,7 @@ def load_splits(
         slots["test"] = slots["test"][:evaluation_rods]
     if len(slots["test"]) < FEW_RODS:
         notes.append(f"There are only {len(slots['test'])} test rods: take medians and percentiles as a hint.")
-    return {split: read_rods(reader, slots[split]) for split in splits if only in (None, split)}, notes
+    return {split: read_rods(reader, slots[split]) for split in splits}, notes
 
 
 def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...]) -> SingleFloats:
