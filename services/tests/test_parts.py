@@ -130,9 +130,9 @@ def test_an_export_is_the_training_packages_work(
     origin: tuple[str, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     url, dataset, _ = origin
-    done = run("export", dataset, "--webdataset", tmp_path / "out", "--where", "gamma<2", "--url", url, "--gzip", 3)
+    done = run("export", dataset, "--webdataset", tmp_path / "out", "--obj", tmp_path / "b", "--url", url)
     assert done.exit_code == 1
-    assert "--gzip is for --hdf5 only" in capfd.readouterr().err
+    assert "an export needs one of" in capfd.readouterr().err
     monkeypatch.setattr("stickslip_services.cli.datasets.find_spec", lambda _name: None)
     done = run("export", dataset, "--webdataset", tmp_path / "out", "--url", url)
     assert (done.exit_code, "pip install 'stickslip-training[export]'" in done.stderr) == (1, True)
