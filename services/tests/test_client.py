@@ -7,9 +7,10 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi import FastAPI
+from stickslip_schemas.base.states import JobState
 from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStateEvent
 from stickslip_services.app import make_app
-from stickslip_services.client import Client, ProblemError, UnreachableError, pull, verify
+from stickslip_services.client import Client, ClientError, ProblemError, UnreachableError, pull, verify
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
@@ -33,6 +34,8 @@ def test_a_job_from_its_spec_to_its_files(app: FastAPI, tmp_path: Path) -> None:
         client.cancel(other.id)
         assert [shown.id for shown in client.jobs()] == [another.id, other.id, job.id]
         worker.work()
+        ended = client.wait(job.id)
+        assert ended.state == JobState.succeeded
         events = list(client.events(job.id))
         assert isinstance(events[-1], JobStateEvent)
         (made,) = [event for event in events if isinstance(event, DatasetPublishedEvent)]
@@ -53,6 +56,11 @@ def test_asynchronous_programs_call_the_client_in_threads(app: FastAPI) -> None:
 
     with serving(app) as url:
         asyncio.run(use(url))
+
+
+def test_a_url_without_a_scheme_is_refused() -> None:
+    with pytest.raises(ClientError, match=r"must begin with http:// or https://: it is 'localhost:8765'"):
+        Client("localhost:8765")
 
 
 def test_a_missing_coordinator_is_reported_at_once_and_a_restart_is_waited_for() -> None:

@@ -37,7 +37,7 @@ from stickslip_schemas.format.manifest import Contents, Manifest
 from tenacity import Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
 from stickslip_services.addresses import coordinator_url
-from stickslip_services.client.errors import UnexpectedError, UnreachableError, raise_for_problem
+from stickslip_services.client.errors import ClientError, UnexpectedError, UnreachableError, raise_for_problem
 
 T = TypeVar("T")
 
@@ -81,8 +81,13 @@ class Client:
             patience: How long a failed request is repeated [s].
             transport: Transport of httpx, for tests.
             sleep: Waits between attempts, for tests.
+
+        Raises:
+            ClientError: The URL has no scheme.
         """
         self.url = coordinator_url(url)
+        if not self.url.startswith(("http://", "https://")):
+            raise ClientError(f"the URL of the coordinator must begin with http:// or https://: it is {self.url!r}")
         self.patience = patience
         self._sleep = sleep
         self._was_answered = False
@@ -186,6 +191,12 @@ class Client:
                 raise UnreachableError(f"{self.url} does not answer: {reason}")
             self._sleep(1.0)
             waited += 1.0
+
+    def wait(self, job_id: str) -> JobDetail:
+        """Wait until a job has ended, as `events` does, and return it: its `state` says how it ended."""
+        for _ in self.events(job_id):
+            pass
+        return self.job(job_id)
 
     def _stream(self, job_id: str, last_id: str) -> Iterator[ServerSentEvent]:
         headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_id} if last_id else {})
