@@ -124,3 +124,13 @@ def test_what_is_no_number_and_what_crosses_is_named() -> None:
     good = {**worst, "not_finite": 0.0}
     assert checks.failed({**good, "stretch": math.nan})[0] == "stretch"
     assert checks.failed({**good, "contact_gain": 0.08})[0] == "contact_gain"
+
+
+def test_the_reason_is_the_cause_and_not_what_follows() -> None:
+    """A holder driven through a floor stretches the cloth, and no step fits its jerks."""
+    cloth, _ = sheet(0.0)
+    good = dict(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))
+    assert checks.failed({**good, "missed": 0.71, "stretch": 6.4, "penetration": 6.4})[0] == "penetration"
+    assert checks.failed({**good, "missed": 1.5, "stretch": 6.4, "passages": 1.0})[0] == "passages"
+    assert checks.failed({**good, "missed": 0.58, "stretch": 2.9, "sharpness": 12.5})[0] == "stretch"
+    assert checks.failed({**good, "missed": 0.58})[0] == "missed"

@@ -284,8 +284,10 @@ class Cloth:
             damping: Of all fabrics, on top of their own.
 
         Raises:
-            ValueError: `event` has passed.
+            ValueError: `event` has passed, or `end` is not a number.
         """
+        if np.isnan(end):
+            raise ValueError("end: must be a number, got nan")
 
         def drive(time: float) -> tuple[Floats, Floats, Floats, list[BodyTuple], float]:
             self.gravity, held, bodies = motion(time)
