@@ -220,6 +220,9 @@ void Stepper::count_contacts(StepReport& report) const {
 void Stepper::check(double dt, const Drive& drive) {
   const Numbering& numbering = assembly_.numbering;
   if (!(dt > 0.0) || !std::isfinite(dt)) refuse("dt: must be finite and > 0");
+  if (!(drive.damping >= 0.0) || !std::isfinite(drive.damping)) {
+    refuse(text("damping: must be finite and >= 0 [1/s], got ", drive.damping));
+  }
   if (drive.gravity.rows() != numbering.vertices) refuse("gravity: must have a row for each vertex");
   if (drive.held.rows() != static_cast<Eigen::Index>(numbering.held.size())) {
     refuse("held: must have a row for each held vertex");

@@ -56,6 +56,8 @@ def test_nan_is_refused() -> None:
         cloth.step(0.01, held=[(np.nan, 0.0, 0.0)])
     with pytest.raises(ValueError, match="dt: must be finite and > 0"):
         cloth.step(-0.01, held=at[:1])
+    with pytest.raises(ValueError, match=r"damping: must be finite and >= 0 \[1/s\], got -50"):
+        cloth.step(0.01, held=at[:1], damping=-50.0)
     with pytest.raises(ValueError, match="end: must be a number, got nan"):
         cloth.advance(math.nan, lambda _: (cloth.gravity, at[:1], []))
 
