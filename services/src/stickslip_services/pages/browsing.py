@@ -19,6 +19,8 @@ from stickslip_services.pages.plots import line_plot
 from stickslip_services.pages.sample_data import SampleData
 
 SHOWN_THUMBS = 48
+GROUPS = ("Parameters", "Looks", "Physics", "Checks")
+"""Groups of labels, in the order of the pages."""
 
 
 def sliders(spec: JobSpec) -> list[dict[str, Any]]:
@@ -89,7 +91,7 @@ def _telling_picture(data: SampleData) -> int:
 
 def histograms(data: SampleData) -> list[dict[str, Any]]:
     """Return the distributions of the numeric labels over the valid samples: parameters, looks, physics, checks."""
-    valid = data.label("valid").astype(bool)
+    valid, group = data.label("valid").astype(bool), groups_of(data)
     shown = []
     for name, array in data.arrays.items():
         is_number = not (array.dtype == "bool" or name in ("split", "valid") or name.endswith("_seed"))
@@ -102,16 +104,15 @@ def histograms(data: SampleData) -> list[dict[str, Any]]:
         counts, bounds = np.histogram(values, bins=min(20, max(5, values.size // 4)))
         top = max(int(counts.max()), 1)
         bars = [(int(count), 100 * count / top, bounds[i], bounds[i + 1]) for i, count in enumerate(counts)]
-        shown.append({"name": name, "text": array.description, "bars": bars, "group": group(data, name)})
-    return sorted(shown, key=lambda each: ("Parameters", "Looks", "Physics", "Checks").index(each["group"]))
+        shown.append({"name": name, "text": array.description, "bars": bars, "group": group[name]})
+    return sorted(shown, key=lambda each: GROUPS.index(each["group"]))
 
 
 def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
     """Return what the page of a sample shows: stills, the layers of the clip, shapes, plots, and labels in groups."""
     pictures, layers, plots, shapes = [], [], [], []
-    groups: dict[str, dict[str, tuple[object, str]]] = {
-        name: {} for name in ("Parameters", "Looks", "Physics", "Checks")
-    }
+    groups: dict[str, dict[str, tuple[object, str]]] = {name: {} for name in GROUPS}
+    group = groups_of(data)
     for name, array in data.arrays.items():
         dimensions = array.dimensions
         if dimensions[:3] == ("frame", "y", "x"):
@@ -126,7 +127,7 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
             plots.append(_plot(data, name, slot))
         elif len(array.shape) <= 1 and name != "sample_key" and (not array.shape or array.shape[0] <= 8):
             text = "" if array.categories else array.description
-            groups[group(data, name)][name] = (data.named(array, data.read(name, slot)), text)
+            groups[group[name]][name] = (data.named(array, data.read(name, slot)), text)
     chosen = groups["Parameters"]
     groups["Parameters"] = {name: chosen[name] for name in data.manifest.spec.named_axes if name in chosen}
     timed = [array for array in data.arrays.values() if array.dimensions[:1] == ("instant",)]
@@ -143,17 +144,14 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
     }
 
 
-def group(data: SampleData, name: str) -> str:
-    """Return which group of labels an array belongs to."""
+def groups_of(data: SampleData) -> dict[str, str]:
+    """Return the group of each array, one of `GROUPS`, by name."""
     spec = data.manifest.spec
-    if name in spec.named_axes:
-        return "Parameters"
-    if name in ("split", "valid") or (
-        isinstance(spec, ClipSpec) and name in {each.name for each in solver_arrays(spec)}
-    ):
-        return "Checks"
-    is_look = isinstance(spec, ClipSpec) and name in {each.name for each in clip_arrays(spec)}
-    return "Looks" if is_look else "Physics"
+    found = dict.fromkeys(data.arrays, "Physics")
+    if isinstance(spec, ClipSpec):
+        found |= {array.name: "Looks" for array in clip_arrays(spec)}
+        found |= {array.name: "Checks" for array in solver_arrays(spec)}
+    return found | {"split": "Checks", "valid": "Checks"} | dict.fromkeys(spec.named_axes, "Parameters")
 
 
 def coloured(array: ArrayLayout, values: Any, index: int) -> npt.NDArray[np.uint8]:

@@ -12,6 +12,7 @@ from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
+from stickslip_services.api.files import matches
 from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
@@ -133,7 +134,7 @@ def get_picture(
     _, committed, data = _open(context, dataset, version)
     tag = f'"{committed.manifest[:32]}-{slot}-{index}-{step}"'
     headers = {"Cache-Control": "private, max-age=86400", "ETag": tag}
-    if request.headers.get("if-none-match") == tag:
+    if matches(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=headers)
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[1:3] != ("y", "x") or index >= len(values):
