@@ -13,13 +13,15 @@ import pytest
 from fastapi import FastAPI
 from stickslip_schemas.documents.certificate import Certificate, CertificateUpload, CurveReport, ProtocolReport
 from stickslip_schemas.documents.responses import JobDetail
+from stickslip_schemas.kinds.cloth.spec import GroundTruth
+from stickslip_schemas.scene.files import with_arrays
 from stickslip_services.app import make_app
 from stickslip_services.catalog.certificates import register_certificate
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.jobs import show_job
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
-from stickslip_testing.jobs import parsed, rods
+from stickslip_sim_core.scenes.cloth_scene import KIND
+from stickslip_testing.jobs import parsed, rods, show_job
 from stickslip_testing.servers import serving, wait_until
 from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, rejection
 
@@ -62,8 +64,11 @@ def worker(app: FastAPI, url: str) -> PretendWorker:
     return PretendWorker(
         DirectApi(context),
         context.store,
+        kinds=("rod_hang", "cloth_scene"),
         whole=True,
-        judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None,
+        judge=lambda task: (
+            rejection() if task.stage == "simulate" and getattr(task.simulation, "gamma", None) == 1.0 else None
+        ),
     ).register()
 
 
@@ -73,12 +78,12 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
     context: Context = app.state.context
     done = submit_job(context, parsed(rods(name="done", gamma=(1.0, 2.0, 3.0))), None)
     worker.work()
+    clips = [make_cloth(context, worker, *scene) for scene in SCENES]
     running = submit_job(context, parsed(rods(name="running", gamma=(7.0, 8.0))), None)
     worker.start(*worker.lease(simulate=1))
-    with context.database.read() as connection:
-        dataset = show_job(context, connection, 1).dataset
     assert isinstance(done, JobDetail)
     assert isinstance(running, JobDetail)
+    dataset = show_job(context, done.id).dataset
     assert dataset is not None
     root = f"/datasets/{dataset.dataset}/v{dataset.version}"
     jobs = [f"/jobs/{job.id}" for job in (done, running)]
@@ -88,7 +93,42 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
         for upload in uploads
     ]
-    return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs"]
+    shown = [page for clip in clips for page in (clip, f"{clip}/samples/1")]
+    return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs", *shown]
+
+
+SCENES = (
+    ("turning-ball", {"duration": 1.0, "sheets.napkin.mesh.cells": [6, 6], "bodies.ball.motion.spin.begin": 0.0}),
+    ("over-the-edge", {"duration": 1.0, "sheets.strip.mesh.cells": [24, 2]}),
+)
+"""Small scenes: one with a floor and a ball, one with a table and a holder, but without a floor."""
+
+
+def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict[str, Any]) -> str:
+    """Make a dataset of true motions and invented pictures; return its page."""
+    spec = parsed(
+        {
+            "kind": "cloth_scene",
+            "name": scene,
+            "scene": scene,
+            "set": values,
+            "axes": {"mu": [0.2, 0.5], "texture": "dots", "viewpoint": "front"},
+            "frames": 5,
+            "ground_truth": list(GroundTruth),
+            "allow_uncertified": True,
+            "samples_per_shard": 2,
+        }
+    )
+    (outcome,) = KIND.simulate([{"scene": with_arrays(spec.stage, context.store.read), "seed": 1}], None)
+    assert not outcome.reason
+    worker.record = outcome.record
+    submitted = submit_job(context, spec, None)
+    assert isinstance(submitted, JobDetail)
+    worker.work()
+    worker.record = {}
+    dataset = show_job(context, submitted.id).dataset
+    assert dataset is not None
+    return f"/datasets/{dataset.dataset}/v{dataset.version}"
 
 
 def certificate(extent: Literal["full", "quick"]) -> CertificateUpload:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import prod
@@ -96,6 +96,8 @@ class PretendWorker:
     ran: list[str] = field(default_factory=list)
     whole: bool = False
     """Whether its datasets have all arrays of their kind, or only `views` and `sample_key`."""
+    record: Mapping[str, Any] = field(default_factory=dict)
+    """Arrays, by name, that all samples of its datasets have alike; the others are invented."""
 
     @property
     def condition(self) -> WorkerCondition:
@@ -174,13 +176,13 @@ class PretendWorker:
             output = RenderOutput(chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
         elif task.stage == "pack" and self.whole:
             arrays = [array for array in layout(task.spec) if not array.is_label]
-            shards = ((array.shard_path(task.shard), _encoded(array, task)) for array in arrays)
+            shards = ((array.shard_path(task.shard), _encoded(array, task, self.record)) for array in arrays)
             output = PackOutput(
                 files=tuple(
                     FileEntry(path=path, sha256=self.store.publish(data), size=len(data)) for path, data in shards
                 ),
                 labels=self.store.publish(
-                    encode_shard([_encoded(array, task) for array in layout(task.spec) if array.is_label])
+                    encode_shard([_encoded(array, task, self.record) for array in layout(task.spec) if array.is_label])
                 ),
             )
         elif task.stage == "pack":
@@ -270,11 +272,13 @@ class PretendWorker:
         return entries
 
 
-def _encoded(array: ArrayLayout, task: PackTask) -> bytes:
-    """Return the file of an array whose values grow from sample to sample."""
+def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> bytes:
+    """Return the file of an array that is recorded, or whose values grow from sample to sample."""
     size = task.spec.samples_per_shard
     ramp = np.arange(prod(array.shape)).reshape(array.shape)
-    values = [((ramp + slot.slot) % 251).astype(array.dtype) for slot in task.slots if slot.valid]
+    values = [
+        np.asarray(record.get(array.name, (ramp + slot.slot) % 251), array.dtype) for slot in task.slots if slot.valid
+    ]
     if array.name == "sample_key":
         keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]
         values = keys
