@@ -143,7 +143,7 @@ def _contents(client: Client, dataset: str) -> Contents:
 
 @shows_errors
 def export(context: typer.Context, url: UrlOption = DEFAULT_URL) -> None:
-    """Export a dataset to a format of another library, with Croissant metadata.
+    """Export a dataset to a format of another library.
 
     Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes the URL of a version.
     """

@@ -16,9 +16,9 @@ from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import huggingface, lerobot, meshes, webdataset
+from stickslip_training.export import hdf5, huggingface, lerobot, meshes, webdataset
 from stickslip_training.export.content import Content, OnBytes
-from stickslip_training.export.writing import to_directory, to_file
+from stickslip_training.export.writing import made_whole, to_directory
 
 
 def info(
@@ -82,7 +82,6 @@ def export(
     arrays: Annotated[str | None, typer.Option(help="arrays to take, with commas between; labels always come")] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
     where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
-    licence: Annotated[str | None, typer.Option("--license", help="URL of a licence, for the metadata")] = None,
 ) -> None:
     """Write a dataset in a format that other libraries read. Nothing is overwritten."""
     targets = {
@@ -103,9 +102,10 @@ def export(
             content = Content(reader, selection)
             with _progress(content) as on_bytes:
                 if option == "--hdf5":
-                    to_file(content, target, on_bytes, licence=licence)
+                    with made_whole(target) as scratch:
+                        hdf5.write(content, scratch, on_bytes)
                 else:
-                    to_directory(content, target, on_bytes, _DIRECTORIES[option], licence=licence)
+                    to_directory(content, target, on_bytes, _DIRECTORIES[option])
         skipped = len(reader) - len(content.slots)
         Console(soft_wrap=True, highlight=False).print(
             f"{content.name} is in {target}: {len(content.slots)} samples"

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from stickslip_schemas.store import sync
 
-from stickslip_training.export import croissant, hdf5
 from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes
 
 
@@ -18,26 +17,13 @@ def to_directory(
     target: Path,
     on_bytes: OnBytes,
     write: Callable[[Content, Path, OnBytes], None],
-    *,
-    licence: str | None = None,
 ) -> None:
-    """Let `write` fill a directory, and add the manifest, a description and Croissant metadata."""
+    """Let `write` fill a directory, and add the manifest and a description."""
     with made_whole(target) as scratch:
         scratch.mkdir()
         (scratch / MANIFEST_COPY).write_bytes(content.manifest())
         (scratch / DESCRIPTION).write_bytes(content.description())
         write(content, scratch, on_bytes)
-        files = {path.relative_to(scratch).as_posix(): path for path in scratch.rglob("*") if path.is_file()}
-        metadata = croissant.document(content, files, licence=licence)
-        (scratch / croissant.CROISSANT_NAME).write_bytes(metadata)
-
-
-def to_file(content: Content, target: Path, on_bytes: OnBytes, *, licence: str | None = None) -> None:
-    """Write an HDF5 file, with Croissant metadata beside it: `NAME.croissant.json`."""
-    beside = target.with_name(f"{target.name}.{croissant.CROISSANT_NAME}")
-    with made_whole(target) as scratch, made_whole(beside) as metadata:
-        hdf5.write(content, scratch, on_bytes)
-        metadata.write_bytes(croissant.document(content, {target.name: scratch}, licence=licence))
 
 
 @contextmanager
