@@ -190,7 +190,7 @@ def measure(name: str, settings: Mapping[str, Any], figures: Path | None) -> Non
         print("  ", dict(curve.parameters), [f"{error:+.2e}" for error in curve.errors])
     print("  ", dict(result.settings), flush=True)
     if figures:
-        from stickslip_sim_core.protocols import plots
+        import plots
 
         plots.plot(result).savefig(figures / f"{name}.png")
 

@@ -51,7 +51,7 @@ def main() -> None:
         print(f"  poisson {poisson:g}: phi {phi:.9f} = {phi / np.pi:.6f} pi, Gamma {gamma:.7f}")
 
     if figures:
-        from stickslip_sim_core.protocols import plots
+        import plots
 
         figures.mkdir(parents=True, exist_ok=True)
         for result in results:

@@ -11,7 +11,7 @@ import schemathesis
 from hypothesis import strategies as st
 from PIL import Image
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.worker_api import ReportBatch
 from stickslip_schemas.kinds import AnyJobSpec
 
@@ -57,7 +57,7 @@ _DOCUMENTS: dict[str, TypeAdapter[Any]] = {
     "/v1/jobs": TypeAdapter(AnyJobSpec),
     "/v1/jobs:validate": TypeAdapter(AnyJobSpec),
     "/v1/worker/report": TypeAdapter(ReportBatch),
-    "/v1/certificates": TypeAdapter(CertificateUpload),
+    "/v1/certificates": TypeAdapter(Certificate),
 }
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stickslip_schemas.documents.certificate import CertificateUpload
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.cli import app
@@ -54,7 +53,7 @@ def quick(cli: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory) 
 def test_register_and_list(cli: Callable[..., Result], quick: Path) -> None:
     registered = cli("register", quick)
     assert registered.exit_code == 0, registered.output
-    digest = read_certificate(quick).certificate.digest
+    digest = read_certificate(quick).digest
     assert digest in registered.stdout
     assert cli("register", quick).stdout == registered.stdout
     (entry,) = json.loads(cli("certificates", "--json").stdout)
@@ -66,8 +65,8 @@ def test_a_cloth_job_from_refusal_to_dataset(
     cli: Callable[..., Result], server: RunningServer, quick: Path, tmp_path: Path
 ) -> None:
     """The certificate is the rods' under the name of a preset of cloth; one of its reports stands for contact, too."""
-    upload = read_certificate(quick)
-    build = upload.certificate.sim_core
+    certificate = read_certificate(quick)
+    build = certificate.sim_core
     builds = BUILDS.model_copy(update={"sim_core": build})
     worker = server.worker(kinds=("cloth_drag",), builds=builds)
     spec = tmp_path / "spec.json"
@@ -78,18 +77,17 @@ def test_a_cloth_job_from_refusal_to_dataset(
         assert words in refused.stderr
 
     made: dict[str, Any] = {"preset": "certified", "extent": "full"}
-    alone = CertificateUpload(certificate=upload.certificate.model_copy(update=made), page=upload.page)
-    of_rods = upload.certificate.protocols
+    alone = certificate.model_copy(update=made)
+    of_rods = certificate.protocols
     made["protocols"] = (*of_rods, *(of_rods[0].model_copy(update={"protocol": name}) for name in CONTACT_PROTOCOLS))
-    full = CertificateUpload(certificate=upload.certificate.model_copy(update=made), page=upload.page)
+    full = certificate.model_copy(update=made)
     with Client(server.url) as client:
         client.register(alone)
         refused = cli("submit", spec)
         assert refused.exit_code == 1
         assert f"it must have {', '.join(CONTACT_PROTOCOLS)}, since cloth touches cloth" in refused.stderr
         entry = client.register(full)
-        assert client.certificate(entry.digest) == full.certificate
-        assert client.certificate_page(entry.digest) == full.page
+        assert client.certificate(entry.digest) == full
         submitted = cli("submit", spec)
         assert submitted.exit_code == 0, submitted.output
         worker.work()
@@ -98,7 +96,7 @@ def test_a_cloth_job_from_refusal_to_dataset(
         manifest, _ = client.manifest(job.dataset.dataset, job.dataset.version)
     assert isinstance(manifest, Manifest)
     assert manifest.certificate == entry.digest
-    assert manifest.builds.sim_core == full.certificate.sim_core
+    assert manifest.builds.sim_core == full.sim_core
     assert "this" in cli("certificates").stdout
 
 
@@ -129,7 +127,6 @@ def test_a_damaged_certificate_is_refused_in_words(cli: Callable[..., Result], q
     document = json.loads((quick / "certificate.json").read_text())
     document["protocols"][0]["error"] = 0.5
     (tmp_path / "certificate.json").write_text(json.dumps(document))
-    (tmp_path / "certificate.html").write_text("<p>")
     result = cli("register", tmp_path)
     assert result.exit_code == 1
     assert "is not a valid certificate" in result.stderr

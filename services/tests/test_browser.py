@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.documents.certificate import Certificate, CertificateUpload, CurveReport, ProtocolReport
+from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds.cloth.spec import GroundTruth
 from stickslip_schemas.scene.files import with_arrays
@@ -131,7 +131,7 @@ def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict
     return f"/datasets/{dataset.dataset}/v{dataset.version}"
 
 
-def certificate(extent: Literal["full", "quick"]) -> CertificateUpload:
+def certificate(extent: Literal["full", "quick"]) -> Certificate:
     x = tuple(np.geomspace(1, 100, 200).tolist())
     curve = CurveReport(
         parameters={"mesh": 0.0},
@@ -153,7 +153,7 @@ def certificate(extent: Literal["full", "quick"]) -> CertificateUpload:
         build_hash="1" * 64,
         curves=(curve,),
     )
-    made = Certificate(
+    return Certificate(
         preset="certified",
         numbers={},
         sim_core=BUILDS.sim_core,
@@ -163,7 +163,6 @@ def certificate(extent: Literal["full", "quick"]) -> CertificateUpload:
         passed=True,
         environment={"cores": "2"},
     )
-    return CertificateUpload(certificate=made, page="<!doctype html><title>made</title>")
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,6 @@ SHARED = {
 HOUSE = {
     ("GET", "/metrics"): 404,
     ("GET", "/v1/certificates/{digest}"): 404,  # there is none here; they belong to no project
-    ("GET", "/v1/certificates/{digest}/page"): 404,
     ("GET", "/certificates/{digest}"): 404,
     ("GET", "/scenes/{digest}"): 404,
     ("POST", "/v1/certificates"): 403,

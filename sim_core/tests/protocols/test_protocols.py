@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
 from stickslip_sim_core.protocols import Curve, ProtocolResult, rods
-from stickslip_sim_core.protocols.plots import dense_master
+from stickslip_sim_core.protocols.dense import dense_master
 from stickslip_sim_core.protocols.rods import extrapolated, loss_of_stability, planar_frames, round_rod, tip
 from stickslip_sim_core.reference import master_curves
 
@@ -102,13 +101,6 @@ class TestCertification:
         results: list[Any] = [protocols.run("pretended"), protocols.run("pretended", "fast", cells=7)]
         assert results == [("certified", 50), ("fast", 7)]
 
-    def test_figures(self) -> None:
-        pytest.importorskip("matplotlib")
-        from stickslip_sim_core.protocols import plots
-
-        result = protocols.run("rod-cantilever", gamma=(1.0, 2.0), elements=64)
-        assert len(plots.figures(result)) == 1
-
 
 class TestRelax:
     def test_agrees_with_solve_rods(self) -> None:
@@ -162,17 +154,6 @@ class TestResult:
         text = json.dumps(protocols.run("rod-cantilever", gamma=(1.0,), elements=64).as_dict(), allow_nan=False)
         assert json.loads(text)["build_hash"] == build_info().build_hash
         assert json.loads(json.dumps(self.RESULT.as_dict(), allow_nan=False))["curves"][0]["measured"] == [1.1, None]
-
-    @pytest.mark.parametrize("name", sorted(protocols.ROD_PROTOCOLS))
-    def test_plot(self, name: str, tmp_path: Path) -> None:
-        pytest.importorskip("matplotlib")
-        from stickslip_sim_core.protocols import plots
-
-        few: dict[str, dict[str, Any]] = {
-            "bend-twist": {"phi": (6.5, 8.0), "poisson": (0.5,)},
-            "rod-cantilever": {"gamma": (1.0, 300.0)},
-        }
-        plots.plot(protocols.run(name, elements=128, **few.get(name, {}))).savefig(tmp_path / "figure.png")
 
     def test_unknown_names_and_settings(self) -> None:
         with pytest.raises(ValueError, match=r"protocol: must be one of bend-twist, .* got 'stick'"):

@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,14 +44,6 @@ class TestStickSlip:
             clear = (mu == m) & (np.abs(strain - threshold) > 0.012)
             assert (regime[clear] == np.where(strain[clear] > threshold, beyond, stick_slip.STICK)).all()
         assert set(regime) == {stick_slip.STICK, stick_slip.SLIP, stick_slip.EXTENDED}
-
-    def test_figures(self, pressed: ProtocolResult, tmp_path: Path) -> None:
-        pytest.importorskip("matplotlib")
-        from stickslip_sim_core.protocols import plots
-
-        for number, figure in enumerate(plots.figures(pressed)):
-            figure.savefig(tmp_path / f"{number}.png")
-        assert len(list(tmp_path.iterdir())) == 2
 
     def test_friction_beyond_the_triple_point_is_refused(self) -> None:
         with pytest.raises(ValueError, match="friction: "):
@@ -176,12 +167,3 @@ class TestPresets:
         for name in protocols.CERTIFICATION["certified"].protocols:
             with pytest.raises(ValueError, match="preset: must be one of certified"):
                 protocols.run(name, "best")
-
-
-def test_plots_of_all(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    from stickslip_sim_core.protocols import plots
-
-    result = protocols.run("inclined-plane", friction=(0.5, 1.0), cells=4, unstructured=0)
-    for figure in plots.figures(result):
-        figure.savefig(tmp_path / "figure.png")

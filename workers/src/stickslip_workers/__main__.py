@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     certify = commands.add_parser("certify", help="run the physical protocols of a preset with this build")
     certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
-    certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json and certificate.html")
+    certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json")
     certify.add_argument(
         "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
     )

@@ -1,55 +1,45 @@
-"""Certification: run the protocols of a preset with this build, and write the certificate and its page.
+"""Certification: run the protocols of a preset with this build, and write the certificate.
 
 It belongs to the workers because a certificate covers their build.
 """
 
-import base64
-import io
 import os
 import platform
 import time
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from stickslip_schemas.base.keys import canonical_json, content_key
 from stickslip_schemas.documents.certificate import Certificate, ProtocolReport
 from stickslip_schemas.plan.sources import digests, sources
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
-from stickslip_sim_core.protocols.plots import dense_master
+from stickslip_sim_core.protocols.dense import dense_master
 
 from stickslip_workers.builds import solver_build
 
 DOCUMENT_NAME = "certificate.json"
-PAGE_NAME = "certificate.html"
 
 Say = Callable[[str], None]
 
 
 def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
-    """Certify a preset: write `certificate.json` and `certificate.html` into `out`.
+    """Certify a preset: write `certificate.json` into `out`.
 
     A protocol that raises has not passed; the others run all the same.
 
     Raises:
         ValueError: There is no such preset.
-        ModuleNotFoundError: matplotlib is not installed.
     """
-    if find_spec("matplotlib") is None:  # fail now, not after an hour of protocols
-        raise ModuleNotFoundError("certificates have pictures: pip install 'stickslip-sim-core[plots]'")
     if preset not in protocols.CERTIFICATION:
         raise ValueError(f"preset: must be one of {', '.join(protocols.CERTIFICATION)}, got {preset!r}")
     certification = protocols.CERTIFICATION[preset]
     environment = _environment()
     reports: list[ProtocolReport] = []
-    results: list[ProtocolResult] = []
     for number, name in enumerate(certification.protocols, 1):
         say(f"{number}/{len(certification.protocols)} {name} ...")
         cpu, wall = time.process_time(), time.monotonic()
@@ -59,8 +49,6 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
         except Exception as error:  # any error becomes part of the certificate
             report = _broken_off(name, error)
-        else:
-            results.append(result)
         reports.append(report)
         spent = time.process_time() - cpu
         environment[f"cpu_seconds/{name}"] = f"{spent:.2f}"
@@ -77,7 +65,6 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
     )
     out.mkdir(parents=True, exist_ok=True)
     write_durably(out / DOCUMENT_NAME, certificate.canonical())
-    write_durably(out / PAGE_NAME, _page(certificate, results).encode())
     return certificate
 
 
@@ -138,32 +125,3 @@ def _processor() -> str:
         return platform.machine()
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.machine()
-
-
-def _page(certificate: Certificate, results: Sequence[ProtocolResult]) -> str:
-    """Return the page: one HTML file that contains its pictures, drawn from the results by matplotlib."""
-    import matplotlib
-    from stickslip_sim_core.protocols import plots
-
-    pictures: dict[str, list[str]] = defaultdict(list)
-    undrawn: dict[str, str] = {}
-    with matplotlib.rc_context({"svg.hashsalt": "stickslip", "svg.fonttype": "path"}):
-        for result in results:
-            try:
-                for figure in plots.figures(result):
-                    data = io.BytesIO()
-                    figure.savefig(data, format="svg", metadata={"Date": None})
-                    # As an image: several SVG elements in one page would share their ids.
-                    pictures[result.protocol].append(base64.b64encode(data.getvalue()).decode())
-            except Exception as error:  # a missing picture must not lose the measurements
-                undrawn[result.protocol] = f"{type(error).__name__}: {error}"
-    environment = jinja2.Environment(autoescape=True, loader=jinja2.PackageLoader("stickslip_workers", ""))
-    environment.filters["shown"] = _shown
-    page = environment.get_template("certificate.html")
-    return page.render(certificate=certificate, pictures=pictures, undrawn=undrawn)
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return ", ".join(_shown(item) for item in value)
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -11,8 +11,6 @@ from pydantic import Field, model_validator
 from stickslip_schemas.base.document import Bool, Document, Float
 from stickslip_schemas.base.keys import Sha256, canonical_json, content_key
 
-MAX_PAGE_CHARACTERS = 8 * 2**20
-
 Numbers = tuple[Float | None, ...]
 
 _NOT_CONTENT: Any = {
@@ -136,10 +134,3 @@ class Certificate(Document):
         if len({protocol.build_hash for protocol in self.protocols}) > 1:
             raise ValueError("all protocols must have been run with one build")
         return self
-
-
-class CertificateUpload(Document):
-    """A certificate with its page for people."""
-
-    certificate: Certificate
-    page: str = Field(min_length=1, max_length=MAX_PAGE_CHARACTERS, description="one self-contained HTML page")

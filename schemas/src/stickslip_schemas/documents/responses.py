@@ -168,7 +168,6 @@ class CertificateEntry(Document):
     passed: bool
     created_at: datetime
     href: str
-    page: str = Field(description="URL of its page")
 
 
 class SampleState(Document):

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, TypeAdapter
-from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import Problem
 from stickslip_schemas.documents.responses import JobPatch
 from stickslip_schemas.documents.tasks import task_adapter
@@ -24,7 +24,7 @@ _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
     "LeaseRequest": LeaseRequest,
     "Heartbeat": Heartbeat,
     "ReportBatch": ReportBatch,
-    "CertificateUpload": CertificateUpload,
+    "Certificate": Certificate,
     "JobPatch": JobPatch,
     "Manifest": Manifest,
     "Problem": Problem,

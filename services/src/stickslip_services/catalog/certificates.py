@@ -4,7 +4,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.documents.certificate import CertificateUpload
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.responses import CertificateEntry, Page
 from stickslip_schemas.store import Store
 
@@ -28,10 +28,9 @@ def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) 
     return (row.digest, row.protocols.split()) if row is not None and row.passed else None
 
 
-def register_certificate(database: Database, store: Store, upload: CertificateUpload, now: float) -> CertificateEntry:
-    """Store a certificate with its page, and register it; a known one becomes the newest again."""
-    certificate = upload.certificate
-    artifact, page = store.publish(certificate.canonical()), store.publish(upload.page.encode())
+def register_certificate(database: Database, store: Store, certificate: Certificate, now: float) -> CertificateEntry:
+    """Store a certificate, and register it; a known one becomes the newest again."""
+    artifact = store.publish(certificate.canonical())
     values = {"created_at": now, "protocols": " ".join(report.protocol for report in certificate.protocols)}
     with database.write() as connection:
         known = update(certificates).where(certificates.c.digest == certificate.digest)
@@ -40,7 +39,6 @@ def register_certificate(database: Database, store: Store, upload: CertificateUp
                 insert(certificates).values(
                     digest=certificate.digest,
                     artifact=artifact,
-                    page=page,
                     preset=certificate.preset,
                     sim_core=certificate.sim_core,
                     extent=certificate.extent,
@@ -75,5 +73,4 @@ def _entry(row: Row[tuple[Any, ...]]) -> CertificateEntry:
         passed=row.passed,
         created_at=as_datetime(row.created_at),
         href=f"/v1/certificates/{row.digest}",
-        page=f"/v1/certificates/{row.digest}/page",
     )

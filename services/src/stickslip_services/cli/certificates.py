@@ -31,18 +31,18 @@ def certify(
     """Measure a preset on the physical protocols, and register the certificate with the coordinator.
 
     A full certificate of a cloth preset takes about three minutes of CPU time. It vouches for this build and preset
-    only. Writes certificate.json and certificate.html; exits with 1 if the preset does not pass.
+    only. Writes certificate.json; exits with 1 if the preset does not pass.
     """
     screen = console()
     directory = out or Path("certificates") / preset
     certificate = certifying.measure(preset, directory, quick=quick)
-    page = escape(str(directory / certifying.PAGE_NAME))
+    written = escape(str(directory / certifying.DOCUMENT_NAME))
     if quick:
         passed = "All" if certificate.passed else "NOT all"
-        screen.print(f"{passed} of the few points that were measured are within the tolerances: {page}")
+        screen.print(f"{passed} of the few points that were measured are within the tolerances: {written}")
         screen.print(f"A quick run does not count. To certify the preset: stickslip certify --preset {escape(preset)}")
     else:
-        screen.print(f"preset {escape(preset)} {'passed' if certificate.passed else 'did NOT pass'}: {page}")
+        screen.print(f"preset {escape(preset)} {'passed' if certificate.passed else 'did NOT pass'}: {written}")
     try:
         with Client(url, patience=1.0) as client:
             _say_registered(client.register(certifying.read_certificate(directory)), url)
@@ -57,9 +57,9 @@ def register(
     url: UrlOption = DEFAULT_URL,
 ) -> None:
     """Register a certificate that was measured without a running coordinator."""
-    upload = certifying.read_certificate(directory)
+    certificate = certifying.read_certificate(directory)
     with Client(url) as client:
-        _say_registered(client.register(upload), url)
+        _say_registered(client.register(certificate), url)
 
 
 def _say_registered(entry: CertificateEntry, url: str) -> None:

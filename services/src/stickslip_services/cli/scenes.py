@@ -47,7 +47,7 @@ def simulate(
     given, files = _scene(scene)
     usual = Path("certificates") / given.preset.value
     directory = certificate or (usual if usual.is_dir() else None)
-    found = None if directory is None else certifying.read_certificate(directory).certificate
+    found = None if directory is None else certifying.read_certificate(directory)
     spec = spec_of(given, allow_uncertified=allow_uncertified)
     result = simulating.simulate(spec, files, out, certificate=found, obj=obj)
     if as_json:

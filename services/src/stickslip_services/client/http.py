@@ -13,7 +13,7 @@ import httpx
 from httpx_sse import EventSource, ServerSentEvent
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.base.states import JobState, TaskState
-from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.responses import (
     CertificateEntry,
     Dataset,
@@ -248,14 +248,10 @@ class Client:
         """Return a certificate."""
         return self._call(Certificate, "GET", f"/v1/certificates/{digest}")
 
-    def certificate_page(self, digest: str) -> str:
-        """Return the page of a certificate as HTML."""
-        return self.request("GET", f"/v1/certificates/{digest}/page").text
-
-    def register(self, upload: CertificateUpload) -> CertificateEntry:
+    def register(self, certificate: Certificate) -> CertificateEntry:
         """Register a certificate. Registering it again changes nothing."""
         headers = {"Content-Type": "application/json"}
-        content = upload.model_dump_json()
+        content = certificate.model_dump_json()
         return self._call(CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers)
 
     # --- HTTP -----------------------------------------------------------------------------------------------------

@@ -276,7 +276,6 @@ certificates = Table(
     Column("seq", _Wide, primary_key=True),
     Column("digest", String, nullable=False, unique=True),
     Column("artifact", String, nullable=False),  # the document
-    Column("page", String, nullable=False),  # its page for people, an artifact
     Column("preset", String, nullable=False),
     Column("sim_core", String, nullable=False),
     Column("extent", String, nullable=False),

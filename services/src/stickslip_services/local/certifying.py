@@ -1,6 +1,6 @@
 """Measurement of certificates by the workers' program, whose build is certified.
 
-The core is not imported here: the program returns two files.
+The core is not imported here: the program writes a file.
 """
 
 import os
@@ -9,12 +9,11 @@ import sys
 from pathlib import Path
 
 from pydantic import ValidationError
-from stickslip_schemas.documents.certificate import Certificate, CertificateUpload
+from stickslip_schemas.documents.certificate import Certificate
 
 from stickslip_services.errors import CommandError
 
 DOCUMENT_NAME = "certificate.json"
-PAGE_NAME = "certificate.html"
 
 
 class CertifyError(CommandError):
@@ -43,19 +42,18 @@ def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     """
     arguments = ["certify", "--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
     digest = ask_workers(arguments, "no certificate was made", CertifyError).strip()
-    certificate = read_certificate(out).certificate
+    certificate = read_certificate(out)
     if certificate.digest != digest:
         raise CertifyError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
     return certificate
 
 
-def read_certificate(directory: Path) -> CertificateUpload:
-    """Read a certificate and its page from the directory that `measure` wrote; raise CertifyError."""
+def read_certificate(directory: Path) -> Certificate:
+    """Read a certificate from the directory that `measure` wrote; raise CertifyError."""
     try:
-        certificate = Certificate.model_validate_json((directory / DOCUMENT_NAME).read_bytes())
-        return CertificateUpload(certificate=certificate, page=(directory / PAGE_NAME).read_text(encoding="utf-8"))
+        return Certificate.model_validate_json((directory / DOCUMENT_NAME).read_bytes())
     except FileNotFoundError as error:
-        raise CertifyError(f"{directory} holds no certificate: there is no {Path(error.filename).name}") from error
+        raise CertifyError(f"{directory} holds no certificate: there is no {DOCUMENT_NAME}") from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the document"

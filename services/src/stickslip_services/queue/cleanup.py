@@ -121,8 +121,7 @@ def _needed(database: Database, store: Store) -> set[bytes]:
         add(*connection.scalars(select(previews.c.digest)))
         for manifest, spec in connection.execute(select(jobs.c.manifest, jobs.c.spec)):
             add(manifest, *_DIGEST.findall(spec))  # a spec names textures, also before its tasks are planned
-        for certificate in connection.execute(select(certificates.c.artifact, certificates.c.page)):
-            add(*certificate)
+        add(*connection.scalars(select(certificates.c.artifact)))
         columns = dataset_versions.c
         versions = connection.execute(
             select(columns.manifest, columns.group_digest).where(columns.manifest.is_not(None))
