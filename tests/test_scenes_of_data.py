@@ -1,5 +1,7 @@
 """Scenes of data in the solver: each built-in one, and what the language says about holders, starts and bodies."""
 
+import ast
+import re
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,25 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
             assert np.shape(made[layout.name]) == tuple(layout.shape), layout.name
     missing = {layout.name for layout in spec.arrays()} - set(made)
     assert not {name for name in missing if "." in name or name.startswith(("holder", "body", "contact"))}, missing
+
+
+def test_no_code_knows_the_name_of_a_scene() -> None:
+    """Names stand in the file's name alone: what a program does with a scene follows from its document."""
+    root, names = Path(__file__).parents[1], set(scene_names())
+    folders = ("schemas/src", "services/src", "workers", "training/src", "sim_core/python", "sim_core/src")
+    sources = [path for folder in folders for path in (root / folder).rglob("*.*") if "tests" not in path.parts]
+    knowing = []
+    for path in sources:
+        if path.suffix == ".py":
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            words = {str(node.value) for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+        elif path.suffix in (".js", ".html", ".cpp", ".hpp"):
+            words = set(re.findall(r"[\"'`]([\w-]+)[\"'`]", path.read_text(encoding="utf-8")))
+        else:
+            continue
+        knowing += [f"{path.relative_to(root)}: {word}" for word in sorted(words & names)]
+    assert len(sources) > 300
+    assert not knowing
 
 
 @pytest.mark.physics

@@ -24,6 +24,12 @@ def npz(**arrays: Any) -> bytes:
     return file.getvalue()
 
 
+def frames(**arrays: Any) -> bytes:
+    """Return a body of one triangle in two frames, but for some arrays."""
+    usual = {"positions": np.zeros((2, 3, 3)), "triangles": np.array([[0, 1, 2]]), "times": np.arange(2.0)}
+    return npz(**{**usual, **arrays})
+
+
 PATH_FILE = b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0,0\n1.5,1,2,3,0,0,0.5\n"
 
 
@@ -50,28 +56,52 @@ def test_files_become_arrays() -> None:
 @pytest.mark.parametrize(
     ("place", "data", "rule"),
     [
-        (BODY, b"", "must have faces"),
-        (BODY, b"v 0 0 0\nv 1 0\n", "line 2 must be a vertex within 100 m"),
-        (BODY, b"v 0 0 nan\n", "line 1 must be a vertex"),
-        (BODY, b"v 0 0 1e9\n", "line 1 must be a vertex within 100 m"),
-        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "line 4 must be a vertex within 100 m or a face"),
+        (BODY, b"", "must have faces, and has none"),
+        (BODY, b"v 0 0 0\nv 1 0\n", "line 2 must be a vertex within 100 m .*, and is 'v 1 0'"),
+        (BODY, b"v 0 0 nan\n", "line 1 must be a vertex .*, and is 'v 0 0 nan'"),
+        (BODY, b"v 0 0 1e9\n", "line 1 must be a vertex within 100 m .*, and is 'v 0 0 1e9'"),
+        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "line 4 must be .* a face of its vertices, and is 'f 1 2 4'"),
         (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 2\n", "triangle 0 names one twice"),
-        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", "must be a manifold"),
-        (BODY, b"\xff\xfe\x00", "must be text in UTF-8"),
-        (BODY, b"PK\x03\x04 no archive", "must be an NPZ file"),
-        (BODY, npz(positions=np.zeros((1, 3, 3))), "triangles, times is missing"),
-        (BODY, npz(positions=np.zeros((2, 3, 3)), triangles=np.array([[0, 1, 2]]), times=np.zeros(2)), "that ascend"),
-        (BODY, npz(positions=np.zeros((1, 3, 3)), triangles=np.array([[0, 1, 3]]), times=np.zeros(1)), "below 3"),
-        (BODY, npz(positions=np.full((1, 3, 3), np.inf), triangles=np.zeros((1, 3)), times=np.zeros(1)), "finite"),
-        (BODY, npz(positions=np.array([None]), triangles=np.zeros((1, 3)), times=np.zeros(1)), "plain arrays"),
-        (MESH, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "must have texture coordinates"),
-        (MESH, FLAT.replace(b"1/1 2/2 3/3", b"1/1 3/3 2/2"), "must have areas above 0 m"),
-        (MESH, FLAT + b"f 1/1 3/2 2/3\n", "a vertex must have one texture coordinate"),
-        (START, npz(positions=np.zeros((3, 2))), r"positions must be \(vertex, 3\)"),
-        (PATH, b"t,x,y,z\n", "must begin with the line time,x,y,z,rx,ry,rz"),
-        (PATH, b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0\n", "line 2 must be seven finite numbers"),
-        (PATH, b"time,x,y,z,rx,ry,rz\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", "instants that ascend"),
-        (PATH, npz(time=np.arange(2.0), move=np.zeros((2, 3)), turn=np.zeros((2, 2))), "move and turn must be"),
+        (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", "must be a manifold: .* 1 edges are not so"),
+        (BODY, b"\xff\xfe\x00", "must be text in UTF-8.* 0xff in position 0"),
+        (BODY, b"PK\x03\x04 no archive", "must be an NPZ file: File is not a zip file"),
+        (
+            BODY,
+            npz(positions=np.zeros((1, 3, 3))),
+            "must have positions, triangles, times, and triangles, times is missing",
+        ),
+        (BODY, frames(times=[0.0, 0.0]), r"times must be instants that ascend from 0 s or later, and are 0, 0 \[s\]"),
+        (BODY, frames(times=[[0.0], [1.0]]), r"times must be \(2\), and is \(2, 1\)"),
+        (BODY, frames(triangles=[[0, 1, 3]]), "triangles must be vertices, 0 to 2, and has 3"),
+        (BODY, frames(triangles=[[0, 1.5, 2]]), "triangles must be vertices, 0 to 2, and has 1.5"),
+        (BODY, frames(triangles=np.zeros((0, 3))), r"triangles must be \(triangle, 3\), and is \(0, 3\)"),
+        (BODY, frames(positions=np.zeros((0, 3, 3))), r"positions must be \(frame, vertex, 3\), and is \(0, 3, 3\)"),
+        (
+            BODY,
+            frames(positions=np.full((2, 3, 3), np.inf)),
+            "positions must be finite numbers, and is float64 with others",
+        ),
+        (BODY, frames(positions=np.full((2, 3, 3), 200.0)), "positions must be within 100 m, and reaches 200 m"),
+        (BODY, frames(positions=[None]), "must be an NPZ file of plain arrays"),
+        (
+            BODY,
+            frames(rest=np.zeros((3, 3)), weights=np.zeros((3, 2)), bones=[1.0]),
+            r"bones must be \(frame, 2, 3, 4\), and",
+        ),
+        (MESH, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", r"must have texture coordinates .*\[m\]"),
+        (MESH, FLAT.replace(b"1/1 2/2 3/3", b"1/1 3/3 2/2"), r"must have areas above 0 m\^2; 0 has -0.005"),
+        (MESH, FLAT + b"f 1/1 3/2 2/3\n", "line 8: a vertex must have one texture coordinate, and 3 has two"),
+        (START, npz(positions=np.zeros((3, 2))), r"positions must be \(vertex, 3\), and is \(3, 2\)"),
+        (PATH, b"t,x,y,z\n", "must begin with the line time,x,y,z,rx,ry,rz, and begins with 't,x,y,z'"),
+        (PATH, b"time,x,y,z,rx,ry,rz\n0,0,0,0,0,0\n", r"line 2 must be .*\[s, m, rad\], and is '0,0,0,0,0,0'"),
+        (PATH, b"time,x,y,z,rx,ry,rz\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", r"ascend from 0 s or later, and are 1, 1 \[s\]"),
+        (PATH, b"time,x,y,z,rx,ry,rz\n", r"ascend from 0 s or later, and are none \[s\]"),
+        (
+            PATH,
+            npz(time=np.arange(2.0), move=np.zeros((2, 3)), turn=np.zeros((2, 2))),
+            r"turn must be \(2, 3\), and is \(2, 2",
+        ),
+        (PATH, npz(time=0.0, move=np.zeros((1, 3)), turn=np.zeros((1, 3))), r"time must be \(time\), and is \(\)"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(place: tuple[str, ...], data: bytes, rule: str) -> None:

@@ -1,5 +1,7 @@
 """Wrong scenes: each is refused with the path, the rule, the value and, of a number, the unit."""
 
+import json
+import re
 from copy import deepcopy
 from typing import Any
 
@@ -68,8 +70,9 @@ NAN, FAR = float("nan"), 1000.0
 UPPER, LOWER, BALL = "sheets.upper", "sheets.lower", "bodies.ball"
 SPIN, KEYS = f"{BALL}.motion.spin", f"{UPPER}.holders.hand.motion.keys"
 
-# Where, what stands there, the place that the answer names (empty: the same), a part of the rule with its unit.
-WRONG: list[tuple[str, Any, str, str]] = [
+# Where, what stands there, the place that the answer names (empty: the same), a part of the rule with its unit, and the
+# value that is shown, where it is not what stands at the place that the answer names.
+WRONG: list[tuple[Any, ...]] = [
     ("format", "stickslip-scene/2", "", "must be one of stickslip-scene/1"),
     ("format", GONE, "", "this field is required"),
     ("sheets", GONE, "", "this field is required"),
@@ -78,10 +81,10 @@ WRONG: list[tuple[str, Any, str, str]] = [
     ("duration", -1.0, "", "greater than 0 [s]"),
     ("duration", NAN, "", "finite number [s]"),
     ("duration", "2 s", "", "valid number [s]"),
-    ("duration", GONE, "", "one of duration [s] and end must be given"),
+    ("duration", GONE, "", "one of duration [s] and end must be given", "null"),
     ("end", {"when": "rest", "at_most": 3.0}, "duration", "and not both"),
-    ("duration", 9999.0, "frame_rate", "length [s] times frame_rate [1/s] must be at most 10000 frames"),
-    ("frame_rate", 0, "", "greater than 0"),
+    ("duration", 9999.0, "frame_rate", "length [s] times frame_rate [1/s] must be at most 10000 frames", "30.0"),
+    ("frame_rate", 0, "", "greater than 0 [1/s]"),
     ("gravity", [0, 0, -FAR], "gravity.2", "greater than or equal to -100 [m/s^2]"),
     ("gravity", [0, -9.81], "gravity.2", "this field is required"),
     ("preset", "quick", "", "must be one of certified"),
@@ -90,8 +93,14 @@ WRONG: list[tuple[str, Any, str, str]] = [
     ("bias.until", -1.0, "", "greater than or equal to 0 [s]"),
     ("calm.rate", 1e4, "", "less than or equal to 1000 [1/s]"),
     ("materials.felt.density", 9.0, "", "less than or equal to 5 [kg/m^2]"),
-    ("materials.gray-interlock", {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}, "", "redefine"),
-    ("materials.Felt", {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}, "", "pattern"),
+    (
+        "materials.gray-interlock",
+        {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3},
+        "",
+        "redefine",
+        '"gray-interlock"',
+    ),
+    ("materials.Felt", {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}, "", "pattern", '"Felt"'),
     (f"{UPPER}.material", "fellt", "", "did you mean felt"),
     (f"{UPPER}.origin", [0, 0, FAR], f"{UPPER}.origin.2", "less than or equal to 100 [m]"),
     (f"{UPPER}.turn", [0, 0, 2000.0], f"{UPPER}.turn.2", "less than or equal to 6.2832 [rad]"),
@@ -100,7 +109,7 @@ WRONG: list[tuple[str, Any, str, str]] = [
     (f"{UPPER}.factors", {"density": 0.01}, f"{UPPER}.factors.density", "greater than or equal to 0.1"),
     (f"{UPPER}.mesh", {"type": "hexagons"}, f"{UPPER}.mesh.type", "must be one of"),
     (f"{UPPER}.mesh.spacing", -0.02, "", "greater than 0 [m]"),
-    (f"{UPPER}.mesh.spacing", 1e-5, "sheets", "at most 100000 vertices"),
+    (f"{UPPER}.mesh.spacing", 1e-5, "sheets", "at most 100000 vertices", "115497375"),
     (f"{LOWER}.mesh.cells", [0, 4], f"{LOWER}.mesh.cells.0", "greater than or equal to 1"),
     (f"{LOWER}.mesh.cells", [8.5, 4], f"{LOWER}.mesh.cells.0", "integer"),
     (f"{LOWER}.mesh.size", [0.2, FAR], f"{LOWER}.mesh.size.1", "less than or equal to 100 [m]"),
@@ -139,13 +148,13 @@ WRONG: list[tuple[str, Any, str, str]] = [
     ("bodies.actor.strength", 3.0, "", "less than or equal to 2"),
     ("bodies.actor.file", "a\\b.obj", "", "in the folder of the scene"),
     ("bodies.actor.frame_rate", -1.0, "", "greater than 0 [1/s]"),
-    ("bodies.upper", {"type": "plane"}, "", "names of their own"),
+    ("bodies.upper", {"type": "plane"}, "", "names of their own", '"upper"'),
     ("friction.0.mu", 11.0, "", "less than or equal to 10"),
     ("friction.0.between", ["ball", "floor"], "", "must name two that may touch"),
     ("friction.1.between", ["ball", "lower"], "", "must name two once"),
-    ("default_friction", GONE, "friction", "missing: actor with lower"),
-    ("looks.sheets.napkin", {"texture": "dots"}, "", "must be one of lower"),
-    ("looks.bodies.bal", {"roughness": 0.5}, "", "did you mean ball"),
+    ("default_friction", GONE, "friction", "missing: actor with lower", "null"),
+    ("looks.sheets.napkin", {"texture": "dots"}, "", "must be one of lower", '"napkin"'),
+    ("looks.bodies.bal", {"roughness": 0.5}, "", "did you mean ball", '"bal"'),
     ("looks.bodies.ball.color", [2, 0, 0], "looks.bodies.ball.color.0", "less than or equal to 1"),
     ("looks.cameras.door.position", [9, 1, 1], "looks.cameras.door", "within 4 m of the middle"),
     ("looks.cameras.door.focal_length", 5.0, "", "greater than or equal to 10 [mm]"),
@@ -154,12 +163,12 @@ WRONG: list[tuple[str, Any, str, str]] = [
     ("parameters.mu.sets", ["friction.ball.tower"], "parameters.mu.sets.0", "no pair of ball and tower"),
     ("parameters.mu.high", 20.0, "", "friction.0.mu: Input should be less than or equal to 10"),
     ("parameters.mu.low", 3.0, "", "low below high"),
-    ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2 [1]"),
-    ("parameters.speed.low", GONE, "", "low and high [rad/s] must be given"),
+    ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2 [1]", "0.5"),
+    ("parameters.speed.low", GONE, "", "low and high [rad/s] must be given", "null"),
     ("parameters.speed.sets", [f"{SPIN}.sped"], "parameters.speed.sets.0", "did you mean speed"),
     ("parameters.fabric.low", 1.0, "", "for numbers without a list of values"),
-    ("parameters.fabric.values", ["silk"], "parameters.fabric.sets.0", "default within silk"),
-    ("parameters.texture", {"sets": [f"{UPPER}.material"]}, "", "name of an axis of all scenes"),
+    ("parameters.fabric.values", ["silk"], "parameters.fabric.sets.0", "default within silk", '"gray-interlock"'),
+    ("parameters.texture", {"sets": [f"{UPPER}.material"]}, "", "name of an axis of all scenes", '"texture"'),
     ("parameters.n", {"low": 1, "high": 9, "sets": [f"{LOWER}.mesh.cells.0"]}, "parameters.n.sets.0", "shapes of"),
     ("parameters.t", {"low": 1, "high": 9, "sets": ["duration"]}, "parameters.t.sets.0", "shapes of arrays"),
     ("parameters.f", {"sets": ["bodies.actor.file"]}, "parameters.f.sets.0", "must lead to a number or a material"),
@@ -173,20 +182,41 @@ WRONG: list[tuple[str, Any, str, str]] = [
 ]
 
 
+PURE = {
+    "Bias": {"size"},
+    "BodyLook": {"color", "roughness"},
+    "FabricNumbers": {"poisson"},
+    "Factors": {"density", "bending", "stretching"},
+    "FloorNumbers": {"albedo", "roughness", "metallic", "specular", "grain", "tint"},
+    "LampNumbers": {"power"},
+    "MeshBody": {"strength"},
+    "Pair": {"mu"},
+    "Parameter": {"low", "high", "values"},  # their unit is data
+    "Plane": {"normal"},
+    "Scene": {"default_friction"},
+    "Spin": {"axis"},
+    "Stretched": {"strain"},
+}
+"""The only numbers of a scene without a unit."""
+
+
 def changed(place: str, value: Any) -> dict[str, Any]:
-    """Return the scene with another value at a place: keys and positions, with points between."""
+    """Return the scene with another value at a place."""
     scene = deepcopy(SCENE)
-    *path, last = place.split(".")
-    at: Any = scene
-    for step in path:
-        at = at[int(step)] if isinstance(at, list) else at[step]
+    above, _, last = place.rpartition(".")
+    here = at(scene, above)
     if value is GONE:
-        del at[last]
-    elif isinstance(at, list):
-        at[int(last)] = value
+        del here[last]
     else:
-        at[last] = value
+        here[int(last) if isinstance(here, list) else last] = value
     return scene
+
+
+def at(document: Any, place: str) -> Any:
+    """Return what stands at a place: keys and positions, with points between."""
+    for step in filter(None, place.split(".")):
+        document = document[int(step)] if isinstance(document, list) else document[step]
+    return document
 
 
 def test_the_scene_itself_is_right() -> None:
@@ -195,19 +225,30 @@ def test_the_scene_itself_is_right() -> None:
     assert Scene.model_validate_json(scene.model_dump_json()) == scene
 
 
-def test_there_are_eighty() -> None:
-    assert len(WRONG) >= 80
+def test_every_number_has_a_unit_but_those_that_are_pure() -> None:
+    schema = Scene.model_json_schema()
+    models = {**schema["$defs"], "Scene": schema}
+    pure = {
+        name: {
+            field
+            for field, said in model.get("properties", {}).items()
+            if '"number"' in json.dumps(said) and not re.search(r"\[.+\]", said.get("description", ""))
+        }
+        for name, model in models.items()
+    }
+    assert {name: fields for name, fields in pure.items() if fields} == PURE
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "said", "rule"), WRONG, ids=lambda part: "missing" if part is GONE else str(part)[:40]
-)
-def test_a_wrong_scene_is_refused(place: str, value: Any, said: str, rule: str) -> None:
+@pytest.mark.parametrize("row", WRONG, ids=lambda row: f"{row[0]}={'missing' if row[1] is GONE else row[1]}"[:60])
+def test_a_wrong_scene_is_refused(row: tuple[Any, ...]) -> None:
+    place, value, said, rule, *shown = row
     document = changed(place, value)
     with pytest.raises(ValidationError) as caught:
         Scene.model_validate(document)
     errors = field_errors(caught.value, document, Scene)
-    found = [error for error in errors if error.pointer == "/" + (said or place).replace(".", "/")]
+    found = {error.pointer: error for error in errors}.get("/" + (said or place).replace(".", "/"))
     assert found, errors
-    assert rule in found[0].rule
-    assert found[0].value or "required" in rule
+    assert rule in found.rule
+    if "required" not in rule:
+        shown = shown or [json.dumps(at(document, said or place))]
+    assert found.value == (shown[0] if len(shown[0]) <= 200 else f"{shown[0][:197]}...") if shown else not found.value

@@ -2,14 +2,15 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from itertools import islice
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from stickslip_schemas.base.units import literals, models_at, unit_of
 from stickslip_schemas.spec.fabrics import did_you_mean
 
 MEDIA_TYPE = "application/problem+json"
@@ -85,13 +86,13 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
         case "missing":
             rule = "this field is required"
         case "extra_forbidden":
-            known = sorted({name for model in _models_at(of, location[:-1]) for name in model.model_fields})
+            known = sorted({name for model in models_at(of, location[:-1]) for name in model.model_fields})
             hint = did_you_mean(str(location[-1]), known) or "."
             rule = f"there is no such field{hint} Fields: {', '.join(known)}"
         case "union_tag_invalid" | "union_tag_not_found":
             tag = item["ctx"]["discriminator"].strip("'")
-            tags = [model.model_fields[tag] for model in _models_at(of, location) if tag in model.model_fields]
-            known = [word for field in tags for word in _literals(field.annotation)]
+            tags = [model.model_fields[tag] for model in models_at(of, location) if tag in model.model_fields]
+            known = [word for field in tags for word in literals(field.annotation)]
             is_missing = item["type"] == "union_tag_not_found" and isinstance(value, Mapping)
             if isinstance(value, Mapping):
                 location = (*location, tag)
@@ -107,56 +108,12 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
         case "enum" | "literal_error":
             known = re.findall(r"'([^']*)'", item["ctx"]["expected"])
             rule = f"must be one of {', '.join(known)}" + (did_you_mean(value, known) if isinstance(value, str) else "")
-    if item["type"] in _OF_NUMBERS:
-        rule += _unit_at(of, location)
+    rule += unit_of(item, of)
     return FieldError(
         pointer=_pointer(location, document, missing=is_missing or item["type"] == "broken_rule"),
         rule=rule,
         value="" if is_missing else _shown(value),
     )
-
-
-_OF_NUMBERS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_type", "finite_number")
-
-
-def _unit_at(of: Any, location: Sequence[int | str]) -> str:
-    """Return ` [unit]` of the number at a place, from the description of its field; nothing where it has none."""
-    names = [place for place, part in enumerate(location) if isinstance(part, str)]
-    for place in reversed(names):
-        for model in _models_at(of, location[:place]):
-            if (field := model.model_fields.get(str(location[place]))) is not None:
-                unit = re.search(r"\[([^\]]+)\]", field.description or "")
-                return f" [{unit[1]}]" if unit else ""
-    return ""
-
-
-def _models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
-    """Return the models that a place in a document may hold, from the type of the whole."""
-    models = list(_models_in(of))
-    for part in location:
-        fields = [model.model_fields[part] for model in models if part in model.model_fields]
-        if fields:
-            models = [found for field in fields for found in _models_in(field.annotation)]
-        else:  # the place in a list, or the tag of a union
-            tagged = [
-                model
-                for model in models
-                if any(part in _literals(field.annotation) for field in model.model_fields.values())
-            ]
-            models = tagged or models
-    return models
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    elif get_origin(annotation) is not Literal:
-        for argument in get_args(annotation):
-            yield from _models_in(argument)
-
-
-def _literals(annotation: Any) -> list[str]:
-    return [str(value) for value in get_args(annotation)] if get_origin(annotation) is Literal else []
 
 
 def _pointer(location: Sequence[int | str], document: Any, *, missing: bool) -> str:

@@ -187,7 +187,7 @@ class ClothSceneSpec(ClipSpec):
             try:
                 self.stage.checked({place: v for name, v in corner.items() for place in self.stage.places(name)})
             except ValidationError as error:
-                refuse_as(error, self, ("axes",), corner)
+                refuse_as(error, self.stage, ("axes",), corner)
         return self
 
     def _corners(self) -> Iterator[dict[str, Any]]:

@@ -70,7 +70,7 @@ class Physics(Document):
     format: Literal["stickslip-scene/1"]
     duration: Float | None = Field(default=None, gt=0, le=10_000, description="[s]")
     end: End | None = Field(default=None, description="instead of `duration`")
-    frame_rate: Float = Field(default=30.0, gt=0, le=10_000, description="frames that are kept, a second")
+    frame_rate: Float = Field(default=30.0, gt=0, le=10_000, description="frames that are kept [1/s]")
     gravity: Vector = Field(default=(0.0, 0.0, -9.81), description="[m/s^2]")
     bias: Bias | None = None
     calm: Calm | None = None

@@ -31,6 +31,16 @@ Floats = npt.NDArray[np.float64]
 Triangles = npt.NDArray[np.int64]
 Arrays = dict[str, npt.NDArray[Any]]
 
+_Shapes = dict[str, tuple[str | int, ...]]
+_FRAMES: _Shapes = {"positions": ("frame", "vertex", 3), "triangles": ("triangle", 3), "times": ("frame",)}
+_SKIN: _Shapes = {
+    "rest": ("vertex", 3),
+    "weights": ("vertex", "bone"),
+    "bones": ("frame", "bone", 3, 4),
+    "times": ("frame",),
+    "triangles": ("triangle", 3),
+}
+
 
 class UnfitFileError(ValueError):
     """A file cannot be what a scene needs; the message has the rule, and what was found."""
@@ -187,39 +197,26 @@ def _body(data: bytes) -> Arrays:
         vertices, triangles, _ = read_obj(data)
         _check_edges(triangles, len(vertices))
         return {"positions": vertices[None], "triangles": triangles, "times": np.zeros(1)}
-    skinned = ("rest", "weights", "bones", "times", "triangles")
-    found = _arrays(data, skinned if "rest" in _names(data) else ("positions", "triangles", "times"))
-    rest = found["rest"] if "rest" in found else found["positions"][0]
-    frames = found.get("bones", found.get("positions"))
-    assert frames is not None
-    _ascending(found["times"], len(frames))
-    if rest.ndim != 2 or rest.shape[1] != 3:
-        raise UnfitFileError(f"vertices must be (frame, vertex, 3) or, at rest, (vertex, 3), and are {rest.shape}")
-    if "weights" in found and found["weights"].shape != (len(rest), frames.shape[1]):
-        raise UnfitFileError(f"weights must be (vertex, bone), and are {found['weights'].shape}")
+    found = _arrays(data, _SKIN if "rest" in _names(data) else _FRAMES)
     triangles = found["triangles"].astype(np.int64)
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.min() < 0 or triangles.max() >= len(rest):
-        raise UnfitFileError(f"triangles must be (triangle, 3) of vertices below {len(rest)}")
-    _check_edges(triangles, len(rest))
+    count = found["rest" if "rest" in found else "positions"].shape[-2]
+    _ascending(found["times"])
+    if (wrong := found["triangles"][(triangles != found["triangles"]) | (triangles < 0) | (triangles >= count)]).size:
+        raise UnfitFileError(f"triangles must be vertices, 0 to {count - 1}, and has {wrong[0]}")
+    _check_edges(triangles, count)
     return {**found, "triangles": triangles}
 
 
 def _start(data: bytes) -> Arrays:
     if not data.startswith(b"PK"):
         return {"positions": read_obj(data)[0]}
-    found = _arrays(data, ("positions",))
-    if found["positions"].ndim != 2 or found["positions"].shape[1] != 3:
-        raise UnfitFileError(f"positions must be (vertex, 3), and are {found['positions'].shape}")
-    return found
+    return _arrays(data, {"positions": ("vertex", 3)})
 
 
 def _path(data: bytes) -> Arrays:
     if data.startswith(b"PK"):
-        found = _arrays(data, ("time", "move", "turn"))
-        _ascending(found["time"], len(found["move"]))
-        shapes = {name: found[name].shape for name in ("move", "turn")}
-        if set(shapes.values()) != {(len(found["time"]), 3)}:
-            raise UnfitFileError(f"move and turn must be (time, 3), and are {shapes}")
+        found = _arrays(data, {"time": ("time",), "move": ("time", 3), "turn": ("time", 3)})
+        _ascending(found["time"])
         return found
     lines = _text(data).splitlines()
     if not lines or lines[0].replace(" ", "") != "time,x,y,z,rx,ry,rz":
@@ -236,13 +233,14 @@ def _path(data: bytes) -> Arrays:
             raise UnfitFileError(f"line {number} must be seven finite numbers [s, m, rad], and is {line[:80]!r}")
         rows.append(row)
     table = np.array(rows).reshape(-1, 7)
-    _ascending(table[:, 0], len(rows))
+    _ascending(table[:, 0])
     return {"time": table[:, 0], "move": table[:, 1:4], "turn": table[:, 4:]}
 
 
-def _ascending(times: Floats, count: int) -> None:
-    if times.shape != (count,) or not count or times[0] < 0 or not (np.diff(times) > 0).all():
-        raise UnfitFileError(f"times must be {count} instants that ascend from 0 s or later, one for each frame")
+def _ascending(times: Floats) -> None:
+    if not len(times) or times[0] < 0 or not (np.diff(times) > 0).all():
+        shown = ", ".join(f"{time:g}" for time in times[:8])
+        raise UnfitFileError(f"times must be instants that ascend from 0 s or later, and are {shown or 'none'} [s]")
 
 
 def _names(data: bytes) -> dict[str, int]:
@@ -254,18 +252,26 @@ def _names(data: bytes) -> dict[str, int]:
         raise UnfitFileError(f"must be an NPZ file: {error}") from error
 
 
-def _arrays(data: bytes, names: tuple[str, ...]) -> Arrays:
+def _arrays(data: bytes, shapes: _Shapes) -> Arrays:
+    """Return the arrays of an NPZ file: sides of their shapes with the same name must be equal."""
     sizes = _names(data)
-    if missing := [name for name in names if name not in sizes]:
-        raise UnfitFileError(f"must have {', '.join(names)}, and {', '.join(missing)} is missing")
+    if missing := [name for name in shapes if name not in sizes]:
+        raise UnfitFileError(f"must have {', '.join(shapes)}, and {', '.join(missing)} is missing")
     if sum(sizes.values()) > MAX_FILE_BYTES:
         raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes when unpacked, and has {sum(sizes.values())}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            found = {name: file[name] for name in names}
+            found = {name: file[name] for name in shapes}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
         raise UnfitFileError(f"must be an NPZ file of plain arrays: {error}") from error
+    sides: dict[Any, int] = {3: 3, 4: 4}
     for name, values in found.items():
+        shape = shapes[name]
+        expected = ", ".join(str(sides.get(side, side)) for side in shape)
+        if values.ndim != len(shape) or not all(
+            n and n == sides.setdefault(side, n) for side, n in zip(shape, values.shape, strict=True)
+        ):
+            raise UnfitFileError(f"{name} must be ({expected}), and is {values.shape}")
         if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
             raise UnfitFileError(f"{name} must be finite numbers, and is {values.dtype} with others")
         if values.dtype.kind == "f" and values.size and np.abs(values).max() > FARTHEST and "time" not in name:
@@ -323,7 +329,9 @@ def read_obj(data: bytes) -> tuple[Floats, Triangles, Floats | None]:
                     raise ValueError
                 for vertex, of_texture in corners:
                     if of_texture is not None and flat.setdefault(vertex, of_texture) != of_texture:
-                        raise UnfitFileError(f"line {number}: a vertex must have one texture coordinate")
+                        raise UnfitFileError(
+                            f"line {number}: a vertex must have one texture coordinate, and {vertex + 1} has two"
+                        )
                 names = [vertex for vertex, _ in corners]
                 triangles += [(names[0], b, c) for b, c in pairwise(names[1:])]
         except UnfitFileError:

@@ -8,6 +8,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base.document import Document, Float
 from stickslip_schemas.base.keys import placed
+from stickslip_schemas.base.units import unit_of
 from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 
 Path = tuple[str | int, ...]
@@ -159,9 +160,8 @@ def refuse(model: BaseModel, place: Path, rule: str, value: Any) -> Never:
     )
 
 
-def refuse_as(error: ValidationError, model: BaseModel, place: Path, value: Any) -> Never:
-    """Raise a ValidationError for a value that another part of a document makes wrong."""
+def refuse_as(error: ValidationError, scene: BaseModel, place: Path, value: Any) -> Never:
+    """Raise a ValidationError for a value that another part of a document, a scene, makes wrong."""
     first = error.errors(include_url=False)[0]
-    refuse(
-        model, place, f"sets {'.'.join(map(str, first['loc']))}: {first['msg'].removeprefix('Value error, ')}", value
-    )
+    rule = first["msg"].removeprefix("Value error, ") + unit_of(first, type(scene))
+    refuse(scene, place, f"sets {'.'.join(map(str, first['loc']))}: {rule}", value)

@@ -1,0 +1,166 @@
+"""How many samples of each built-in scene are valid, and what they cost.
+
+    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--out FILE]
+
+Simulates each scene at the mesh and the preset of its file. All parameters vary together: numbers over their declared
+ranges as a Sobol sequence, fabrics over all that are built in. No more samples of a scene begin once it has cost
+`--seconds` of CPU. Writes a row for each scene as soon as it is done, and keeps the rows of other scenes that FILE has.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.grid import grid
+from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.spec.fabrics import Material
+from stickslip_sim_core.cloth.solver import Cloth
+from stickslip_sim_core.scenes import cloth_scene
+
+OUT = Path(__file__).parent / "results/scenes.json"
+COMMAND = "python benchmarks/scenes.py"
+
+
+def spec(name: str, samples: int) -> Any:
+    """Return the spec of a scene in which all parameters vary."""
+    scene = load_scene(name)
+    axes: dict[str, Any] = {}
+    for parameter, given in scene.parameters.items():
+        if isinstance(scene.default(parameter), str):
+            fabrics = [str(value) for value in given.values or Material]
+            axes[parameter] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
+        else:
+            axes[parameter] = {"type": "sobol", "low": given.low, "high": given.high, "num": samples}
+    cameras = scene.looks.cameras
+    viewpoint = next(iter(cameras)) if isinstance(cameras, dict) else "front"
+    looks = {"texture": ["checker"] * samples, "viewpoint": [viewpoint] * samples}
+    return job_spec_adapter.validate_python(
+        {
+            "kind": "cloth_scene",
+            "scene": name,
+            "combine": "zip",
+            "frames": 2,
+            "allow_uncertified": True,
+            "axes": axes | looks,
+        }
+    )
+
+
+class Clock:
+    """CPU seconds in some calls."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+
+    def of(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that does the same and counts its time."""
+
+        def timed(*given: Any, **named: Any) -> Any:
+            begin = time.process_time()
+            try:
+                return called(*given, **named)
+            finally:
+                self.spent[name] += time.process_time() - begin
+
+        return timed
+
+
+def simulated(simulation: Any) -> dict[str, Any]:
+    """Return what came of a sample: its code and reason if it is not valid, and CPU seconds by part."""
+    begin, clock = time.process_time(), Clock()
+    given = simulation.given(built_in_files().__getitem__)
+    scene = cloth_scene.scene(given["scene"], seed=given["seed"])
+    set_up = time.process_time() - begin
+    scene = replace(
+        scene,
+        motion=clock.of("motion", scene.motion),
+        holders=[replace(holder, pose=clock.of("motion", holder.pose)) for holder in scene.holders],
+        forces=clock.of("forces", scene.forces),
+    )
+    step, Cloth.advance = Cloth.advance, clock.of("steps", Cloth.advance)  # type: ignore[method-assign]
+    try:
+        outcome = scene.outcome()
+    finally:
+        Cloth.advance = step  # type: ignore[method-assign]
+    cpu = time.process_time() - begin
+    layer = {
+        "set-up": set_up,
+        "motion": clock.spent["motion"],
+        "contacts and forces of frames": clock.spent["forces"],
+        "checks and other arrays": cpu - set_up - clock.spent["steps"] - clock.spent["forces"],
+    }
+    return {"code": outcome.code if outcome.reason else "", "reason": outcome.reason, "cpu": cpu, "layer": layer}
+
+
+def row(name: str, samples: int, seconds: float) -> dict[str, Any]:
+    """Simulate samples of a scene, and return its row."""
+    made, measured = spec(name, samples), commit()
+    stage = made.stage
+    found: list[dict[str, Any]] = []
+    for point in grid(made):
+        if sum(each["cpu"] for each in found) > seconds:
+            break
+        values = {key: value for key, value in point.items() if key in stage.parameters}
+        found.append(simulated(made.simulation(point)) | {"values": values})
+        print(name, len(found), f"{found[-1]['cpu']:.1f} s", values, found[-1]["reason"] or "valid", flush=True)
+    vertices = sum(sheet.mesh.shape[0] for sheet in stage.sheets.values())
+    length = (stage.frames - 1) / stage.frame_rate
+    cpu = [each["cpu"] for each in found]
+    share = {part: sum(each["layer"][part] for each in found) / sum(cpu) for part in found[0]["layer"]}
+    return {
+        "scene": name,
+        "preset": stage.preset.value,
+        "vertices": vertices,
+        "scene seconds": round(length, 2),
+        "samples": len(found),
+        "valid": sum(not each["reason"] for each in found),
+        "not valid": [{key: each[key] for key in ("code", "reason", "values")} for each in found if each["reason"]],
+        "CPU s a sample, least, median, most": [round(value, 1) for value in (min(cpu), median(cpu), max(cpu))],
+        "CPU ms a vertex and scene second, least, median, most": [
+            round(1e3 * value / vertices / length, 2) for value in (min(cpu), median(cpu), max(cpu))
+        ],
+        "share of CPU outside the solver's steps, %": {part: round(100 * value, 2) for part, value in share.items()},
+        "commit": measured,
+    }
+
+
+def commit() -> str:
+    """Return the commit that is measured."""
+    found = subprocess.run(["git", "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
+    return found.stdout.strip()
+
+
+def main() -> None:
+    """Run the scenes one after another."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("scenes", nargs="*", choices=[[], *scene_names()], metavar="SCENE", default=[])
+    parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--seconds", type=float, default=4000.0)
+    parser.add_argument("--out", type=Path, default=OUT)
+    args = parser.parse_args()
+    for name in args.scenes or scene_names():
+        made = row(name, args.samples, args.seconds)
+        old = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
+        rows = sorted([*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"])
+        said = {
+            "what": "Validity and CPU time of the built-in scenes, all parameters over their declared ranges",
+            "command": COMMAND,
+            "conditions": "one thread; two cores shared with other work; CPU time of this process",
+            "rows": rows,
+        }
+        args.out.write_text(json.dumps(said, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
