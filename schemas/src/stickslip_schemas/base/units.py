@@ -12,7 +12,7 @@ _RULES = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", 
 
 
 def unit_of(item: ErrorDetails, of: Any) -> str:
-    """Return ` [unit]` of the number that an error is about; nothing where there is none.
+    """Return ` [unit]` of the number that an error is about, or an empty text.
 
     `of` is the type that the document was to be, a model or a union of models.
     """
