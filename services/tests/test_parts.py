@@ -1,4 +1,4 @@
-"""Parts of a dataset are pulled, checked and completed; versions are compared; exports are started."""
+"""Parts of a dataset are pulled, checked and completed; exports are started."""
 
 import json
 from collections.abc import Iterator
@@ -8,7 +8,6 @@ import pytest
 from stickslip_schemas.format.selection import SELECTION_NAME, Selection
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
-from stickslip_services.client.comparing import differences
 from stickslip_services.client.errors import ForeignFilesError, SelectionError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
@@ -105,25 +104,6 @@ def test_what_makes_no_sense_is_refused(
 ) -> None:
     done = run("pull", origin[1], tmp_path / "d", "--url", origin[0], *options)
     assert (done.exit_code, message in " ".join(done.stderr.split())) == (1, True), done.output
-
-
-def test_versions_are_compared(origin: tuple[str, str, str], tmp_path: Path) -> None:
-    url, large, small = origin
-    with Client(url) as client:
-        pull(client, small, 1, tmp_path / "small", selection=Selection(arrays=()))
-        found = {what: (a, b) for what, a, b in differences(client.contents(large, 1), client.contents(small, 1))}
-    assert found["samples"] == ("8", "4")
-    assert found["spec name"] == ("4-rods", "2-rods")
-    assert found["samples in this version only"] == ("4", "0")
-    assert not [what for what in found if what.startswith(("build", "certificate", "array"))]
-    done = run("datasets", "diff", f"{large}:v1", tmp_path / "small", "--url", url)
-    assert done.exit_code == 1
-    assert "samples in this version only" in done.stdout
-    same = run("datasets", "diff", small, tmp_path / "small", "--url", url)
-    assert (same.exit_code, "same files" in same.stdout) == (0, True), same.output
-    assert large in run("datasets", "--url", url).stdout
-    wrong = run("datasets", "diff", tmp_path, small, "--url", url)
-    assert (wrong.exit_code, "manifest.json" in wrong.stderr) == (1, True)
 
 
 def test_an_export_is_the_training_packages_work(

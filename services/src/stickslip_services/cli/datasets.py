@@ -1,4 +1,4 @@
-"""Commands for datasets: list, pull, compare, export and verify."""
+"""Commands for datasets: list, pull, export, sign and verify."""
 
 import os
 import re
@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
-from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, Contents, Manifest
+from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.addresses import DEFAULT_URL, coordinator_url
 from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say, table
 from stickslip_services.cli.errors import shows_errors
-from stickslip_services.client.comparing import differences
 from stickslip_services.client.errors import ClientError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.signing import sign_directory, signer_of
-from stickslip_services.client.verifying import safe_path
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
 
@@ -107,38 +104,6 @@ def pull_dataset(
         f"({size(done.downloaded_bytes)}), {there} already there"
     )
     say(f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}")
-
-
-@datasets.command("diff")
-@shows_errors
-def diff(
-    a: Annotated[str, typer.Argument(metavar="A", help="DATASET[:vN], or a directory")],
-    b: Annotated[str, typer.Argument(metavar="B", help="DATASET[:vN], or a directory")],
-    url: UrlOption = DEFAULT_URL,
-) -> None:
-    """Compare two versions: spec, builds, labels, samples, files. Exit with 1 if they differ."""
-    with Client(url) as client:
-        found = differences(_contents(client, a), _contents(client, b))
-    if not found:
-        console().print("no difference: same spec, same builds, same files")
-        return
-    shown = table("difference", a, b)
-    for difference in found:
-        shown.add_row(*map(escape, difference))
-    console().print(shown)
-    raise typer.Exit(1)
-
-
-def _contents(client: Client, dataset: str) -> Contents:
-    """Return the contents of a version, from a directory or from the coordinator."""
-    if _ID.match(dataset):
-        return client.contents(*_resolve(client, dataset))
-    path = Path(dataset) / MANIFEST_NAME
-    try:
-        manifest = Manifest.model_validate_json(path.read_bytes())
-        return Contents(manifest, lambda file: safe_path(Path(dataset), file.path).read_bytes())
-    except ValidationError as error:
-        raise ClientError(f"{path} is not a valid manifest: {str(error).splitlines()[0]}") from error
 
 
 @shows_errors
