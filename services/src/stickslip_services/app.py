@@ -23,7 +23,6 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
-from stickslip_schemas import tracing
 
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
@@ -100,7 +99,6 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
         context.close()
-        await run_in_threadpool(tracing.stop)  # here: a signal ends the process as soon as the server has stopped
 
     app = FastAPI(
         title="stickslip",
@@ -189,9 +187,8 @@ def main(arguments: list[str] | None = None) -> int:
         check_database(settings, Role.coordinator, with_store=True)
         # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
         with locked(settings.data) if descriptor is None else nullcontext():
-            tracing.start("stickslip-coordinator")
             return _serve(settings, descriptor)
-    except (DatabaseRefusedError, tracing.TracingUnavailableError) as error:
+    except DatabaseRefusedError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
 

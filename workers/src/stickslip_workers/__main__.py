@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 from pydantic import ValidationError
-from stickslip_schemas import tracing
 from stickslip_schemas.documents.tasks import task_adapter
 from stickslip_schemas.store import open_store, store_place
 
@@ -152,11 +151,6 @@ def _dispatch(options: argparse.Namespace) -> int:
         dispatcher.stop()
 
     try:
-        tracing.start("stickslip-dispatcher")
-    except tracing.TracingUnavailableError as error:
-        logging.error("%s", error)
-        return 2
-    try:
         dispatcher = Dispatcher(settings, place)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
@@ -164,8 +158,6 @@ def _dispatch(options: argparse.Namespace) -> int:
     except (NoNodeError, StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
-    finally:
-        tracing.stop()
     return 0
 
 

@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from typing import Any
 
-from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Reason, Stage
 from stickslip_schemas.documents.tasks import RenderTask, TaskResult
 from stickslip_schemas.documents.worker_api import Lease, LeaseRequest, WorkerRegistration
@@ -207,9 +206,7 @@ class Dispatcher:
         return self._settle(one, [with_damaged_inputs(result, lease.task, self._store) for lease in one.leases])
 
     def _settle(self, one: Call, results: list[TaskResult]) -> None:
-        seconds = time.monotonic() - (one.started_at or time.monotonic())
         for lease, result in zip(one.leases, results, strict=True):
-            tracing.record_task(lease, result, seconds, worker=self._settings.name)
             if result.outcome == "failed":
                 log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
             self._alone.discard(lease.task_id)

@@ -67,10 +67,6 @@ class Lease(Document):
     limit_seconds: Float | None = Field(
         default=None, gt=0, description="timeout of the call [s]; null: no similar task has been measured"
     )
-    traceparent: str | None = Field(
-        default=None,
-        description="W3C traceparent of the job's submission; null where no spans are exported",
-    )
     task: Task
 
 

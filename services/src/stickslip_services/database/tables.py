@@ -62,7 +62,6 @@ jobs = Table(
     Column("id", String, nullable=False, unique=True),
     Column("name", String),
     Column("project", String, nullable=False, server_default=""),  # of the key that it was submitted with
-    Column("traceparent", String),  # the span that it was submitted in, as a W3C traceparent
     Column("kind", String, nullable=False),
     Column("spec", Text, nullable=False),  # JSON
     Column("sample_count", Integer, nullable=False),

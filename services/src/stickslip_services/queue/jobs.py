@@ -17,7 +17,7 @@ from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.damage import check_results, check_samples, terms_of
 from stickslip_services.queue.eta import StageTimings, read_costs
-from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_key
+from stickslip_services.queue.ids import SAMPLE_COLUMNS
 from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
@@ -43,12 +43,6 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     if row is None:
         raise NotFoundError(f"there is no job {job_id!r}")
     return row
-
-
-def traceparent_of(connection: Connection, task: str) -> str | None:
-    """Return the traceparent of the job that a task is charged to; None if it has none."""
-    query = select(jobs.c.traceparent).join(tasks, tasks.c.job == jobs.c.seq).where(tasks.c.key == task_key(task))
-    return connection.scalar(query)
 
 
 def show_job(context: Context, connection: Connection, job: int) -> JobDetail:

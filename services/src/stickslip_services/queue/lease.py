@@ -9,7 +9,6 @@ from dataclasses import replace
 from math import inf
 
 from sqlalchemy import Connection, bindparam, exists, select, text, update
-from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Reason, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
@@ -179,15 +178,12 @@ def _compose_leases(
                 composed |= compose_tasks(connection, [grant.task], publish)
             except UNSOUND as error:
                 damaged[grant.task.seq] = getattr(error, "results", ())
-    traced = select(jobs.c.seq, jobs.c.traceparent).where(jobs.c.seq.in_({grant.job for grant in grants}))
-    traceparents = dict(connection.execute(traced).all()) if tracing.is_on() else {}
     leases = tuple(
         Lease(
             task_id=grant.task_id,
             token=grant.token,
             attempt=grant.attempt,
             limit_seconds=grant.limit_seconds,
-            traceparent=traceparents.get(grant.job),
             task=composed[grant.task.seq],
         )
         for grant in grants

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
-from stickslip_schemas import tracing
 from stickslip_schemas.base.states import JobState, Reason, Stage
 
 from stickslip_services.database.prepared import Prepared
@@ -102,9 +101,7 @@ class Planner:
             with collector_at_rest():
                 if not self._goes_on(row):
                     self._pieces = self._begin(row, packed)
-                with tracing.span("plan", parent=row.traceparent, job=row.id, first=row.planned):
-                    piece = next(self._pieces)
-                    self._write(row.seq, piece)
+                self._write(row.seq, next(self._pieces))
         except Exception as error:
             self._job = None
             if isinstance(error, OSError | SQLAlchemyError):

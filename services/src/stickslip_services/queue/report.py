@@ -3,7 +3,6 @@
 A dataset version is committed by the transaction that accepts the report of its publish task.
 """
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -11,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sqlalchemy import bindparam, delete, insert, select, update
-from stickslip_schemas import tracing
 from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
@@ -34,7 +32,6 @@ from stickslip_services.database.tables import jobs, previews, task_dependencies
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import row_digest, task_id, task_key
-from stickslip_services.queue.jobs import traceparent_of
 from stickslip_services.queue.ledger import HELD_COLUMNS, LIVE, Ending, HeldTask, Ledger, start_tasks
 from stickslip_services.queue.recompute import recompute
 from stickslip_services.queue.retries import fail_tries, give_back, lose
@@ -93,7 +90,6 @@ _COUNT_DOWN = Prepared(
 def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
     """Judge the reports of a worker, one by one, and store the results; raise UnknownWorkerError."""
     versions: dict[str, ManifestSummary] = {}
-    began = time.monotonic()
     reports = [_checked_in_store(context, report, versions) for report in batch.reports]
     with context.ledger() as book:
         worker = find_worker(book.connection, batch.worker_id)
@@ -118,19 +114,15 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
                 recompute(book, end.task.seq, end.result.damaged_inputs)
     for verdict in verdicts:
         if verdict.verdict == "accepted" and verdict.task_id in versions:
-            _after_commit(context, verdict.task_id, time.monotonic() - began)
+            _after_commit(context, verdict.task_id)
     return ReportAnswer(verdicts=tuple(verdicts))
 
 
-def _after_commit(context: Context, task: str, seconds: float) -> None:
-    """Delete the temporary artifacts of a publish task, and record the span of its commit."""
+def _after_commit(context: Context, task: str) -> None:
+    """Delete the temporary artifacts of a publish task."""
     with suppress(OSError):
         for digest in context.sections.pop(task, ()):
             context.store.delete(digest)
-    if tracing.is_on():
-        with context.database.read() as connection:
-            traceparent = traceparent_of(connection, task)
-        tracing.record("commit", parent=traceparent, seconds=seconds, task=task)
 
 
 def _checked_in_store(context: Context, report: Report, versions: dict[str, ManifestSummary]) -> Report:

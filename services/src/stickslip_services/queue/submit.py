@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from itertools import islice
 
 from sqlalchemy import Connection, func, insert, select
-from stickslip_schemas import tracing
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Eta, JobDetail, Validation
@@ -47,31 +46,19 @@ class Replay:
 
 
 def submit_job(
-    context: Context,
-    spec: JobSpec,
-    idempotency_key: str | None = None,
-    *,
-    priority: int = 0,
-    traceparent: str | None = None,
+    context: Context, spec: JobSpec, idempotency_key: str | None = None, *, priority: int = 0
 ) -> JobDetail | Replay:
     """Make a job of a spec, or return the answer to an earlier request with the same idempotency key.
-
-    All spans of the job have one parent, which is a child of `traceparent`, the span of the request.
 
     Raises UnknownFileError, QuotaExceededError, KindNotAvailableError, PresetNotCertifiedError, or
     IdempotencyKeyReusedError.
     """
     check_files(context.database, context.store, spec)
-    told = {"kind": spec.kind, "samples": spec.sample_count}
-    with collector_at_rest(), tracing.span("submit", parent=traceparent, **told) as span:
-        answer = _submit(context, spec, idempotency_key, priority, tracing.traceparent())
-        span.set_attribute("stickslip.job", answer.job_id if isinstance(answer, Replay) else answer.id)
-        return answer
+    with collector_at_rest():
+        return _submit(context, spec, idempotency_key, priority)
 
 
-def _submit(
-    context: Context, spec: JobSpec, key: str | None, priority: int, traceparent: str | None
-) -> JobDetail | Replay:
+def _submit(context: Context, spec: JobSpec, key: str | None, priority: int) -> JobDetail | Replay:
     project, print_ = this_asker().project, sha256(spec.model_dump_json().encode())
     at_once = spec.sample_count <= context.settings.plan_samples
     plan: Plan | None = None
@@ -92,7 +79,7 @@ def _submit(
             check_quota(connection, project, spec.sample_count)
             now = context.clock()
             with ledger(connection, now) as book:
-                job = insert_job(book, spec, priority=priority, project=project, traceparent=traceparent)
+                job = insert_job(book, spec, priority=priority, project=project)
                 _enqueue(book, job, terms, plan)
             shown = show_job(context, connection, job)
             details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}

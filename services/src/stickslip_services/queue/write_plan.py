@@ -37,9 +37,7 @@ _ADD_GROUPS = Prepared(
 )
 
 
-def insert_job(
-    book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "", traceparent: str | None = None
-) -> int:
+def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "") -> int:
     """Insert a job without its tasks; return its `seq`."""
     text = spec.model_dump_json()
     result = book.connection.execute(
@@ -47,7 +45,6 @@ def insert_job(
             id=new_id("job"),
             name=spec.name,
             project=project,
-            traceparent=traceparent,
             kind=spec.kind,
             spec=text,
             digest=row_digest(text, None, None),

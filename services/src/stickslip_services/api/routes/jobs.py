@@ -57,16 +57,12 @@ def post_job(
     priority: Annotated[
         int, Query(ge=-100, le=100, description="tasks of the job with the highest number come first")
     ] = 0,
-    traceparent: Annotated[
-        str | None,
-        Header(max_length=255, description="the span that asks [W3C Trace Context], where spans are exported"),
-    ] = None,
 ) -> Response:
     """Submit a job. Existing results are reused, and failed tasks are tried again.
 
     429: the project of the key has reached its quota of jobs or samples.
     """
-    job = submit_job(context, spec, idempotency_key, priority=priority, traceparent=traceparent)
+    job = submit_job(context, spec, idempotency_key, priority=priority)
     if isinstance(job, Replay):
         return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
     return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})
