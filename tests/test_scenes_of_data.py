@@ -13,7 +13,7 @@ from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
 from stickslip_sim_core import ClothRun, fabric
-from stickslip_sim_core.cloth.solver import GRAVITY
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.scenes import cloth_scene
 from stickslip_testing.worker import BUILDS
 
@@ -104,6 +104,18 @@ class TestLanguage:
         assert z == pytest.approx(np.array([[2, 0, -1], [0, 1, 0]]) * WEIGHT, rel=2e-3, abs=1e-3 * WEIGHT)
         assert set(np.unique(run.record["b.contact"][-1])) <= {1, 2}
         assert not run.record["b.contact"][0].any()
+
+    def test_frames_within_a_step_do_not_cross_where_its_ends_do_not(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A cloth is thrown on a peg; a cubic between the ends of a step reaches through a fold that it hits."""
+        document = load_scene("peg").model_dump(mode="json") | {"duration": 0.6, "frame_rate": 500}
+        document["sheets"]["cloth"]["mesh"]["cells"] = [8, 8]
+        made = cloth_scene.scene(Scene.model_validate(document).physics(), seed=1)
+        run = made.run()
+        assert run.valid, run.reason
+        assert not run.self_intersections.any()
+        smooth = Cloth.positions_at
+        monkeypatch.setattr(Cloth, "positions_at", lambda cloth, time, straight=False: smooth(cloth, time))
+        assert made.run().code == "crossings"
 
     def test_a_release_lets_go_without_a_kick(self) -> None:
         """A sheet thrown upward flies on as it was moved: the mean of z falls by g t^2/2."""

@@ -316,10 +316,11 @@ class Cloth:
         self._spent = max(0.0, self._spent - self.preset.newton_per_second * seconds) + iterations
         self.spent = max(self.spent, self._spent / self.preset.newton_per_second)
 
-    def positions_at(self, time: float) -> Floats:
+    def positions_at(self, time: float, *, straight: bool = False) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
 
-        They are cubic in time between both ends of the step, with the velocities there.
+        They are cubic in time between both ends of the step, with the velocities there, or straight: a cubic goes on
+        with the velocity before an impact, and may reach through what it hits.
 
         Raises:
             ValueError: The time is not in the last step.
@@ -331,6 +332,8 @@ class Cloth:
             raise ValueError(f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}")
         h, s = self.time - begin, (time - begin) / (self.time - begin)
         way = self.positions - x
+        if straight:
+            return np.asarray(x + s * way)
         found: Floats = x + s * s * (3.0 - 2.0 * s) * way + h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
         return found
 

@@ -170,7 +170,7 @@ class Scene:
             kernel=self.kernel,
         )
         cloth.set_state(self.start, bodies=self.motion(0.0)[1])
-        paths, forces = [cloth.positions], [self.forces(cloth)]
+        paths, forces, crossed = [cloth.positions], [self.forces(cloth)], [self._crossings(cloth.positions)]
         calm, rest_time = 0, np.nan
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
@@ -178,6 +178,10 @@ class Scene:
             if cloth.spent > 1.0:
                 break
             paths.append(cloth.positions_at(time))
+            crossed.append(self._crossings(paths[-1]))
+            if crossed[-1] and self.self_contact is not None:
+                paths[-1] = cloth.positions_at(time, straight=True)
+                crossed[-1] = self._crossings(paths[-1])
             forces.append(self.forces(cloth))
             if on_frame is not None:
                 on_frame(frame + 1, self.frames)
@@ -188,14 +192,13 @@ class Scene:
                 rest_time = time
                 break
         missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
-        paths, forces = paths + missing * paths[-1:], forces + missing * forces[-1:]
+        for found in (paths, forces, crossed):
+            found += missing * found[-1:]  # type: ignore[operator]
         path = np.stack(paths)
         times = np.arange(len(path)) / self.frame_rate
-        finite = bool(np.isfinite(path).all())
         record: dict[str, Array] = {name: np.stack([each[name] for each in forces]) for name in forces[0]}
         record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
-        crossings = np.array([self_intersections(p, self.mesh.triangles) if finite else 0 for p in path], np.int32)
-        worst = checks.values(checks.Seen(cloth, path, int(crossings.max()) if self.self_contact else 0))
+        worst = checks.values(checks.Seen(cloth, path, max(crossed) if self.self_contact else 0))
         code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
         run = ClothRun(
             positions=path,
@@ -204,7 +207,7 @@ class Scene:
             times=times,
             record={**record, **self.record},
             labels={},
-            self_intersections=crossings,
+            self_intersections=np.array(crossed, np.int32),
             least_distance=cloth.least_distance,
             kernel=cloth.kernel,
             steps=cloth.steps,
@@ -216,6 +219,10 @@ class Scene:
             reason=reason,
         )
         return replace(run, labels=self.labels(run))
+
+    def _crossings(self, positions: Floats) -> int:
+        """Return how many pairs of triangles cross; none where positions (V, 3) [m] are not finite."""
+        return self_intersections(positions, self.mesh.triangles) if np.isfinite(positions).all() else 0
 
     def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
         """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move of itself."""
