@@ -1,6 +1,8 @@
 """The dashboard: every page answers, shows what it should, escapes what it is given, and changes jobs."""
 
 import asyncio
+import html
+import json
 import re
 from collections.abc import Iterator
 from io import BytesIO
@@ -11,12 +13,12 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from PIL import Image
-from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.scene.library import load_scene
 from stickslip_services.api.routes.pages.jobs import _changes
 from stickslip_services.app import make_app
-from stickslip_services.pages.plots import line_plot
+from stickslip_services.pages.plots import plot, table
+from stickslip_services.pages.rendering import _environment
 from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods, show_job
@@ -96,9 +98,9 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     thumbs = read(client, f"/ui{path[0]}/thumbs?gamma.from=1&gamma.to=1")
     assert "2 of 6 samples" in thumbs
     sample = read(client, f"{path[0]}/samples/3")
-    assert sample.count("<polyline") >= 3
+    assert "twist" in html.unescape(sample.partition('data-plot="')[2])
     assert "curvature" in sample
-    assert 'data-values="/ui' in sample
+    assert f'data-motion="/ui{path[0]}/samples/3/motion.json"' in sample
     picture = client.get(f"/ui{path[0]}/samples/3/views/2.png")
     assert picture.headers["content-type"] == "image/png"
     again = client.get(f"/ui{path[0]}/samples/3/views/2.png", headers={"If-None-Match": picture.headers["etag"]})
@@ -106,11 +108,13 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     shown = np.asarray(Image.open(BytesIO(picture.content)))
     stored = (np.arange(4 * shown.size).reshape(4, *shown.shape) + 3) % 251  # as PretendWorker fills it
     assert (shown == stored[2]).all()
-    points = client.get(f"/ui{path[0]}/samples/3/centerline.json").json()["points"]
-    assert np.shape(points) == (1, 150, 3)
+    motion = client.get(f"/ui{path[0]}/samples/3/motion.json").json()
+    (rod,) = motion["sheets"]
+    assert (np.shape(rod["points"]), motion["bodies"], motion["holders"]) == ((1, 450), [], [])
+    assert client.get(f"/ui{path[0]}/samples/99/motion.json").status_code == 404
     for missing in ("samples/99", "samples/-1"):
         assert client.get(f"{path[0]}/{missing}").status_code == 404
-    for missing in ("3/nothing.json", "3/views/9.png", "3/energy/0.png"):
+    for missing in ("3/nothing/0.png", "3/views/9.png", "3/energy/0.png"):
         assert client.get(f"/ui{path[0]}/samples/{missing}").status_code == 404
     assert read(client, re.sub("/v1$", "", path[0])) == dataset
 
@@ -194,18 +198,21 @@ def test_a_page_is_told_of_changes(app: FastAPI, client: httpx.Client) -> None:
 
 
 def test_assets_are_local_and_licensed(client: httpx.Client) -> None:
-    for name in ("app.css", "app.js", "htmx.min.js", "icon.svg"):
+    for name in ("app.css", "app.js", "space.js", "icon.svg"):
         assert client.get(f"/static/{name}").status_code == 200
-    assert "Zero-Clause BSD" in client.get("/static/htmx-LICENSE.txt").text
-    assert sha256(client.get("/static/htmx.min.js").content)
+    for library, licence in (("htmx", "Zero-Clause BSD"), ("three", "MIT License"), ("uplot", "MIT License")):
+        assert licence in client.get(f"/static/{library}-LICENSE.txt").text
+        assert client.get(f"/static/{library}.min.js").status_code == 200
     assert client.get("/static/../app.py").status_code == 404
 
 
-def test_a_plot_escapes_names_and_leaves_out_what_is_not_finite() -> None:
-    plot = line_plot({"a<b": [(0.0, 1.0), (1.0, float("nan")), (2.0, 3.0)]}, x_name="t", y_name="y")
-    assert plot.count(",") >= 2
-    assert "a&lt;b" in plot
-    assert "nan" not in plot
+def test_a_plot_escapes_names_and_leaves_gaps_where_nothing_is_known() -> None:
+    made = plot(table([0.0, 1.0], {'"><b>': [1.0, float("nan")]}), x_name="t", y_name="y")
+    text = _environment().from_string('{% from "macros.html" import plot %}{{ plot(made) }}').render(made=made)
+    assert "<b>" not in text
+    found = re.search('data-plot="([^"]*)"', text)
+    assert found is not None
+    assert json.loads(html.unescape(found[1]))["tables"][0]["curves"] == {'"><b>': [1.0, None]}
 
 
 def test_scenes_have_pages_with_their_parameters(client: httpx.Client) -> None:

@@ -1,45 +1,104 @@
-"""The page of a sample of a scene: shapes of its sheets, curves with the names of its things."""
+"""The page of a sample of a scene: what its view in space shows, and curves with the names of its things."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
 from stickslip_services.pages.browsing import coloured, sample_view
+from stickslip_services.pages.motion import deformed, motion
+
+
+def sample(values: dict[str, Any] | None = None, **spec: Any) -> Any:
+    """Return the data of a sample that is 0 but for some values."""
+    axes = {"texture": "checker", "viewpoint": "front"}
+    parsed = job_spec_adapter.validate_python({"allow_uncertified": True, "axes": axes, **spec})
+    arrays = {array.name: array for array in layout(parsed)}
+    known = {name: np.zeros(array.shape, dtype=array.dtype) for name, array in arrays.items()} | (values or {})
+    return SimpleNamespace(
+        arrays=arrays,
+        manifest=SimpleNamespace(spec=parsed),
+        read=lambda name, _slot: known[name],
+        named=lambda _array, value: value.tolist(),
+        store=SimpleNamespace(read=built_in_files().__getitem__),
+    )
+
+
+ON_CLOTH: dict[str, Any] = {
+    "kind": "cloth_scene",
+    "scene": "on-cloth",
+    "set": {"sheets.cloth.mesh.cells": [4, 4], "sheets.stretched.mesh.cells": [4, 4]},
+}
 
 
 def test_a_scene_shows_its_sheets_and_the_forces_between_its_things() -> None:
-    spec = job_spec_adapter.validate_python(
-        {
-            "kind": "cloth_scene",
-            "scene": "on-cloth",
-            "set": {"sheets.cloth.mesh.cells": [4, 4], "sheets.stretched.mesh.cells": [4, 4]},
-            "allow_uncertified": True,
-            "axes": {"texture": "checker", "viewpoint": "front"},
-        }
-    )
-    arrays = {array.name: array for array in layout(spec)}
-    values = {name: np.zeros(array.shape, dtype=array.dtype) for name, array in arrays.items()}
-    data = SimpleNamespace(
-        arrays=arrays,
-        manifest=SimpleNamespace(spec=spec),
-        read=lambda name, _slot: values[name],
-        named=lambda _array, value: value.tolist(),
-    )
-    shown = sample_view(data, 0)  # type: ignore[arg-type]
-    assert [shape["name"] for shape in shown["shapes"]] == ["cloth.positions", "stretched.positions"]
+    data = sample(**ON_CLOTH)
+    arrays = data.arrays
+    shown = sample_view(data, 0)
+    assert shown["paths"]
+    assert shown["has_contact"]
     assert (shown["layers"], len(shown["frames"])) == (["video"], arrays["video"].shape[0])
     assert shown["instants"] == arrays["cloth.positions"].shape[0]
 
-    text = " ".join(shown["plots"])
+    text = str(shown["plots"])
     for name in ("cloth, floor", "cloth, stretched", "cloth.left", "stretched.frame"):
         assert name in text
-    assert text.count('class="cursor"') == len(shown["plots"])
+    assert all(plot["timed"] for plot in shown["plots"])
     assert list(shown["groups"]) == ["Parameters", "Looks", "Physics", "Checks"]
     assert next(iter(shown["groups"]["Parameters"])) == "fabric"
     assert {"psnr_cloth", "light"} <= set(shown["groups"]["Looks"])
     assert {"stretch", "valid"} <= set(shown["groups"]["Checks"])
+
+
+def test_a_view_in_space_has_what_the_scene_has() -> None:
+    shown = motion(sample(**ON_CLOTH), 0)
+    assert [(sheet["name"], len(sheet["contact"][0])) for sheet in shown["sheets"]] == [
+        ("cloth", 25),
+        ("stretched", 25),
+    ]
+    assert [body["type"] for body in shown["bodies"]] == ["plane"]
+    assert [holder["size"] for holder in shown["holders"]] == [pytest.approx([0.02, 0.02, 0.01])] * 2  # and no rim
+    assert len(shown["instants"]) == len(shown["sheets"][0]["points"]) == len(shown["bodies"][0]["poses"]) == 300
+
+    edge: dict[str, Any] = {"scene": "over-the-edge", "set": {"sheets.strip.mesh.cells": [40, 4]}}
+    shown = motion(sample({"rounding": np.float64(0.02)}, kind="cloth_scene", **edge), 0)
+    (table,) = shown["bodies"]
+    assert (table["type"], table["rounding"]) == ("box", 0.02)  # the sample's own, and there is no floor
+
+    drag = {"material": "gray-interlock", "mu": 0.3, "texture": "dots", "viewpoint": "left"}
+    track = np.zeros((300, 25, 3), np.float32)
+    track[:, :, 2] = 0.12345
+    rest = np.stack(np.meshgrid(range(5), range(5)), axis=-1).reshape(25, 2).astype(np.float32)
+    shown = motion(sample({"positions": track, "rest": rest}, kind="cloth_drag", mesh=5, axes=drag), 0)
+    assert [body["type"] for body in shown["bodies"]] == ["plane"]
+    assert "contact" not in shown["sheets"][0]
+    assert shown["sheets"][0]["points"][7][2] == pytest.approx(0.12345 / shown["unit"], abs=0.5)
+    assert [holder["poses"][0][11] for holder in shown["holders"]] == pytest.approx([0.12345, 0.12345])
+
+
+def test_a_long_motion_is_thinned() -> None:
+    scene: dict[str, Any] = {"scene": "shawl", "set": {"duration": 9.0}}
+    shown = motion(sample(kind="cloth_scene", **scene), 0)
+    figure = shown["bodies"][0]
+    assert 20 <= len(shown["instants"]) < 136
+    assert shown["instants"][-1] == 135
+    assert len(figure["points"]) == len(shown["instants"])
+    assert len(figure["points"][0]) == 3 * 1442
+
+
+def test_a_body_of_triangles_follows_its_bones() -> None:
+    still = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+    raised = still.copy()
+    raised[2, 3] = 2.0
+    skin = {"rest": np.zeros((2, 3)), "weights": np.array([[1.0, 0.0], [0.5, 0.5]]), "times": np.array([0.0, 1.0])}
+    bones = np.array([[still, still], [still, raised]])
+    heights = deformed({**skin, "bones": bones}, 3.0, np.array([0.0, 0.5, 9.0]))[:, :, 2]
+    assert heights.tolist() == [[0.0, 0.0], [0.0, 1.5], [0.0, 3.0]]
+    assert deformed({"positions": np.ones((1, 4, 3)), "times": np.zeros(1)}, 1.0, np.arange(3.0)).shape == (3, 4, 3)
 
 
 def test_ground_truth_is_shown_in_colours() -> None:

@@ -269,11 +269,17 @@ class PretendWorker:
 
 
 def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> bytes:
-    """Return the file of an array that is recorded, or whose values grow from sample to sample."""
+    """Return the file of an array: an axis of the grid, recorded, or of values that grow from sample to sample."""
     size = task.spec.samples_per_shard
-    ramp = np.arange(prod(array.shape)).reshape(array.shape)
+    ramp, of_axis = np.arange(prod(array.shape)).reshape(array.shape), array.name in task.spec.named_axes
+    known = [{**record, **(slot.labels if of_axis else {})}.get(array.name) for slot in task.slots]
     values = [
-        np.asarray(record.get(array.name, (ramp + slot.slot) % 251), array.dtype) for slot in task.slots if slot.valid
+        np.asarray(
+            (ramp + slot.slot) % 251 if own is None else array.categories.index(own) if array.categories else own,
+            array.dtype,
+        )
+        for slot, own in zip(task.slots, known, strict=True)
+        if slot.valid
     ]
     if array.name == "sample_key":
         keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]

@@ -15,7 +15,8 @@ from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
-from stickslip_services.pages.plots import line_plot
+from stickslip_services.pages.motion import is_path
+from stickslip_services.pages.plots import plot, table
 from stickslip_services.pages.sample_data import SampleData
 
 SHOWN_THUMBS = 48
@@ -109,8 +110,8 @@ def histograms(data: SampleData) -> list[dict[str, Any]]:
 
 
 def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
-    """Return what the page of a sample shows: stills, the layers of the clip, shapes, plots, and labels in groups."""
-    pictures, layers, plots, shapes = [], [], [], []
+    """Return what the page of a sample shows: stills, the layers of the clip, plots, and labels in groups."""
+    pictures, layers, plots = [], [], []
     groups: dict[str, dict[str, tuple[object, str]]] = {name: {} for name in GROUPS}
     group = groups_of(data)
     for name, array in data.arrays.items():
@@ -119,8 +120,8 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
             layers.append(name)
         elif dimensions[-3:] == ("y", "x", "rgb"):
             pictures.append({"name": name, "count": array.shape[0]})
-        elif dimensions[-1:] == ("xyz",) and len(array.shape) in (2, 3) and _is_place(dimensions[-2]):
-            shapes.append({"name": name, "steps": array.shape[0] if len(array.shape) == 3 else 1})
+        elif is_path(array):
+            continue
         elif dimensions[:1] in (("point",), ("instant",)) and len(array.shape) == 2 and array.shape[1] <= _CURVES:
             plots.append(_plot(data, name, slot))
         elif dimensions[:1] == ("instant",) and dimensions[-1] == "xyz" and prod(array.shape[1:-1]) <= 2 * _CURVES:
@@ -139,7 +140,8 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         "instants": timed[0].shape[0] if timed else len(frames),
         "rate": timed[0].attributes.get("instants_per_second", 0) if timed else 0,
         "plots": plots,
-        "shapes": shapes,
+        "paths": any(map(is_path, data.arrays.values())),
+        "has_contact": any(name.endswith(".contact") for name in data.arrays),
         "groups": {title: labels for title, labels in groups.items() if labels},
     }
 
@@ -194,12 +196,7 @@ _CURVES = 4
 """In one plot; of vectors, of which there is a curve of each length, twice as many."""
 
 
-def _is_place(dimension: str) -> bool:
-    """Return whether a dimension runs over points in space: of a curve, a mesh or a sheet of a scene."""
-    return dimension.split(".")[-1] in ("point", "vertex")
-
-
-def _plot(data: SampleData, name: str, slot: int) -> str:
+def _plot(data: SampleData, name: str, slot: int) -> dict[str, Any]:
     array = data.arrays[name]
     values = np.asarray(data.read(name, slot), dtype=float)
     if values.ndim > 2:
@@ -212,5 +209,7 @@ def _plot(data: SampleData, name: str, slot: int) -> str:
     x, x_name = np.linspace(0, 1, len(values)), "arc length over L"
     if rate is not None:
         x, x_name = np.arange(len(values)) / rate, "time [s]"
-    curves = {part: list(zip(x.tolist(), values[:, i].tolist(), strict=True)) for i, part in enumerate(parts)}
-    return line_plot(curves, x_name=x_name, y_name=f"{name}: {array.description}", has_cursor=rate is not None)
+    curves = dict(zip(parts, values.T.tolist(), strict=True))
+    return plot(
+        table(x.tolist(), curves), x_name=x_name, y_name=f"{name}: {array.description}", is_timed=rate is not None
+    )

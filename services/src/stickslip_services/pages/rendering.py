@@ -27,6 +27,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.policies["json.dumps_kwargs"] = {}  # curves keep their order
     made.filters |= {
         "duration": fine_duration,
         "size": size,

@@ -21,7 +21,7 @@ class SampleData:
         self.contents = contents
         self.manifest = manifest = contents.manifest
         self.arrays = {array.name: array for array in layout(manifest.spec)}
-        self._store = store
+        self.store = store
 
     def read(self, name: str, slot: int) -> Array:
         """Return the value of an array for a sample; raise KeyError, OSError or CorruptChunkError."""
@@ -29,9 +29,9 @@ class SampleData:
         size = self.manifest.samples_per_file(array)
         file = self._file(array, slot // size)
         return (
-            _chunk(self._store, file, array, slot % size, size)
+            _chunk(self.store, file, array, slot % size, size)
             if array.per_sample
-            else _column(self._store, file.sha256, array, size)[slot % size]
+            else _column(self.store, file.sha256, array, size)[slot % size]
         )
 
     def label(self, name: str) -> Array:
@@ -39,7 +39,7 @@ class SampleData:
         array = self.arrays[name]
         size = self.manifest.samples_per_file(array)
         files = (self._file(array, number) for number in range(-(-self.manifest.sample_count // size)))
-        columns = [_column(self._store, file.sha256, array, size) for file in files]
+        columns = [_column(self.store, file.sha256, array, size) for file in files]
         return np.concatenate(columns)[: self.manifest.sample_count]
 
     def rejections(self, until: int) -> dict[int, Rejection]:

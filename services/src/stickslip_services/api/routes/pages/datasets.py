@@ -4,7 +4,6 @@ import json
 from functools import lru_cache
 from typing import Annotated, Any
 
-import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
@@ -19,6 +18,7 @@ from stickslip_services.catalog.datasets import find_dataset, find_version, list
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import coloured, histograms, losses, sample_view, sliders, thumbs
+from stickslip_services.pages.motion import motion
 from stickslip_services.pages.sample_data import SampleData
 from stickslip_services.queue.context import Context
 
@@ -143,20 +143,16 @@ def get_picture(
     return Response(content, media_type="image/png", headers=headers)
 
 
-@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.json")
-def get_values(
-    dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, context: ContextDep
-) -> Response:
-    """Return the points of a shape, (step, point, xyz), and its triangles, if it has some, as JSON."""
+@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/motion.json")
+def get_motion(dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], context: ContextDep) -> Response:
+    """Return what the view of a sample in three dimensions draws, as JSON."""
     _, _, data = _open(context, dataset, version)
-    values = np.asarray(_value(data, array, slot), dtype=np.float32)
-    steps = values if values.ndim == 3 else values[None]
-    chosen = np.linspace(0, len(steps) - 1, min(len(steps), 60)).astype(int)
-    document: dict[str, Any] = {"points": np.round(steps[chosen], 4).tolist(), "steps": chosen.tolist()}
-    triangles = f"{array.removesuffix('positions')}triangles"
-    if triangles in data.arrays:
-        document["triangles"] = data.read(triangles, slot).tolist()
-        document["floor"] = True  # of cloth, at z = 0
+    try:
+        if slot >= data.manifest.sample_count:
+            raise KeyError(slot)
+        document = motion(data, slot)
+    except KeyError as error:
+        raise NotFoundError(f"version {version} of {dataset} has no shape of a sample {slot}") from error
     return Response(json.dumps(document), media_type="application/json")
 
 

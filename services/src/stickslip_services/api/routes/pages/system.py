@@ -14,7 +14,7 @@ from stickslip_services.catalog.certificates import find_certificate, list_certi
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import dataset_versions
-from stickslip_services.pages.plots import line_plot
+from stickslip_services.pages.plots import plot, table
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.workers import alive_workers, show_workers
 
@@ -47,22 +47,23 @@ def _builds(context: Context, connection: Connection) -> set[str]:
     return {builds.sim_core for worker in alive_workers(context, connection) for builds in worker.builds.values()}
 
 
-def _curves(protocol: ProtocolReport) -> Iterator[str]:
+def _curves(protocol: ProtocolReport) -> Iterator[dict[str, Any]]:
     for curve in protocol.curves[:6]:
         dense = curve.dense_x, curve.dense_master
         line = dense if curve.dense_x else (curve.x, curve.master)  # of a certificate without dense curves
         name = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
-        yield line_plot(
-            {"master curve": _known(*line)},
-            dots={"measured": _known(curve.x, curve.measured)},
+        yield plot(
+            _known("master curve", *line),
+            _known("measured", curve.x, curve.measured, is_dots=True),
             x_name=protocol.x,
             y_name=f"{protocol.y}{f' ({name})' if name else ''}",
             is_log=True,
         )
 
 
-def _known(x: Numbers, y: Numbers) -> list[tuple[float, float]]:
-    return sorted((a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None)
+def _known(name: str, x: Numbers, y: Numbers, *, is_dots: bool = False) -> dict[str, Any]:
+    known = sorted((a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None)
+    return table([a for a, _ in known], {name: [b for _, b in known]}, is_dots=is_dots)
 
 
 @router.get("/workers")

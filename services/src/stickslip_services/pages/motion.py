@@ -1,0 +1,144 @@
+"""What moves in a sample, for its view in three dimensions: sheets, rods, bodies and holders over time."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.kinds.cloth.drag_scene import DragSceneSpec
+from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
+from stickslip_schemas.scene.files import with_arrays
+from stickslip_schemas.scene.sheets import Holder
+from stickslip_schemas.spec.arrays import ArrayLayout
+
+from stickslip_services.pages.sample_data import SampleData
+
+MOST_NUMBERS = 600_000
+"""Coordinates that a page is sent, about 3 MB: of a longer motion it gets fewer instants, evenly spread."""
+
+LEAST_INSTANTS = 20
+
+UNIT = 1e-4
+"""Of the coordinates, which are whole numbers: of 1 m, or of the length of a rod."""
+
+JAWS = (0.01, 0.01, 0.01)
+"""By how much a holder is larger than what it holds, and the size of one that is not recorded [m]."""
+
+Floats = npt.NDArray[np.float64]
+
+
+def is_path(array: ArrayLayout) -> bool:
+    """Return whether an array holds points in space: of a rod, of a cloth, or of a sheet of a scene."""
+    is_place = array.dimensions[-2:-1] and array.dimensions[-2].split(".")[-1] in ("point", "vertex")
+    return bool(is_place) and array.dimensions[-1] == "xyz" and len(array.shape) in (2, 3)
+
+
+def motion(data: SampleData, slot: int) -> dict[str, Any]:
+    """Return what the view of a sample draws, as JSON; raise KeyError where the sample or its paths are missing.
+
+    Coordinates (instant, vertex x xyz) are whole numbers of `UNIT`; poses (instant, 12) are rows of x -> A x + b [m].
+    """
+    named = [name for name, array in data.arrays.items() if is_path(array)]
+    tracks = {name: np.asarray(data.read(name, slot), dtype=float) for name in named}
+    tracks = {name: track if track.ndim == 3 else track[None] for name, track in tracks.items()}
+    if not tracks:
+        raise KeyError("positions")
+    bodies = _bodies(data, slot)
+    moving = [*tracks.values(), *(body["points"] for body in bodies if "points" in body)]
+    most = max(LEAST_INSTANTS, MOST_NUMBERS // sum(path[0].size for path in moving))
+    count = max(len(path) for path in moving)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+    sheets = []
+    for name, track in tracks.items():
+        own = name.removesuffix("positions")
+        sheet = {"name": own.rstrip(".") or name, "points": _whole(track, chosen)}
+        if f"{own}triangles" in data.arrays:
+            sheet["triangles"] = data.read(f"{own}triangles", slot).ravel().tolist()
+        if f"{own}contact" in data.arrays:
+            states = np.asarray(data.read(f"{own}contact", slot))[chosen]
+            sheet["contact"] = ["".join(map(str, row)) for row in states.tolist()]
+        sheets.append(sheet)
+    holders = _holders(data, slot, tracks)
+    for thing in (*bodies, *holders):
+        thing |= {
+            key: thing[key][chosen].reshape(len(chosen), -1).tolist() for key in ("poses", "holds") if key in thing
+        }
+        thing |= {key: _whole(thing[key], chosen) for key in ("points",) if key in thing}
+    return {"unit": UNIT, "instants": chosen.tolist(), "sheets": sheets, "bodies": bodies, "holders": holders}
+
+
+def _whole(track: Floats, chosen: npt.NDArray[np.int64]) -> list[list[int]]:
+    some = track[np.minimum(chosen, len(track) - 1)]
+    return np.asarray(np.rint(np.nan_to_num(some) / UNIT), int).reshape(len(some), -1).tolist()
+
+
+def _bodies(data: SampleData, slot: int) -> list[dict[str, Any]]:
+    """Return the bodies of the scene with the sample's own numbers, and their poses (instant, 3, 4)."""
+    spec = data.manifest.spec
+    if isinstance(spec, DragSceneSpec):
+        return [{"type": "plane", "normal": [0, 0, 1]}]  # its floor, at z = 0
+    if not isinstance(spec, ClothSceneSpec) or "body_pose" not in data.arrays:
+        return []
+    numbers = [name for name in spec.stage.parameters if isinstance(spec.stage.default(name), float)]
+    own = {place: float(data.read(name, slot)) for name in numbers for place in spec.stage.places(name)}
+    document = with_arrays(spec.stage.checked(own), data.store.read)
+    poses = np.asarray(data.read("body_pose", slot), dtype=float)
+    times = np.arange(len(poses)) / spec.instants_per_second
+    found = []
+    for number, (name, body) in enumerate(document["bodies"].items()):
+        shown = {key: body[key] for key in ("type", "normal", "radius", "length", "size", "rounding") if key in body}
+        if body["type"] == "mesh":
+            shown["points"] = deformed(body["file"], body["strength"], times)
+            shown["triangles"] = body["file"]["triangles"].ravel().tolist()
+        found.append(shown | {"name": name, "poses": poses[:, number]})
+    return found
+
+
+def deformed(file: Mapping[str, Any], strength: float, times: Floats) -> Floats:
+    """Return the vertices (time, vertex, xyz) [m] of a body of triangles, straight between the frames of its file.
+
+    A skin's vertices are sums over bones of w (A x + b); `strength` scales all displacements since the first time.
+    """
+    frames = np.asarray(file["bones"] if "bones" in file else file["positions"], dtype=float)
+    place = np.interp(times, file["times"], np.arange(len(frames)))
+    low = np.minimum(place.astype(int), max(len(frames) - 2, 0))
+    share = (place - low).reshape(-1, *[1] * (frames.ndim - 1))
+    moved = (1 - share) * frames[low] + share * frames[np.minimum(low + 1, len(frames) - 1)]
+    if "bones" in file:
+        turned = np.einsum("nb,tbij,nj->tni", file["weights"], moved[..., :3], file["rest"], optimize=True)
+        moved = turned + np.einsum("nb,tbi->tni", file["weights"], moved[..., 3])
+    found: Floats = moved[:1] + strength * (moved - moved[:1])
+    return found
+
+
+def _holders(data: SampleData, slot: int, tracks: Mapping[str, Floats]) -> list[dict[str, Any]]:
+    """Return the boxes of holders, their poses (instant, 3, 4), and whether they hold (instant)."""
+    spec = data.manifest.spec
+    if isinstance(spec, DragSceneSpec):  # at both corners of the upper edge
+        rest, (track,) = np.asarray(data.read("rest", slot), dtype=float), tracks.values()
+        corners = [np.argmax(rest @ direction) for direction in ((-1, 1), (1, 1))]
+        still = np.broadcast_to(np.eye(3), (len(track), 3, 3))
+        at = [np.concatenate([still, track[:, corner, :, None]], axis=2) for corner in corners]
+        return [{"size": JAWS, "poses": poses, "holds": np.ones(len(track), int)} for poses in at]
+    if not isinstance(spec, ClothSceneSpec) or "holder_pose" not in data.arrays:
+        return []
+    poses, holds = (np.asarray(data.read(name, slot)) for name in ("holder_pose", "grasped"))
+    found = []
+    for number, (sheet, name) in enumerate(spec.stage.holders):
+        held = _held(spec.stage.sheets[sheet].holders[name], np.asarray(data.read(f"{sheet}.rest", slot), dtype=float))
+        if held is not None:
+            size = (np.append(np.ptp(held, axis=0), 0.0) + JAWS).tolist()
+            found.append({"size": size, "poses": poses[:, number], "holds": holds[:, number]})
+    return found
+
+
+def _held(holder: Holder, rest: Floats) -> Floats | None:
+    """Return the part of a flat sheet (vertex, uv) [m] that a holder holds, None of a rim."""
+    if holder.vertices is not None:
+        return rest[list(holder.vertices)]
+    if holder.edge is not None:
+        axis, sign = {"left": (0, -1), "right": (0, 1), "bottom": (1, -1), "top": (1, 1)}[holder.edge]
+        along = sign * rest[:, axis]
+        held: Floats = rest[np.isclose(along, along.max())]
+        return held
+    return None if holder.low is None else np.array([holder.low, holder.high], dtype=float)
