@@ -151,7 +151,6 @@ class Settings(BaseSettings):
 
     @property
     def worker_key_path(self) -> Path:
-        """File of the key that workers show."""
         return self.data / "worker-key"
 
     @property

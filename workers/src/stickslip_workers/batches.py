@@ -149,7 +149,6 @@ def arguments_of(parts: Parts) -> list[Any]:
 
 
 def results_of(answer: Any, part: list[Lease]) -> list[TaskResult]:
-    """Return the result of each task of a part from its answer."""
     try:
         if isinstance(answer, dict):
             return split(renders(part), TaskResult.model_validate(answer))

@@ -66,7 +66,6 @@ class Call:
 
     @property
     def leases(self) -> list[Lease]:
-        """All its tasks."""
         return list(chain.from_iterable(self.parts))
 
     def runs_longer_than(self, seconds: float) -> bool:

@@ -30,5 +30,4 @@ def kind(name: str) -> "Kind":
 
 
 def kind_names() -> tuple[str, ...]:
-    """Return the names of all kinds."""
     return tuple(KINDS)

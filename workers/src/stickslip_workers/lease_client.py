@@ -93,7 +93,6 @@ class CoordinatorClient:
         """Of coordinators with one database; the first one is asked."""
 
     def register(self, registration: WorkerRegistration) -> WorkerSession:
-        """Register the dispatcher."""
         return self._post("/v1/workers", registration, WorkerSession)
 
     def lease(self, request: LeaseRequest) -> LeaseBatch:
@@ -105,11 +104,9 @@ class CoordinatorClient:
         return self._post("/v1/worker/heartbeat", heartbeat, HeartbeatAnswer)
 
     def report(self, reports: ReportBatch) -> ReportAnswer:
-        """Report results."""
         return self._post("/v1/worker/report", reports, ReportAnswer, timeout=PATIENT)
 
     def close(self) -> None:
-        """Close the connections."""
         self._http.close()
 
     def _post(self, path: str, document: BaseModel, answer: type[Answer], *, timeout: httpx.Timeout = PROMPT) -> Answer:
@@ -180,7 +177,6 @@ class LeaseBook:
         self._states: dict[str, LeaseState] = {}
 
     def add(self, leases: Iterable[Lease]) -> None:
-        """Add new leases."""
         self._put(leases, started=False)
 
     def start(self, leases: Iterable[Lease]) -> None:
@@ -229,7 +225,6 @@ class LeaseBook:
             self._states.clear()
 
     def states(self) -> tuple[LeaseState, ...]:
-        """Return the states for a heartbeat."""
         with self._lock:
             return tuple(self._states.values())
 

@@ -13,7 +13,6 @@ MESSAGE_LENGTH = 2000
 
 
 def failed(reason: Reason, message: str) -> TaskResult:
-    """Return the result of a failed task."""
     return TaskResult(outcome="failed", reason=reason, message=message[:MESSAGE_LENGTH])
 
 

@@ -205,7 +205,6 @@ class Contents:
         return found
 
     def sections(self) -> Iterator[ManifestSection]:
-        """Yield all sections, by slot."""
         for number in range(max(1, len(self.manifest.sections))):
             yield self.section(number)
 

@@ -101,7 +101,6 @@ class Parameter(Document):
         return "all fabrics" if self.low is None else f"{self.low:g} to {self.high:g} [{self.unit}]"
 
     def allows(self, value: Value) -> bool:
-        """Return whether it may have a value."""
         if self.values is not None:
             return value in self.values
         if self.low is None or self.high is None:
@@ -139,7 +138,6 @@ def found(document: Mapping[str, Any], path: str) -> Path:
 
 
 def at(document: Any, place: Path) -> Any:
-    """Return what is at a place of a document."""
     for step in place:
         document = document[step]
     return document

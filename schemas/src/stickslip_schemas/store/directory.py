@@ -52,7 +52,6 @@ class DirectoryStore:
         return self.root / artifact_name(digest)
 
     def dataset_path(self, dataset: str, version: int) -> Path:
-        """Return the directory of a dataset version."""
         return self.root / version_name(dataset, version)
 
     def publish(self, data: bytes) -> str:
@@ -166,7 +165,6 @@ class DirectoryStore:
         return any(path.is_file() for path in self.dataset_path(dataset, version).rglob("*"))
 
     def room(self) -> Room:
-        """Return the room on the disk."""
         place = self.root
         while not place.exists():
             place = place.parent

@@ -55,7 +55,6 @@ def asking(asker: Asker) -> Iterator[None]:
 
 
 def this_asker() -> Asker:
-    """Return who asks."""
     return _asker.get()
 
 

@@ -26,7 +26,6 @@ _IMPLIED = {
 
 
 def includes(granted: Scope, needed: Scope) -> bool:
-    """Return whether a scope includes the needed one."""
     return needed in _IMPLIED[granted]
 
 

@@ -84,7 +84,6 @@ def problem_response(
     fields: list[FieldError] | None = None,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Return a problem document as a response."""
     problem = problem_document(status, code, detail, path=path, request_id=request_id, fields=fields)
     # The request may contain text without a UTF-8 form; the answer must be valid UTF-8.
     content = problem.model_dump_json(ensure_ascii=True)

@@ -121,7 +121,6 @@ def version_number(connection: Connection, dataset: str, publish_task: int) -> i
 
 
 def reserve_number(connection: Connection, dataset: str, version: int, publish_task: int) -> None:
-    """Reserve a version number for a publish task."""
     connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task))
 
 
@@ -150,7 +149,6 @@ def commit_version(
 
 
 def find_committed(connection: Connection, publish_task: int) -> CommittedVersion:
-    """Return the version that a publish task has made."""
     row = connection.execute(select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)).one()
     reference = DatasetRef(dataset=row.dataset, version=row.version, manifest=row.manifest)
     return CommittedVersion(reference, row.sample_count, row.sample_count - row.valid_count)

@@ -111,7 +111,6 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
         self._http.close()
 
     # --- jobs -----------------------------------------------------------------------------------------------------
@@ -137,7 +136,6 @@ class Client:
         return self._call(FileUpload, "POST", "/v1/files", content=data, headers=octets)
 
     def job(self, job_id: str) -> JobDetail:
-        """Return a job."""
         return self._call(JobDetail, "GET", f"/v1/jobs/{job_id}")
 
     def jobs(self, *, search: str = "", state: JobState | None = None, project: str = "") -> Iterator[Job]:
@@ -146,12 +144,10 @@ class Client:
         return self._items(Page[Job], "/v1/jobs", {name: value for name, value in query.items() if value})
 
     def samples(self, job_id: str, *, state: TaskState | None = None) -> Iterator[SampleState]:
-        """Yield the samples of a job by slot."""
         query = {} if state is None else {"state": str(state)}
         return self._items(Page[SampleState], f"/v1/jobs/{job_id}/samples", query)
 
     def previews(self, job_id: str) -> list[Preview]:
-        """Return the previews of a job."""
         return self._call(list[Preview], "GET", f"/v1/jobs/{job_id}/previews")
 
     def prioritise(self, job_id: str, priority: int) -> JobDetail:
@@ -159,7 +155,6 @@ class Client:
         return self._call(JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority})
 
     def cancel(self, job_id: str) -> JobDetail:
-        """Cancel a job."""
         return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
 
     def pause(self, job_id: str) -> JobDetail:
@@ -167,7 +162,6 @@ class Client:
         return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:pause")
 
     def resume(self, job_id: str) -> JobDetail:
-        """Resume a paused job."""
         return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
 
     def events(self, job_id: str) -> Iterator[Event]:
@@ -216,11 +210,9 @@ class Client:
         return self._items(Page[Dataset], "/v1/datasets")
 
     def dataset(self, dataset: str) -> Dataset:
-        """Return a dataset."""
         return self._call(Dataset, "GET", f"/v1/datasets/{dataset}")
 
     def version(self, dataset: str, version: int) -> DatasetVersion:
-        """Return a version of a dataset."""
         return self._call(DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}")
 
     def contents(self, dataset: str, version: int) -> Contents:
@@ -230,12 +222,10 @@ class Client:
         return Contents(manifest, lambda file: self.request("GET", root + file.path).content)
 
     def manifest(self, dataset: str, version: int) -> tuple[Manifest, bytes]:
-        """Return the manifest of a version, and its bytes."""
         response = self.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
         return parsed(Manifest, response), response.content
 
     def workers(self) -> list[WorkerEntry]:
-        """Return the workers."""
         return self._call(list[WorkerEntry], "GET", "/v1/workers")
 
     # --- certificates ---------------------------------------------------------------------------------------------
@@ -245,7 +235,6 @@ class Client:
         return self._items(Page[CertificateEntry], "/v1/certificates")
 
     def certificate(self, digest: str) -> Certificate:
-        """Return a certificate."""
         return self._call(Certificate, "GET", f"/v1/certificates/{digest}")
 
     def register(self, certificate: Certificate) -> CertificateEntry:
@@ -302,7 +291,6 @@ class Client:
         return parsed(answer, self.request(method, path, **options))
 
     def _items(self, answer: type[Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:
-        """Yield the items of all pages of a list."""
         token: str | None = ""
         while token is not None:
             params = {"page_size": PAGE_SIZE, **(query or {})} | ({"page_token": token} if token else {})

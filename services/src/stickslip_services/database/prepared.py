@@ -60,7 +60,6 @@ class Prepared:
         return None if row is None else row[0]
 
     def run(self, connection: Connection, values: Values) -> None:
-        """Execute it."""
         sql, parameters = self._filled(connection, values)
         with _translated(connection, sql):
             _driver(connection).execute(sql, parameters)

@@ -33,7 +33,6 @@ metadata = MetaData(
 
 
 def _partial(condition: str) -> dict[str, Any]:
-    """Return the condition of a partial index."""
     return {"sqlite_where": text(condition), "postgresql_where": text(condition)}
 
 

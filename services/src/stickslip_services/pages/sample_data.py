@@ -35,7 +35,6 @@ class SampleData:
         )
 
     def label(self, name: str) -> Array:
-        """Return a label of all slots."""
         array = self.arrays[name]
         size = self.manifest.samples_per_file(array)
         files = (self._file(array, number) for number in range(-(-self.manifest.sample_count // size)))

@@ -45,7 +45,6 @@ class Context:
         return cls(settings, database, clock, store, watch)
 
     def close(self) -> None:
-        """Close the database."""
         self.is_closing = True
         self.database.close()
 

@@ -167,7 +167,6 @@ _ALL_COSTS = Prepared(select(cost_groups))
 
 
 def read_costs(connection: Connection) -> dict[Group, Cost]:
-    """Return the measured costs by group."""
     return {
         (Stage(stage), kind, group): Cost(
             StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)

@@ -59,5 +59,4 @@ def read_events(connection: Connection, job: int, *, after: int, limit: int) -> 
 
 
 def append_event(connection: Connection, job: int, name: EventName, data: Document, now: float) -> None:
-    """Store an event."""
     connection.execute(insert(events).values(job=job, name=name, data=data.model_dump_json(), created_at=now))

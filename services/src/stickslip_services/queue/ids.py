@@ -25,7 +25,6 @@ def row_digest(*values: object) -> int:
 
 
 def task_id(stage: str, key: bytes) -> str:
-    """Return the name of a task."""
     return f"{stage}-{key.hex()}"
 
 

@@ -131,7 +131,6 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
 
 
 def list_previews(connection: Connection, job: int) -> list[Preview]:
-    """Return the previews of a job by slot."""
     return _previews(connection, _PREVIEWS.where(samples.c.job == job).order_by(samples.c.slot).limit(1000))
 
 

@@ -164,7 +164,6 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
 
 
 def _held(connection: Connection, job: int, known: Collection[_Known]) -> set[int]:
-    """Return which of the tasks a job has."""
     held: set[int] = set()
     for batch in batches(task.seq for task in known):
         held.update(

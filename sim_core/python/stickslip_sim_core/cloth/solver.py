@@ -157,7 +157,6 @@ class Cloth:
 
     @property
     def kernel(self) -> str:
-        """Level of the kernels."""
         return str(self._solver.kernel())
 
     @property

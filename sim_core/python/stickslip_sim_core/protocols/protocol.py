@@ -135,12 +135,10 @@ class MeshedProtocol(ClothProtocol):
 
     @property
     def kinds(self) -> list[MeshKind]:
-        """Kinds of the meshes."""
         return mesh_kinds(min(self.structured, self.grids_max), self.unstructured)
 
     @property
     def meshes(self) -> range:
-        """Numbers of the meshes."""
         return range(len(self.kinds))
 
     def reported(self) -> dict[str, Setting]:

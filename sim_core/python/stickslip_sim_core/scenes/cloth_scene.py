@@ -196,7 +196,6 @@ class _Forces:
 
 
 def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], ends: NDArray[np.int64]) -> Record:
-    """Return the arrays of sheets and surfaces."""
     found: dict[str, Any] = {}
     for one, path in zip(sheets, np.split(run.positions, ends[1:-1], axis=1), strict=True):
         found[f"{one.name}.positions"] = path

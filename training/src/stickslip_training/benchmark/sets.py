@@ -57,7 +57,6 @@ class NamedSet:
 
     @property
     def task(self) -> Task:
-        """The questions."""
         return TASKS[str(self.parsed_spec.kind)]
 
     def check(self, reader: DatasetReader) -> tuple[Integers, Making]:
@@ -87,7 +86,6 @@ class NamedSet:
 
 
 def set_names() -> tuple[str, ...]:
-    """Return the names of the sets."""
     return tuple(sorted(file.name.removesuffix(".json") for file in _folder().iterdir() if file.name.endswith(".json")))
 
 

@@ -85,7 +85,6 @@ class Clips(Truth):
 
     @staticmethod
     def joined(parts: "Sequence[Clips]") -> "Clips":
-        """Return the clips of all parts."""
         columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Clips)}
         whole: dict[str, Any] = {
             name: torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each)
@@ -135,7 +134,6 @@ def frames_at(
 
 
 def training_cameras() -> tuple[Camera, ...]:
-    """Return the cameras that a network is trained on."""
     return tuple(camera for camera in load_rig(RIG) if camera.name in VIEWPOINTS)
 
 

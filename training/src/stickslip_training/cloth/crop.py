@@ -39,7 +39,6 @@ class Cameras:
 
     @staticmethod
     def of(cameras: Sequence[Camera]) -> "Cameras":
-        """Return the cameras as tensors."""
         return Cameras(
             torch.tensor([camera.rotation for camera in cameras], dtype=torch.float32),
             torch.tensor([camera.translation for camera in cameras], dtype=torch.float32),

@@ -92,7 +92,6 @@ class Truth:
 
 
 def score(posterior: Posterior, truth: Truth) -> Scores:
-    """Compare posteriors with the truth."""
     below = quantile_of_truth(posterior.mu, posterior.bins, truth.mu)
     return _scores(
         estimates(posterior.mu, posterior.bins),

@@ -36,7 +36,6 @@ class FrictionModel:
     """Training runs, settings, measured errors and limits."""
 
     def estimate(self, clips: Clips) -> Posterior:
-        """Return the posterior of every clip, whether it is familiar or not."""
         seen = features(self.net, clips)
         return Posterior.of(*log_histograms(self.net, seen), self.materials, self.bins, self.temperature)
 

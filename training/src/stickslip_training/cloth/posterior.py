@@ -33,7 +33,6 @@ class Bins:
 
     @property
     def centers(self) -> Floats:
-        """(count,)"""
         return (self.edges[:-1] + self.edges[1:]) / 2
 
     def place(self, values: Floats) -> Integers:

@@ -47,7 +47,6 @@ class Runs:
         return len(self.mu)
 
     def __getitem__(self, chosen: Array) -> "Runs":
-        """Return some of the runs."""
         names = ("positions", "material", "mu", "landed")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 

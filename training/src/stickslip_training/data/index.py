@@ -72,7 +72,6 @@ class Index:
             raise CorruptDataError(f"{self.source}/{error}") from error
 
     def section(self, slot: int) -> ManifestSection:
-        """Return the section of the manifest that lists a sample."""
         with self.contents() as contents:
             return contents.section(contents.number_of(slot))
 

@@ -151,7 +151,6 @@ class Samples(Dataset[Item]):
         return DataLoader(self, batch_size=batch_size, shuffle=shuffle, collate_fn=collate, **options)
 
     def close(self) -> None:
-        """Close connections."""
         self.reader.close()
 
     def _sample_keys(self, slots: Array) -> torch.Tensor:

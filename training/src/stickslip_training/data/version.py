@@ -72,7 +72,6 @@ class Version:
 
     @property
     def manifest(self) -> Manifest:
-        """The manifest."""
         return self.index.manifest
 
     @property
@@ -106,7 +105,6 @@ class Version:
         self.close()
 
     def close(self) -> None:
-        """Close connections."""
         self.source.close()
 
     def slots(self, split: Split | None = None, *, rejected: bool = False) -> npt.NDArray[np.int64]:
@@ -138,7 +136,6 @@ class Version:
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        """Names of the labels."""
         return tuple(array.name for array in self.arrays.values() if not array.per_sample and len(array.shape) < 2)
 
     def categories(self, name: str) -> tuple[str, ...]:
@@ -151,7 +148,6 @@ class Version:
             yield from contents.rejections()
 
     def files(self) -> Iterator[FileEntry]:
-        """Yield the files that the manifest lists."""
         with self.index.contents() as contents:
             yield from contents.files()
 

@@ -72,7 +72,6 @@ class Content:
 
     @property
     def labels(self) -> tuple[ArrayLayout, ...]:
-        """The arrays that are labels."""
         return tuple(array for array in self.arrays if array.is_label)
 
     @property

@@ -16,7 +16,6 @@ CHUNK_BYTES = 2**20
 
 
 def write(content: Content, path: Path, on_bytes: OnBytes) -> None:
-    """Write the file."""
     import h5py
 
     with h5py.File(path, "x") as file:

@@ -137,5 +137,4 @@ def why_unfit(what: str, points: Array, radius: float, cameras: tuple[Camera, ..
 
 
 def rejected(reason: Reason, message: str) -> TaskResult:
-    """Return the rejection of a sample."""
     return TaskResult(outcome="rejected", reason=reason, message=message)

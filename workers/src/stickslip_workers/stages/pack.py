@@ -92,7 +92,6 @@ class _Shard:
             raise ValueError(f"labels of slot {slot.slot} must have an array each; there is none for {sorted(unknown)}")
 
     def encode(self, array: ArrayLayout) -> bytes:
-        """Return the file of an array."""
         if array.per_sample:
             return encode_shard(self._chunks[array.name])
         return encode_chunk(self._columns[array.name])

@@ -30,7 +30,6 @@ class Records:
         self._bytes = 0
 
     def __call__(self, digest: str) -> dict[str, Array]:
-        """Return the arrays of an artifact."""
         if digest in self._artifacts:
             self._artifacts.move_to_end(digest)
             return self._artifacts[digest]

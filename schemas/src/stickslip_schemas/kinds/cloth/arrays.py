@@ -32,7 +32,6 @@ def over_time(
 
 
 def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
-    """Return the clip and the labels of what it shows."""
     pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
     instants = {"instants": list(spec.shown_instants)}
     return (

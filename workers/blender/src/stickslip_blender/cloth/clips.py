@@ -241,7 +241,6 @@ def _results(
 
 
 def rig_camera(look: AnyLook) -> Camera:
-    """Return the camera of a viewpoint of the rig."""
     assert look.rig is not None
     return next(camera for camera in load_rig(look.rig) if camera.name == look.viewpoint)
 

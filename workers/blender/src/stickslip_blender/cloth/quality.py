@@ -63,7 +63,6 @@ class Measured:
 
     @property
     def labels(self) -> dict[str, object]:
-        """The labels of the clip."""
         psnr, deviations = ([None if np.isnan(x) else x for x in values] for values in (self.psnr, self.deviations))
         return {f"psnr_{name}": x for name, x in zip(REGIONS, psnr, strict=True)} | {"psnr_deviation": deviations}
 

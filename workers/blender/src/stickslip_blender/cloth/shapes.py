@@ -53,7 +53,6 @@ def gores(color: Array, count: int) -> Array:
 
 
 def box(size: tuple[float, float, float], center: tuple[float, float, float]) -> tuple[Array, Faces]:
-    """Return the corners and faces of a box."""
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces: Faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return np.asarray(center) + 0.5 * np.asarray(size) * signs, faces

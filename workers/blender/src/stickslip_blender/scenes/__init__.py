@@ -24,5 +24,4 @@ def renders(kind: str) -> Callable[[Any, RenderTask, Workshop], TaskResult]:
 
 
 def kind_names() -> tuple[str, ...]:
-    """Return the names of all kinds."""
     return tuple(KINDS)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> TaskResult:
-    """Render the clips of a scene."""
     sheet = look.scene.textured
     stage = Stage(
         look.scene.model_dump(mode="json"),

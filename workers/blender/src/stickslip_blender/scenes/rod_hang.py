@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskResult:
-    """Render the views of one rod."""
     cameras = load_rig(look.rig)
     line = workshop.record(task.record)["centerline"]
     if rejected := why_unfit("rod", line, look.radius, cameras):
