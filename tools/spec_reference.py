@@ -71,7 +71,7 @@ def reference() -> str:
         meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
         schema = model.model_json_schema()
         rows = {name: _field_row(name, field, schema) for name, field in schema["properties"].items()}
-        lines += [f"## Custom {what}s\n", f"An entry of `{key}` names a {what} and gives its numbers. {meaning}\n"]
+        lines += [f"## Custom {what}s\n", f"Entries of `{key}`. {meaning}\n"]
         lines += _table(KEY_HEAD, rows)
     return "\n".join(lines)
 
