@@ -30,13 +30,14 @@ from typing import Any
 import httpx
 import numpy as np
 from plan import coordinator, peak_megabytes, spec
-from sqlalchemy import text
+from sqlalchemy import Row, text
 from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
 from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.ids import row_digest
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import start
@@ -216,16 +217,21 @@ def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
     record = RecordRef(digest=store.publish(b"a record"), row=0)
     with made.database.write() as connection:
         simulated = SimulateOutput(record=record, labels={}).model_dump_json()
-        connection.execute(
-            text("UPDATE tasks SET state = 'succeeded', output = :output, waiting_on = 0 WHERE stage = 'simulate'"),
-            {"output": simulated},
+        update = text(
+            "UPDATE tasks SET state = 'succeeded', output = :output, digest = :digest, waiting_on = 0 WHERE seq = :seq"
         )
-        packs = connection.execute(text("SELECT seq, payload FROM tasks WHERE stage = 'pack'")).all()
-        update = text("UPDATE tasks SET state = 'succeeded', output = :output, waiting_on = 0 WHERE seq = :seq")
-        for row, output in zip(
-            packs, _packed(made, store, [json.loads(row.payload)["shard"] for row in packs]), strict=True
-        ):
-            connection.execute(update, {"seq": row.seq, "output": output.model_dump_json()})
+
+        def end(row: Row[Any], output: str) -> dict[str, Any]:
+            digest = row_digest(row.key, "succeeded", None, "", output)
+            return {"seq": row.seq, "output": output, "digest": digest}
+
+        of_stage = text("SELECT seq, key, payload FROM tasks WHERE stage = :stage")
+        simulations = connection.execute(of_stage, {"stage": "simulate"}).all()
+        connection.execute(update, [end(row, simulated) for row in simulations])
+        packs = connection.execute(of_stage, {"stage": "pack"}).all()
+        outputs = _packed(made, store, [json.loads(row.payload)["shard"] for row in packs])
+        for row, output in zip(packs, outputs, strict=True):
+            connection.execute(update, end(row, output.model_dump_json()))
         connection.execute(text("UPDATE tasks SET waiting_on = 0 WHERE stage = 'publish'"))
 
 

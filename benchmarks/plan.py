@@ -46,7 +46,7 @@ def coordinator(data: Path) -> Iterator[tuple[httpx.Client, int]]:
         try:
             with httpx.Client(base_url=url, timeout=120) as client:
                 builds = dict.fromkeys(Builds.model_fields, "a" * 64)
-                worker = {"name": "bench", "builds": {"rod_hang": builds}, "slots": 1}
+                worker = {"name": "bench", "builds": {"rod_hang": builds}, "condition": {"slots": 1}, "versions": {}}
                 key = {"Authorization": f"Bearer {(data / 'worker-key').read_text().strip()}"}
                 client.post("/v1/workers", json=worker, headers=key).raise_for_status()
                 yield client, process.pid

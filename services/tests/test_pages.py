@@ -135,6 +135,8 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     assert "gamma 1, phi1 1: 0 of 1 done, 1 lost" in dataset
     counts = [re.findall(r"(\d) of 4 samples", read(client, f"{path[0]}?valid={value}")) for value in ("yes", "no", "")]
     assert counts == [["2"], ["2"], ["4"]]
+    assert "0 of 4 samples" in read(client, f"{path[0]}?gamma.from=1&gamma.to=0")
+    assert "4 of 4 samples" in read(client, f"{path[0]}?psnr=30")  # of rods, nothing is measured
     assert "option selected>train" in read(client, f"{path[0]}?split=train")
     assert "gamma 2, phi1 1: 1 of 1 done<" in dataset
     assert "it fell &lt;b&gt;off&lt;/b&gt;" in dataset

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
-from stickslip_services.pages.browsing import coloured, sample_view
+from stickslip_services.pages.browsing import coloured, sample_view, sliders, thumbs
 from stickslip_services.pages.motion import deformed, motion
 
 
@@ -23,7 +24,7 @@ def sample(values: dict[str, Any] | None = None, **spec: Any) -> Any:
         arrays=arrays,
         manifest=SimpleNamespace(spec=parsed),
         read=lambda name, _slot: known[name],
-        named=lambda _array, value: value.tolist(),
+        named=lambda array, value: array.categories[value] if array.categories else value.tolist(),
         store=SimpleNamespace(read=built_in_files().__getitem__),
     )
 
@@ -78,6 +79,38 @@ def test_a_view_in_space_has_what_the_scene_has() -> None:
     assert "contact" not in shown["sheets"][0]
     assert shown["sheets"][0]["points"][7][2] == pytest.approx(0.12345 / shown["unit"], abs=0.5)
     assert [holder["poses"][0][11] for holder in shown["holders"]] == pytest.approx([0.12345, 0.12345])
+
+
+def test_a_great_list_is_filtered_by_names_numbers_and_pictures() -> None:
+    count = 5 * 200 * 3
+    axes = {
+        "material": ["gray-interlock", "camel-ponte-roma", "royal-target", "navy-sparkle-sweat", "white-swim-solid"],
+        "mu": {"type": "linspace", "start": 0.0, "stop": 1.0, "num": 200},
+        "texture": ["dots", "plaid", "floral"],
+        "viewpoint": "left",
+    }
+    data = sample(kind="cloth_drag", axes=axes)
+    points = list(grid(data.manifest.spec))
+    columns = {name: np.array([point[name] for point in points]) for name in ("mu", "material", "texture")}
+    for name in ("material", "texture"):
+        columns[name] = np.array([data.arrays[name].categories.index(value) for value in columns[name]])
+    columns |= {"split": np.arange(count) % 3, "valid": np.arange(count) > 0, "psnr_cloth": np.linspace(20, 40, count)}
+    data.label, data.rejection, data.manifest.sample_count = columns.__getitem__, lambda _slot: None, count
+
+    def chosen(**query: str) -> int:
+        return int(thumbs(data, query, 0)["chosen"])
+
+    assert [len(axis["values"]) for axis in sliders(data.manifest.spec)] == [5, 101, 3]
+    assert chosen() == count
+    assert chosen(**{"material.from": "1", "material.to": "2"}) == 2 * 200 * 3
+    assert chosen(**{"mu.from": "100"}) == 5 * 3  # the largest alone
+    assert chosen(**{"mu.from": "2", "mu.to": "1"}) == 0
+    assert chosen(valid="no") == 1
+    assert chosen(psnr="39.999") == 1
+    assert chosen(psnr="bright") == chosen(**{"mu.from": "-1"}) == count
+    shown = thumbs(data, {"texture.from": "1", "texture.to": "1"}, 48)
+    assert (len(shown["thumbs"]), shown["next_start"]) == (48, 96)
+    assert {point["texture"] for _, point, _ in shown["thumbs"]} == {sorted(axes["texture"])[1]}
 
 
 def test_a_long_motion_is_thinned() -> None:

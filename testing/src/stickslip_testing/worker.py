@@ -279,7 +279,7 @@ def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> b
             array.dtype,
         )
         for slot, own in zip(task.slots, known, strict=True)
-        if slot.valid
+        if slot.valid or of_axis
     ]
     if array.name == "sample_key":
         keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]

@@ -1,7 +1,7 @@
 """Contents of the pages of a dataset version: the chosen samples, the distributions of labels, and one sample."""
 
 from collections.abc import Mapping
-from itertools import islice
+from contextlib import suppress
 from math import prod
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, solver_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
-from stickslip_schemas.plan.grid import grid
+from stickslip_schemas.plan.grid import columns_of
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -20,49 +20,60 @@ from stickslip_services.pages.plots import plot, table
 from stickslip_services.pages.sample_data import SampleData
 
 SHOWN_THUMBS = 48
+STOPS = 101
+"""Of a slider: one at each percent where an axis has more values."""
 GROUPS = ("Parameters", "Looks", "Physics", "Checks")
 """Groups of labels, in the order of the pages."""
 
 
 def sliders(spec: JobSpec) -> list[dict[str, Any]]:
-    """Return the names and sorted values of the axes with more than one value."""
-    columns: dict[str, set[Any]] = {name: set() for name in spec.named_axes}
-    for point in islice(grid(spec), MOST_SAMPLES):
-        for name, value in point.items():
-            columns[name].add(value)
-    return [{"name": name, "values": sorted(values)} for name, values in columns.items() if len(values) > 1]
+    """Return the names of the axes with more than one value, and at most `STOPS` of their values, in order."""
+    found = []
+    for name, column in zip(spec.named_axes, columns_of(spec), strict=True):
+        values = sorted(set(column))
+        stops = (
+            np.unique(np.linspace(0, len(values) - 1, STOPS).astype(int)) if len(values) > STOPS else range(len(values))
+        )
+        found.append({"name": name, "values": [values[stop] for stop in stops]})
+    return [axis for axis in found if len(axis["values"]) > 1]
 
 
 def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, Any]:
-    """Return the context of `thumbs.html`: the samples within the sliders, from number `start` on.
+    """Return the context of `thumbs.html`: the samples within the filters, from number `start` on.
 
-    The query has the ends of each slider, `NAME.from` and `NAME.to`, as indices into the values of the axis;
-    `split`, the name of a split; and `valid`, yes or no.
+    The query has the ends of each slider, `NAME.from` and `NAME.to`, as indices into its values; `split`, the name of a
+    split; `valid`, yes or no; and `psnr`, the least PSNR of the cloth [dB].
     """
-    wanted: dict[str, set[Any]] = {}
-    for axis in sliders(data.manifest.spec):
-        values = axis["values"]
+    axes, valid = sliders(data.manifest.spec), data.label("valid").astype(bool)
+    inside = np.ones(data.manifest.sample_count, dtype=bool)
+    for axis in axes:
+        values, array = axis["values"], data.arrays[axis["name"]]
+        column = np.asarray(data.label(array.name), dtype=float)
         places = [query.get(f"{axis['name']}.{end}", "") for end in ("from", "to")]
         first, last = (int(place) if place.isdecimal() and len(place) < 9 else None for place in places)
-        wanted[axis["name"]] = set(values[first or 0 : len(values) if last is None else last + 1])
-    lost = data.rejections(MOST_SAMPLES)
-    codes = data.label("split") if query.get("split") in SPLITS else None
-    valid = {"yes": True, "no": False}.get(query.get("valid", ""))
-    chosen = [
-        (slot, point)
-        for slot, point in enumerate(islice(grid(data.manifest.spec), MOST_SAMPLES))
-        if all(point[name] in values for name, values in wanted.items())
-        and (codes is None or codes[slot] == SPLITS.index(query["split"]))
-        and valid in (None, slot not in lost)
+        within = values[first or 0 : len(values) if last is None else last + 1]
+        if array.categories:
+            inside &= np.isin(column, [array.categories.index(str(value)) for value in within])
+        elif len(within) < len(values):
+            inside &= (column >= min(within, default=np.inf)) & (column <= max(within, default=-np.inf))
+    if query.get("split") in SPLITS:
+        inside &= data.label("split") == SPLITS.index(query["split"])
+    if query.get("valid") in ("yes", "no"):
+        inside &= valid == (query["valid"] == "yes")
+    with suppress(ValueError, KeyError):
+        inside &= np.asarray(data.label("psnr_cloth"), dtype=float) >= float(query["psnr"])
+    chosen = np.flatnonzero(inside)
+    columns = [(axis["name"], data.arrays[axis["name"]], data.label(axis["name"])) for axis in axes]
+    shown = [
+        (slot, {name: data.named(array, column[slot]) for name, array, column in columns}, data.rejection(slot))
+        for slot in chosen[start : start + SHOWN_THUMBS].tolist()
     ]
-    shown = chosen[start : start + SHOWN_THUMBS]
-    keep = {name: value for name, value in query.items() if name != "start"}
     return {
-        "thumbs": [(slot, point, lost.get(slot)) for slot, point in shown],
+        "thumbs": shown,
         "chosen": len(chosen),
         "next_start": start + SHOWN_THUMBS if start + SHOWN_THUMBS < len(chosen) else None,
-        "kept_query": keep,
-        "varying": {axis["name"] for axis in sliders(data.manifest.spec)},
+        "kept_query": {name: value for name, value in query.items() if name != "start"},
+        "has_psnr": "psnr_cloth" in data.arrays,
         "pictured": _pictured(data),
         "picture_index": _telling_picture(data),
     }
