@@ -13,7 +13,7 @@ FOLDERS = ("schemas/src", "services/src", "workers", "training/src", "sim_core/s
 ENDINGS = (".py", ".pyi", ".cpp", ".hpp", ".html", ".js", ".css")
 GENERATED = (".min.js", "_sim_core.pyi")
 
-MAX_SOURCE_LINES = 56_484
+MAX_SOURCE_LINES = 56_266
 """The goal is 50,000. Lower this with every change that removes lines; never raise it.
 
 It was raised once, from 53,500, for scenes as data and the checks of cloth: later changes must pay it back."""

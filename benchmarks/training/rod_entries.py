@@ -1,8 +1,8 @@
 """Answer a test set of rods by our methods: one file of predictions each, for `stickslip-train benchmark score`.
 
-    python benchmarks/training/rod_entries.py INPUTS.npz OUT [--local-global MODEL.pt] [--table-5-1 MODEL.pt]
+    python benchmarks/training/rod_entries.py INPUTS.npz OUT [--table-5-1 MODEL.pt]
 
-INPUTS.npz is of `stickslip-train benchmark inputs`. The networks answer where their files are given.
+INPUTS.npz is of `stickslip-train benchmark inputs`. The network answers where its file is given.
 """
 
 import argparse
@@ -27,7 +27,6 @@ from stickslip_training.rods.baselines import (  # noqa: E402
     quintic_spline_curvature,
 )
 from stickslip_training.rods.evaluation import bending, estimate_strains  # noqa: E402
-from stickslip_training.rods.local_global import load_local_global  # noqa: E402
 
 Lines = npt.NDArray[np.float32]
 Answer = dict[str, Any]
@@ -66,7 +65,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("inputs", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--local-global", type=Path)
     parser.add_argument("--table-5-1", type=Path)
     args = parser.parse_args()
     with np.load(args.inputs) as file:
@@ -78,12 +76,8 @@ def main() -> None:
         "three-parameter-fit": rod_by_rod(fit_parameters),
         "distributed-fit": rod_by_rod(fit_natural_curvature),
     }
-    for name, path, load in (
-        ("local-global", args.local_global, load_local_global),
-        ("table-5-1", args.table_5_1, table_5_1.load_model),
-    ):
-        if path is not None:
-            methods[name] = at_once(network(load(path).eval()))
+    if args.table_5_1 is not None:
+        methods["table-5-1"] = at_once(network(table_5_1.load_model(args.table_5_1).eval()))
     args.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     for name, method in methods.items():

@@ -1,13 +1,8 @@
 import json
 import re
 
-import numpy as np
 import pytest
 from stickslip_training.cli import app
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.rods.dataset import load_splits
-from stickslip_training.rods.evaluation import estimate_strains, noisy_test_centerline
-from stickslip_training.rods.local_global import load_local_global
 from typer.testing import CliRunner
 
 runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
@@ -49,27 +44,7 @@ def test_curvature_trains_and_writes(rods, tmp_path):
     assert len(json.loads((out / "report.json").read_text())["history"]) == 2
 
 
-@pytest.mark.physics
-def test_local_global_trains_and_writes(rods, tmp_path):
-    out, measured = tmp_path / "out", tmp_path / "reconstructed.npz"
-    true = np.zeros((4, 150, 3))
-    np.savez(measured, true=true, reconstructed=true + 1e-3, verdict=np.full(4, "good"))
-    options = ["--steps", "3", "--noise", "0.001", "0.01", "--judged-at", "0.02", "--reconstruction", str(measured)]
-    result = runner.invoke(app, ["local-global", str(rods.root), "--out", str(out), *options])
-    assert result.exit_code == 0, result.output
-    for line in ("step 3: loss", "network", "quintic spline", "at 2.00% noise", "Note: There are"):
-        assert line in result.output
-    report = json.loads((out / "report.json").read_text())
-    assert report["settings"]["noise"] == [0.001, 0.01]
-    assert report["methods"][0]["method"] == "network"
-    with DatasetReader(rods.root) as reader:
-        test = load_splits(reader, 1000)[0]["test"]
-    noisy = noisy_test_centerline(test, 0.02, 0)
-    strains = estimate_strains(load_local_global(out / "local-global.pt"), noisy)
-    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
-
-
-@pytest.mark.parametrize("command", [["info"], ["curvature", "--out", "out"], ["local-global", "--out", "out"]])
+@pytest.mark.parametrize("command", [["info"], ["curvature", "--out", "out"]])
 def test_a_mistake_is_one_line_and_status_1(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = runner.invoke(app, [command[0], "nowhere", *command[1:]])

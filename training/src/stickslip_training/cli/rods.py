@@ -1,8 +1,6 @@
-"""The commands on rods: `stickslip-train curvature`, `local-global` and `reconstruct`."""
+"""The commands on rods: `stickslip-train curvature` and `reconstruct`."""
 
-import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,15 +9,12 @@ from rich.console import Console
 from rich.table import Table
 
 from stickslip_training.cli.errors import DatasetArgument, readable_errors
-from stickslip_training.data.reader import DatasetReader
 
 if TYPE_CHECKING:
     from stickslip_training.rods.curvature import TrainingReport
-    from stickslip_training.rods.evaluation import MethodReport
 
 
 _SECONDS_BETWEEN_LINES = 5.0  # epochs of a small dataset take less
-_EVALUATED_RODS = 1000  # at most
 
 
 def curvature(
@@ -66,78 +61,17 @@ def curvature(
         console.print(f"{out}: report.json, model.pt, checkpoint.pt", soft_wrap=True)
 
 
-def local_global(
-    dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option(help="directory for the network and the report")],
-    steps: Annotated[int, typer.Option(help="of training; 1000 take 40 CPU seconds")] = 12_000,
-    noise: Annotated[tuple[float, float], typer.Option(help="least and largest white noise, over L")] = (2e-4, 1e-2),
-    reconstruction: Annotated[
-        Path | None,
-        typer.Option(help="npz of `benchmarks/reconstruction.py --save`: a fifth of the rods get its noise"),
-    ] = None,
-    judged_at: Annotated[float, typer.Option(help="white noise on the test rods, over L")] = 0.005,
-    seed: Annotated[int, typer.Option()] = 0,
-    threads: Annotated[int, typer.Option(help="of torch")] = 1,
-    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
-) -> None:
-    """Train the network that pools local and global features, with fresh noise at every step."""
-    from stickslip_training.engine.fit import EpochReport
-    from stickslip_training.rods.dataset import ReconstructionNoise, load_splits
-    from stickslip_training.rods.evaluation import evaluate, noisy_test_centerline
-    from stickslip_training.rods.local_global import LocalGlobalTraining, save_local_global, train_local_global
-
-    console = Console()
-
-    def show(report: EpochReport) -> None:
-        console.print(f"step {report.step}: loss {report.train_loss:.3f}, {report.seconds:.0f} s")
-
-    with readable_errors():
-        settings = LocalGlobalTraining(steps=steps, noise=noise, seed=seed, threads=threads)
-        measured = None if reconstruction is None else ReconstructionNoise.load(reconstruction)
-        with DatasetReader(dataset) as reader:
-            rods, notes = load_splits(reader, _EVALUATED_RODS)
-        train, test = rods["train"], rods["test"]
-        net = train_local_global(
-            train.centerline,
-            train.strains,
-            settings,
-            reconstruction=measured,
-            out=out,
-            resume=resume,
-            on_epoch=show,
-        )
-        methods, loss = evaluate(net, test, noisy_test_centerline(test, judged_at, seed))
-        save_local_global(out / "local-global.pt", net, settings)
-        report = {
-            "settings": asdict(settings),
-            "noise_of_test_rods": judged_at,
-            "rods": {name: len(part) for name, part in rods.items()},
-            "test_loss": loss,
-            "methods": [asdict(method) for method in methods],
-            "notes": notes,
-        }
-        (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    console.print(_methods(f"|κ| of {len(test)} test rods at {judged_at:.2%} noise", "", methods))
-    for note in notes:
-        console.print(f"Note: {note}")
-    console.print(f"{out}: local-global.pt, report.json, checkpoint.pt", soft_wrap=True)
-
-
 def _results(report: "TrainingReport") -> Table:
-    return _methods(
-        f"|κ| of {report.rods['test']} test rods at {report.config['noise']:.2%} noise",
-        f"The network's loss over all three strains is {report.test_loss:.3f} rad. "
+    table = Table(
+        title=f"|κ| of {report.rods['test']} test rods at {report.config['noise']:.2%} noise",
+        caption=f"The network's loss over all three strains is {report.test_loss:.3f} rad. "
         f"It was trained for {report.seconds:.0f} s on {report.rods['train']} rods.",
-        report.methods,
+        caption_justify="left",
     )
-
-
-def _methods(title: str, caption: str, methods: "tuple[MethodReport, ...]") -> Table:
-    table = Table(title=title, caption=caption, caption_justify="left")
     table.add_column("method")
     for title in ("RMS of |κ| L", "error, median", "error, 90 %", "ms a rod"):
         table.add_column(title, justify="right", no_wrap=True)
-    for method in methods:
+    for method in report.methods:
         table.add_row(
             method.method,
             f"{method.rms:,.2f} rad",
