@@ -222,15 +222,47 @@ def test_leases_are_renewed_at_the_start_of_a_coordinator(
     assert row(context, lease.task_id).expires_at == clock.now + context.settings.lease_seconds
 
 
-def test_a_sweep_takes_back_expired_leases_only(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_sweep_takes_back_the_leases_of_silent_workers_only(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context)
-    expired, renewed = worker.lease(simulate=2)
-    clock.advance(20)
-    worker.beat(renewed)
-    clock.advance(20)
-    sweep(context)
+    (expired,) = worker.lease(simulate=1)
+    other = PretendWorker(DirectApi(context), context.store, name="other").register()
+    (renewed,) = other.lease(simulate=1)
+    for _ in range(2):
+        clock.advance(20)
+        other.beat(renewed)
+        sweep(context)
     assert row(context, expired.task_id).owner is None
-    assert row(context, renewed.task_id).owner == worker.id
+    assert row(context, renewed.task_id).owner == other.id
+
+
+def test_a_lease_that_its_worker_does_not_know_of_is_taken_back(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    """Its answer was lost on the way."""
+    submit(context)
+    known, lost = worker.lease(simulate=2)
+    for seconds, owner in ((20, worker.id), (20, None)):
+        clock.advance(seconds)
+        assert worker.beat(known) == ()
+        assert row(context, lost.task_id).owner == owner
+    assert row(context, lost.task_id).state == TaskState.pending
+    assert row(context, known.task_id).owner == worker.id
+
+
+def test_a_worker_that_was_heard_in_the_future_can_be_lost(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    """The clock of an earlier process was ahead."""
+    submit(context)
+    (lease,) = worker.lease(simulate=1)
+    worker.beat(lease)
+    clock.advance(-3600)
+    start(context)
+    clock.advance(31)
+    sweep(context)
+    assert row(context, lease.task_id).owner is None
 
 
 def test_a_sweep_retries_due_tasks_only(context: Context, worker: PretendWorker, clock: ManualClock) -> None:

@@ -89,10 +89,12 @@ class LeaseState(Document):
 
 
 class Heartbeat(Document):
-    """Renew the leases, and tell how the dispatcher is."""
+    """Renew all leases of the dispatcher, and tell how it is."""
 
     worker_id: str
-    leases: tuple[LeaseState, ...]
+    leases: tuple[LeaseState, ...] = Field(
+        description="all that it holds: one that is not there is taken back when it has had the duration of a lease"
+    )
     condition: WorkerCondition
 
 

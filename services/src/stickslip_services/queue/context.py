@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.clock import Clock
@@ -30,8 +29,6 @@ class Context:
     notifier: Notifier = field(default_factory=Notifier)
     frames_by_worker: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
     """Progress of simulations from the last heartbeat of each worker: (frames done, frames total) by task."""
-    conditions: dict[str, tuple[float, WorkerCondition]] = field(default_factory=dict)
-    """Time and condition of the last heartbeat of each worker that was noted in the database."""
     sections: dict[str, tuple[Sha256, ...]] = field(default_factory=dict)
     """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an earlier process."""
     is_closing: bool = False

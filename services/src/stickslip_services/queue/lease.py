@@ -6,9 +6,8 @@ has lost its lease is recognised.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf
 
-from sqlalchemy import Connection, bindparam, exists, select, text, update
+from sqlalchemy import Connection, bindparam, select, text, update
 from stickslip_schemas.base.states import Reason, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
@@ -50,6 +49,7 @@ from stickslip_services.queue.workers import (
     find_worker,
     insert_worker,
     is_silent,
+    note_heard,
     note_seen,
     note_stranded,
 )
@@ -64,7 +64,7 @@ def register_worker(context: Context, registration: WorkerRegistration) -> Worke
         old = list(book.connection.scalars(select(workers.c.id).where(workers.c.name == registration.name)))
         worker = insert_worker(book.connection, registration, book.now)
         message = f"worker {registration.name} was started anew"
-        lose(book, find_held(book, owners=old), context.settings, message=message)
+        lose(book, find_held(book, old), context.settings, message=message)
     plan_waiting_jobs(context)
     note_stranded(context)
     return WorkerSession(worker_id=worker.id, lease_seconds=context.settings.lease_seconds)
@@ -75,14 +75,14 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
     wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
     with context.database.read() as connection:
         worker = _unsuperseded(connection, request.worker_id)
-        due = is_sweep_due(connection, context.clock())
+        due = is_sweep_due(connection, context.clock(), context.alive_since)
         ready = has_ready_task(connection, worker, wanted.keys(), at_most=request.at_most_seconds)
         waiting = ready or has_runnable_job(connection)
+    if due:
+        take_back(context)
     if is_silent(context, worker):
         with context.database.touch() as connection:
             note_seen(connection, worker.id, context.clock())
-    if due:
-        take_back(context)
     if context.store_watch.trouble:
         return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
     if not (ready or due):
@@ -100,61 +100,52 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
 
 
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
-    """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
+    """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError.
+
+    The time of a worker's last message renews all its leases. A heartbeat that does not list one that has had its
+    duration takes it back: the worker does not know of it.
+    """
     now, condition = context.clock(), message.condition
-    noted_at, known = context.conditions.get(message.worker_id, (-inf, None))
     with context.database.touch() as connection:
-        # Most heartbeats are one statement: neither a read nor a write of the worker each time.
-        if condition != known or now - noted_at > context.settings.lease_seconds / 4 or not message.leases:
-            worker = find_worker(connection, message.worker_id)
-            if is_silent(context, worker) or condition != worker.condition:
-                note_seen(connection, worker.id, now, condition)
-            context.conditions[worker.id] = now, condition
-            known = worker.condition
-        left = _leave_renewed(connection, message, now + context.settings.lease_seconds)
+        known = note_heard(connection, message.worker_id, now)
+        if condition != known:
+            note_seen(connection, message.worker_id, now, condition)
+        held = {(key, token): rest for key, token, *rest in _HELD.tuples(connection, {"b_worker": message.worker_id})}
     if condition.state != known.state:
         note_stranded(context)
     context.frames_by_worker[message.worker_id] = {
         lease.task_id: lease.frames for lease in message.leases if lease.frames is not None
     }
-    if not left:
+    left = []
+    for lease in message.leases:
+        state, _, runnable_job = held.pop((task_key(lease.task_id), lease.token), (None, None, None))
+        if runnable_job is None or state not in _GOES_ON[lease.started]:
+            left.append(lease)
+    if not left and all(expires_at > now for _, expires_at, _ in held.values()):
         return HeartbeatAnswer(drop=())
     with context.ledger() as book:
         worker = find_worker(book.connection, message.worker_id)
-        drop = _renew_leases(book, worker, left, context.settings.lease_seconds)
+        drop = _sort_out(book, worker, left)
+        listed = {task_key(lease.task_id) for lease in message.leases}
+        unlisted = [task for task in find_held(book, [worker.id], expired=True) if task.key not in listed]
+        lose(book, unlisted, context.settings, message=f"worker {worker.name} does not know of it")
     return HeartbeatAnswer(drop=drop)
 
 
-_RENEWED = (
-    select(tasks.c.seq)
-    .where(
-        tasks.c.key.in_(bindparam("b_keys", expanding=True)),
-        tasks.c.owner == bindparam("b_worker"),
-        exists().where(job_tasks.c.task == tasks.c.seq, jobs.c.seq == job_tasks.c.job, jobs.c.state.in_(RUNNABLE)),
+_RUNNABLE_JOB = (
+    select(jobs.c.seq)
+    .join(job_tasks, job_tasks.c.job == jobs.c.seq)
+    .where(job_tasks.c.task == tasks.c.seq, jobs.c.state.in_(RUNNABLE))
+    .limit(1)
+    .scalar_subquery()
+)
+_HELD = Prepared(
+    select(tasks.c.key, tasks.c.token, tasks.c.state, tasks.c.expires_at, _RUNNABLE_JOB.label("runnable_job")).where(
+        text("tasks.owner IS NOT NULL"), tasks.c.owner == bindparam("b_worker")
     )
-    .with_for_update(skip_locked=True)
 )
-_RENEW = Prepared(
-    update(tasks)
-    .where(tasks.c.seq.in_(_RENEWED))
-    .values(expires_at=bindparam("b_until"))
-    .returning(tasks.c.key, tasks.c.token, tasks.c.state)
-)
-
-
-def _leave_renewed(connection: Connection, message: Heartbeat, until: float) -> list[LeaseState]:
-    """Renew the leases whose tasks go on as they are, with one statement; return the others."""
-    held = message.leases
-    keys = {lease.task_id: task_key(lease.task_id) for lease in held}
-    states = {
-        (key, token): state
-        for batch in batches(key for key in keys.values() if key is not None)
-        for key, token, state in _RENEW.tuples(
-            connection, {"b_keys": batch, "b_worker": message.worker_id, "b_until": until}
-        )
-    }
-    goes_on = {False: (TaskState.leased, TaskState.running), True: (TaskState.running,)}
-    return [lease for lease in held if states.get((keys[lease.task_id], lease.token)) not in goes_on[lease.started]]
+_GOES_ON = {False: (TaskState.leased, TaskState.running), True: (TaskState.running,)}
+"""States of tasks that need no change, by whether the worker says that they have been started."""
 
 
 def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
@@ -195,7 +186,7 @@ def _compose_leases(
 def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -> None:
     """Mend the rows that leased tasks need, and retry these, as after a report of damaged artifacts."""
     with context.ledger() as book:
-        held = [task for task in find_held(book, owners=[worker_id]) if task.seq in damaged]
+        held = [task for task in find_held(book, [worker_id]) if task.seq in damaged]
         start_tasks(book, [(task.seq, task.stage) for task in held])
         why = Reason.storage_error, str(DamagedRowsError())
         fail_tries(book, [(replace(task, state=TaskState.running), *why) for task in held], context.settings)
@@ -203,10 +194,8 @@ def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -
             mend(book, task.seq, damaged[task.seq])
 
 
-def _renew_leases(
-    book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState], lease_seconds: float
-) -> tuple[str, ...]:
-    """Renew leases, note which tasks have been started, and return the tasks that the worker must drop."""
+def _sort_out(book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState]) -> tuple[str, ...]:
+    """Note which tasks have been started, and return the tasks that the worker must drop."""
     drop: list[str] = []
     mine: list[tuple[LeaseState, HeldTask]] = []
     keys = {state.task_id: task_key(state.task_id) for state in held}
@@ -230,12 +219,6 @@ def _renew_leases(
             release(book, task, TaskState.pending)
     drop.extend(lease.task_id for lease, task in mine if task.seq in unneeded | halted)
     kept = [(lease, task) for lease, task in mine if task.seq not in unneeded | halted]
-    for batch in batches(kept):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([task.seq for _, task in batch]))
-            .values(expires_at=book.now + lease_seconds)
-        )
     started = [task for lease, task in kept if lease.started and task.state is TaskState.leased]
     start_tasks(book, [(task.seq, task.stage) for task in started])
     return tuple(drop)
@@ -244,6 +227,9 @@ def _renew_leases(
 def renew_all_leases(connection: Connection, now: float, lease_seconds: float) -> None:
     """Renew every lease: while the coordinator was down, no heartbeat could arrive."""
     connection.execute(update(tasks).where(text("tasks.owner IS NOT NULL")).values(expires_at=now + lease_seconds))
+    connection.execute(
+        update(workers).where(workers.c.last_seen_at > now).values(last_seen_at=now)
+    )  # a clock was ahead
 
 
 def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:

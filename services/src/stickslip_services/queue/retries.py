@@ -34,11 +34,9 @@ from stickslip_services.queue.ledger import (
 from stickslip_services.settings import Settings
 
 
-def find_held(book: Ledger, *, owners: Sequence[str] | None = None, expired: bool = False) -> list[HeldTask]:
-    """Return the leased tasks of `owners`, or those whose lease has expired."""
-    query = select(*HELD_COLUMNS).where(text("tasks.owner IS NOT NULL"))  # in the words of the partial index
-    if owners is not None:
-        query = query.where(tasks.c.owner.in_(owners))
+def find_held(book: Ledger, owners: Sequence[str], *, expired: bool = False) -> list[HeldTask]:
+    """Return the leased tasks of `owners`; with `expired` those that have been leased for the duration of a lease."""
+    query = select(*HELD_COLUMNS).where(text("tasks.owner IS NOT NULL"), tasks.c.owner.in_(owners))
     if expired:
         query = query.where(tasks.c.expires_at <= book.now)
     return [HeldTask.of(row) for row in book.connection.execute(query)]
@@ -111,25 +109,32 @@ def _emit(book: Ledger, task: HeldTask, state: TaskState, reason: Reason, messag
     book.emit(task.seq, event)
 
 
+# A lease ends when it has had its duration, and nothing has been heard of its worker for as long.
+_EXPIRED = (
+    "tasks.owner IS NOT NULL AND tasks.expires_at <= :b_now "  # in the words of the partial index
+    "AND tasks.owner NOT IN (SELECT workers.id FROM workers WHERE workers.last_seen_at > :b_alive_since)"
+)
+_FIND_EXPIRED = Prepared(select(*HELD_COLUMNS).where(text(_EXPIRED)))
 _IS_DUE = Prepared(
-    "SELECT EXISTS (SELECT 1 FROM tasks WHERE tasks.owner IS NOT NULL AND tasks.expires_at <= :b_now) "
+    f"SELECT EXISTS (SELECT 1 FROM tasks WHERE {_EXPIRED}) "
     "OR EXISTS (SELECT 1 FROM tasks WHERE tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now)"
 )
 
 
-def is_sweep_due(connection: Connection, now: float) -> bool:
+def is_sweep_due(connection: Connection, now: float, alive_since: float) -> bool:
     """Return whether a lease has expired or a retry is due, without taking the write lock."""
-    return bool(_IS_DUE.scalar(connection, {"b_now": now}))
+    return bool(_IS_DUE.scalar(connection, {"b_now": now, "b_alive_since": alive_since}))
 
 
 def take_back(context: Context) -> None:
     """Take back expired leases, and return tasks whose retry is due to `pending`."""
     with context.database.read() as connection:
-        if not is_sweep_due(connection, context.clock()):
+        if not is_sweep_due(connection, context.clock(), context.alive_since):
             return
+    seconds = context.settings.lease_seconds
     with context.ledger() as book:
-        message = f"no heartbeat for {context.settings.lease_seconds:g} s"
-        lose(book, find_held(book, expired=True), context.settings, message=message)
+        rows = _FIND_EXPIRED.rows(book.connection, {"b_now": book.now, "b_alive_since": book.now - seconds})
+        lose(book, list(map(HeldTask.of, rows)), context.settings, message=f"no heartbeat for {seconds:g} s")
         _retry_due(book)
 
 

@@ -118,6 +118,20 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
     raise KindNotAvailableError(f"no worker makes {kind!r}; those that have registered make {kinds}")
 
 
+_HEARD = Prepared(
+    update(workers)
+    .where(workers.c.id == bindparam("b_id"))
+    .values(last_seen_at=bindparam("b_now"))
+    .returning(workers.c.condition)
+)
+
+
+def note_heard(connection: Connection, worker_id: str, now: float) -> WorkerCondition:
+    """Store the time of a worker's heartbeat; return how it was. Raise UnknownWorkerError."""
+    rows = _HEARD.tuples(connection, {"b_id": worker_id, "b_now": now})
+    return WorkerCondition.model_validate_json(rows[0][0]) if rows else find_worker(connection, worker_id).condition
+
+
 def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition | None = None) -> None:
     """Store the time of a worker's last message, and how it is where that has changed."""
     values: dict[str, Any] = {"last_seen_at": now}
