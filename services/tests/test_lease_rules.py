@@ -1,20 +1,23 @@
 """The rules of leasing, each by itself: fencing, expiry, retries, back-off, losses, priorities, cancelling, quotas."""
 
+import asyncio
+import threading
 from typing import Any
 
 import pytest
 from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask
-from stickslip_schemas.documents.worker_api import LeaseRequest
+from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, LeaseState
 from stickslip_services.access.asker import Asker, asking
 from stickslip_services.access.projects import check_quota, find_project, set_quota
+from stickslip_services.api.routes.workers import Gathering
 from stickslip_services.database.tables import tasks
-from stickslip_services.errors import ConflictError, QuotaExceededError
+from stickslip_services.errors import ConflictError, QuotaExceededError, UnknownWorkerError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job
 from stickslip_services.queue.ids import task_key
-from stickslip_services.queue.lease import lease_tasks
+from stickslip_services.queue.lease import lease_tasks, renew_leases, sort_out
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import start, sweep
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
@@ -249,6 +252,61 @@ def test_a_lease_that_its_worker_does_not_know_of_is_taken_back(
         assert row(context, lost.task_id).owner == owner
     assert row(context, lost.task_id).state == TaskState.pending
     assert row(context, known.task_id).owner == worker.id
+
+
+def test_heartbeats_that_wait_are_answered_together(context: Context, worker: PretendWorker) -> None:
+    submit(context)
+    other = PretendWorker(DirectApi(context), context.store, name="other").register()
+    (kept,), (lost,) = worker.lease(simulate=1), other.lease(simulate=1)
+    other.report((lost, None))
+    messages = [
+        Heartbeat(
+            worker_id=of,
+            leases=(LeaseState(task_id=lease.task_id, token=lease.token, started=False),),
+            condition=worker.condition,
+        )
+        for of, lease in ((worker.id, kept), (other.id, lost), ("worker-nobody", kept), (other.id, kept))
+    ]
+    left = renew_leases(context, messages)
+    assert left == [None, *(list(message.leases) for message in messages[1:])]
+    for message, states, drop in zip(messages[1:], left[1:], ((lost.task_id,), None, (kept.task_id,)), strict=True):
+        assert states is not None
+        if drop is None:
+            with pytest.raises(UnknownWorkerError):
+                sort_out(context, message, states)
+        else:
+            assert sort_out(context, message, states).drop == drop
+    assert row(context, kept.task_id).owner == worker.id
+
+
+def test_calls_that_wait_are_gathered_and_fail_together() -> None:
+    calls: list[list[int]] = []
+    first = threading.Event()
+
+    def call(items: list[int]) -> list[int]:
+        calls.append(items)
+        assert first.wait(10)
+        if 2 in items:
+            raise ValueError("two")
+        return [10 * item for item in items]
+
+    async def use() -> list[int | BaseException]:
+        gathering = Gathering(call)
+        waiting = [asyncio.create_task(gathering.add(item)) for item in (1,)]
+        while not calls:
+            await asyncio.sleep(0.01)
+        waiting += [asyncio.create_task(gathering.add(item)) for item in (2, 3, 4)]
+        await asyncio.sleep(0)
+        waiting[3].cancel()
+        first.set()
+        results = await asyncio.gather(*waiting, return_exceptions=True)
+        return [*results, await gathering.add(5)]
+
+    one, two, three, four, five = asyncio.run(use())
+    assert (one, five, calls) == (10, 50, [[1], [2, 3, 4], [5]])
+    assert isinstance(two, ValueError)
+    assert isinstance(three, ValueError)
+    assert isinstance(four, asyncio.CancelledError)
 
 
 def test_a_worker_that_was_heard_in_the_future_can_be_lost(

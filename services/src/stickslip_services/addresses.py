@@ -1,6 +1,7 @@
 """Addresses of a coordinator, for the server and for its clients."""
 
 import os
+from functools import lru_cache
 from ipaddress import ip_address
 
 DEFAULT_PORT = 8765
@@ -11,6 +12,7 @@ PRIVATE_VARIABLES = (DATABASE_VARIABLE, "STICKSLIP_SECRETS_KEY")
 """Variables with secrets that only the coordinator needs."""
 
 
+@lru_cache
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach `host`."""
     if host == "localhost":

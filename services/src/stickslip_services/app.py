@@ -47,6 +47,7 @@ from stickslip_services.local.process import configure_logging, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import give_up_waiting
+from stickslip_services.queue.lease import renew_leases
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.scrub import scrub_when_idle
@@ -112,6 +113,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.context = context
     app.state.metrics = metrics
     app.state.feeds = Feeds(context)
+    app.state.renewals = workers.Gathering(partial(renew_leases, context))
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with one after the other.
     routers = [module.router for module in (workers, jobs, uploads, datasets, certificates, health, pages)]

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from math import isfinite
 from typing import Any, Generic, TypeVar
 
 from fastapi import Request
@@ -42,10 +43,12 @@ class JsonBody(Generic[T]):
 
     def read(self, body: bytes) -> T:
         """Return the document in a body; raise ProblemError."""
-        document = parse_json(body)
+        strange: list[str] = []
+        document = parse_json(body, strange)
         try:
             valid = self._adapter.validate_python(document)
-            json.dumps(document, allow_nan=False)  # models refuse NaN with its place; this covers free-form parts
+            if strange:  # models refuse NaN with its place; this covers free-form parts
+                raise ValueError(f"{strange[0][:100]} is no number")
             return valid
         except ValidationError as error:
             fields = field_errors(error, document, self._of, at_most=SHOWN_ERRORS)
@@ -67,11 +70,18 @@ async def whole_body(request: Request) -> bytes:
         raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
 
 
-def parse_json(body: bytes) -> Any:
-    """Parse JSON [RFC 8259]: UTF-8, no duplicate keys, but NaN and infinities pass; raise ProblemError."""
+def parse_json(body: bytes, strange: list[str]) -> Any:
+    """Parse JSON [RFC 8259]: UTF-8, no duplicate keys; raise ProblemError. Add NaN and infinities to `strange`."""
+
+    def number(text: str) -> float:
+        value = float(text)
+        if not isfinite(value):
+            strange.append(text)
+        return value
+
     try:
         text = body.decode("utf-8")
-        document = json.loads(text, object_pairs_hook=_no_key_twice)
+        document = json.loads(text, object_pairs_hook=_no_key_twice, parse_float=number, parse_constant=number)
         if "\\u" in text:
             json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
     except RecursionError as error:

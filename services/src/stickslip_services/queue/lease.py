@@ -6,6 +6,7 @@ has lost its lease is recognised.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from sqlalchemy import Connection, bindparam, select, text, update
 from stickslip_schemas.base.states import Reason, TaskState
@@ -100,32 +101,57 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
 
 
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
-    """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError.
+    """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
+    (left,) = renew_leases(context, [message])
+    return HeartbeatAnswer(drop=()) if left is None else sort_out(context, message, left)
 
-    The time of a worker's last message renews all its leases. A heartbeat that does not list one that has had its
-    duration takes it back: the worker does not know of it.
+
+def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[LeaseState] | None]:
+    """Renew the leases of workers, with two statements for all; return what `sort_out` must look at, None for nothing.
+
+    The time of a worker's last message renews all its leases.
     """
-    now, condition = context.clock(), message.condition
+    now, ids = context.clock(), [message.worker_id for message in messages]
+    held: dict[str, dict[tuple[bytes | None, int], Sequence[Any]]] = {worker: {} for worker in ids}
+    is_news = False
     with context.database.touch() as connection:
-        known = note_heard(connection, message.worker_id, now)
-        if condition != known:
-            note_seen(connection, message.worker_id, now, condition)
-        held = {(key, token): rest for key, token, *rest in _HELD.tuples(connection, {"b_worker": message.worker_id})}
-    if condition.state != known.state:
+        known = note_heard(connection, ids, now)
+        for worker, key, token, *state in _HELD.tuples(connection, {"b_workers": ids}):
+            held[worker][key, token] = state
+        for message in messages:
+            before = known.get(message.worker_id, message.condition)
+            if message.condition != before:
+                note_seen(connection, message.worker_id, now, message.condition)
+                is_news |= message.condition.state != before.state
+    if is_news:
         note_stranded(context)
-    context.frames_by_worker[message.worker_id] = {
-        lease.task_id: lease.frames for lease in message.leases if lease.frames is not None
-    }
-    left = []
-    for lease in message.leases:
-        state, _, runnable_job = held.pop((task_key(lease.task_id), lease.token), (None, None, None))
-        if runnable_job is None or state not in _GOES_ON[lease.started]:
-            left.append(lease)
-    if not left and all(expires_at > now for _, expires_at, _ in held.values()):
-        return HeartbeatAnswer(drop=())
+    found: list[list[LeaseState] | None] = []
+    for message in messages:
+        mine, left, listed = held[message.worker_id], [], set()
+        for lease in message.leases:
+            name = task_key(lease.task_id), lease.token
+            state, _, runnable_job = mine.get(name, _GONE)
+            if runnable_job is None or state not in _GOES_ON[lease.started]:
+                left.append(lease)
+            listed.add(name)
+        lost = any(expires_at <= now and name not in listed for name, (_, expires_at, _) in mine.items())
+        is_known = message.worker_id in known
+        found.append(left if left or lost or not is_known else None)
+        if is_known:
+            frames = {lease.task_id: lease.frames for lease in message.leases if lease.frames is not None}
+            context.frames_by_worker[message.worker_id] = frames
+    return found
+
+
+def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -> HeartbeatAnswer:
+    """Note which tasks of a heartbeat have been started, and return those to drop; raise UnknownWorkerError.
+
+    A lease that has had its duration, and that the message does not list, is taken back: its answer was lost.
+    """
     with context.ledger() as book:
         worker = find_worker(book.connection, message.worker_id)
-        drop = _sort_out(book, worker, left)
+        note_seen(book.connection, worker.id, book.now, message.condition)
+        drop = _start_or_drop(book, worker, left)
         listed = {task_key(lease.task_id) for lease in message.leases}
         unlisted = [task for task in find_held(book, [worker.id], expired=True) if task.key not in listed]
         lose(book, unlisted, context.settings, message=f"worker {worker.name} does not know of it")
@@ -138,12 +164,14 @@ _RUNNABLE_JOB = (
     .where(job_tasks.c.task == tasks.c.seq, jobs.c.state.in_(RUNNABLE))
     .limit(1)
     .scalar_subquery()
+    .label("runnable_job")
 )
 _HELD = Prepared(
-    select(tasks.c.key, tasks.c.token, tasks.c.state, tasks.c.expires_at, _RUNNABLE_JOB.label("runnable_job")).where(
-        text("tasks.owner IS NOT NULL"), tasks.c.owner == bindparam("b_worker")
+    select(tasks.c.owner, tasks.c.key, tasks.c.token, tasks.c.state, tasks.c.expires_at, _RUNNABLE_JOB).where(
+        text("tasks.owner IS NOT NULL"), tasks.c.owner.in_(bindparam("b_workers", expanding=True))
     )
 )
+_GONE = None, None, None
 _GOES_ON = {False: (TaskState.leased, TaskState.running), True: (TaskState.running,)}
 """States of tasks that need no change, by whether the worker says that they have been started."""
 
@@ -194,7 +222,7 @@ def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -
             mend(book, task.seq, damaged[task.seq])
 
 
-def _sort_out(book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState]) -> tuple[str, ...]:
+def _start_or_drop(book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState]) -> tuple[str, ...]:
     """Note which tasks have been started, and return the tasks that the worker must drop."""
     drop: list[str] = []
     mine: list[tuple[LeaseState, HeldTask]] = []

@@ -120,16 +120,22 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
 
 _HEARD = Prepared(
     update(workers)
-    .where(workers.c.id == bindparam("b_id"))
+    .where(
+        workers.c.id.in_(
+            select(workers.c.id)
+            .where(workers.c.id.in_(bindparam("b_ids", expanding=True)))
+            .with_for_update(skip_locked=True)
+        )
+    )
     .values(last_seen_at=bindparam("b_now"))
-    .returning(workers.c.condition)
+    .returning(workers.c.id, workers.c.condition)
 )
 
 
-def note_heard(connection: Connection, worker_id: str, now: float) -> WorkerCondition:
-    """Store the time of a worker's heartbeat; return how it was. Raise UnknownWorkerError."""
-    rows = _HEARD.tuples(connection, {"b_id": worker_id, "b_now": now})
-    return WorkerCondition.model_validate_json(rows[0][0]) if rows else find_worker(connection, worker_id).condition
+def note_heard(connection: Connection, ids: Collection[str], now: float) -> dict[str, WorkerCondition]:
+    """Store when workers were heard; return how they were, without those that a writer has locked or nobody knows."""
+    rows = _HEARD.tuples(connection, {"b_ids": ids, "b_now": now})
+    return {worker: WorkerCondition.model_validate_json(condition) for worker, condition in rows}
 
 
 def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition | None = None) -> None:

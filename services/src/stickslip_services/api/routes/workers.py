@@ -1,10 +1,11 @@
 """The worker API: dispatchers register, lease tasks, send heartbeats, and report results. Tasks can be read, too."""
 
 import asyncio
-from collections.abc import Callable
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from stickslip_schemas.documents.responses import WorkerEntry
 from stickslip_schemas.documents.worker_api import (
@@ -23,29 +24,51 @@ from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, ContextDep, problem_responses
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.lease import heartbeat, lease_tasks, register_worker
+from stickslip_services.queue.lease import lease_tasks, register_worker, sort_out
 from stickslip_services.queue.report import report_results
 from stickslip_services.queue.workers import show_workers
 
 T = TypeVar("T")
+U = TypeVar("U")
 _Route = TypeVar("_Route", bound=Callable[..., Any])
 
 router = APIRouter()
+
+MOST_ON_LOOP = 64 * 2**10
+"""Heartbeats of at most so many bytes are read by the event loop, in 2 ms; longer ones by a thread."""
+MOST_TOGETHER = 64
+"""Heartbeats that are answered with one statement: about 5 ms."""
 
 _LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest)
 _HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat)
 _REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
 
 
+class _Plain(APIRoute):
+    """A route whose function takes the request and returns the response: FastAPI resolves nothing for it."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler: Callable[[Request], Coroutine[Any, Any, Response]] = self.endpoint
+        return handler
+
+
 def _verb(name: str, document: type[BaseModel], answer: type[BaseModel], *refusals: int) -> Callable[[_Route], _Route]:
     """Return the decorator of a route that workers post a document to."""
-    return router.post(
-        f"/v1/worker/{name}",
-        tags=["workers"],
-        response_model=answer,
-        responses=problem_responses(*refusals, *BODY_PROBLEMS),
-        openapi_extra=body_schema(document.__name__) | KEYED,
-    )
+
+    def add(endpoint: _Route) -> _Route:
+        router.add_api_route(
+            f"/v1/worker/{name}",
+            endpoint,
+            methods=["POST"],
+            tags=["workers"],
+            response_model=answer,
+            responses=problem_responses(*refusals, *BODY_PROBLEMS),
+            openapi_extra=body_schema(document.__name__) | KEYED,
+            route_class_override=_Plain,
+        )
+        return endpoint
+
+    return add
 
 
 @router.get("/v1/workers", tags=["workers"], responses=problem_responses())
@@ -78,7 +101,46 @@ async def post_lease(request: Request) -> Response:
 @_verb("heartbeat", Heartbeat, HeartbeatAnswer, 404)
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
-    return await _answer(request, _HEARTBEAT, heartbeat)
+    body = await _HEARTBEAT.received(request)
+    is_long = len(body) > MOST_ON_LOOP
+    message = await asyncio.to_thread(_HEARTBEAT.read, body) if is_long else _HEARTBEAT.read(body)
+    left = await request.app.state.renewals.add(message)
+    answer = HeartbeatAnswer(drop=())
+    if left is not None:
+        answer = await asyncio.to_thread(sort_out, request.app.state.context, message, left)
+    return Response(answer.model_dump_json(), media_type="application/json")
+
+
+class Gathering(Generic[T, U]):
+    """Calls a function in a thread: once for all items that have come while its last call was running."""
+
+    def __init__(self, call: Callable[[list[T]], list[U]]) -> None:
+        self._call = call
+        self._waiting: list[tuple[T, asyncio.Future[U]]] = []
+        self._task: asyncio.Task[None] | None = None
+
+    async def add(self, item: T) -> U:
+        """Return the result for an item."""
+        future: asyncio.Future[U] = asyncio.get_running_loop().create_future()
+        self._waiting.append((item, future))
+        if self._task is None:
+            self._task = asyncio.create_task(self._work())
+        return await future
+
+    async def _work(self) -> None:
+        while self._waiting:
+            batch, self._waiting = self._waiting[:MOST_TOGETHER], self._waiting[MOST_TOGETHER:]
+            try:
+                results = await asyncio.to_thread(self._call, [item for item, _ in batch])
+            except Exception as error:
+                for _, future in batch:
+                    if not future.cancelled():
+                        future.set_exception(error)
+                continue
+            for (_, future), result in zip(batch, results, strict=True):
+                if not future.cancelled():
+                    future.set_result(result)
+        self._task = None
 
 
 @_verb("report", ReportBatch, ReportAnswer, 404)
