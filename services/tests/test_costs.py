@@ -10,12 +10,12 @@ from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, prioritise_job
 from stickslip_services.queue.eta import KEPT_RUNS, MEASURED, TIMES, Cost, StageTimings, limit_seconds
-from stickslip_services.queue.lease import heartbeat, lease_tasks
+from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import sweep
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
-from stickslip_testing.worker import PretendWorker, failure, rejection
+from stickslip_testing.worker import PretendWorker, failure, heartbeat, rejection
 
 pytestmark = pytest.mark.databases(slow=True)
 

@@ -181,8 +181,7 @@ def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one
     made(context, receiver.url)
     run_job(context, worker, 1.0)
     other = WebhookDelivery(context.database, context.clock, sealer(context.settings))
-    with messenger._claimed(1) as is_ours:  # and here it is killed
-        assert is_ours
+    assert messenger._claim(1)  # and here it is killed
     other.run()
     assert receiver.received == []
     clock.advance(CLAIM_SECONDS)
@@ -191,6 +190,34 @@ def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one
         thread.start()
     for thread in threads:
         thread.join()
+    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+
+
+@pytest.mark.parametrize(("stopped", "wait"), [(False, WAITS[0]), (True, 0.0)])
+def test_a_delivery_that_ends_in_its_middle_is_tried_again_without_the_wait_of_its_claim(
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    receiver: Receiver,
+    monkeypatch: pytest.MonkeyPatch,
+    stopped: bool,
+    wait: float,
+) -> None:
+    made(context, receiver.url)
+    run_job(context, worker, 1.0)
+    messenger = WebhookDelivery(context.database, context.clock, sealer(context.settings))
+    if stopped:
+        messenger.stop()
+    else:
+        monkeypatch.setattr(messenger, "_deliver_one", lambda _seq: 1 / 0)
+        monkeypatch.setattr(threading, "excepthook", lambda _error: None)
+    messenger.run()
+    other = WebhookDelivery(context.database, context.clock, sealer(context.settings))
+    if wait:
+        other.run()
+        assert receiver.received == []
+    clock.advance(wait)
+    other.run()
     assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
 
 

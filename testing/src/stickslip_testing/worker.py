@@ -25,6 +25,7 @@ from stickslip_schemas.documents.tasks import (
 )
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
+    HeartbeatAnswer,
     Lease,
     LeaseRequest,
     LeaseState,
@@ -51,7 +52,7 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.lease import heartbeat, lease_tasks, register_worker
+from stickslip_services.queue.lease import lease_tasks, register_worker, renew_leases, sort_out
 from stickslip_services.queue.report import report_results
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
@@ -68,6 +69,12 @@ def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed")
 def rejection(message: str = "it diverged") -> TaskResult:
     """Return the result of a rejected sample."""
     return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
+
+
+def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
+    """Answer a heartbeat alone."""
+    (left,) = renew_leases(context, [message])
+    return HeartbeatAnswer(drop=()) if left is None else sort_out(context, message, left)
 
 
 class DirectApi:

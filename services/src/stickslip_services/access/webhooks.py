@@ -12,8 +12,6 @@ import secrets
 import threading
 import time
 from base64 import b64encode
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -158,33 +156,35 @@ class WebhookDelivery:
         for thread in threads:
             thread.join(max(0.0, end - time.monotonic()))
 
-    def _deliver(self, seq: int) -> None:
-        """Deliver the messages of a webhook, unless another coordinator or thread does so."""
-        with self._claimed(seq) as is_ours:
-            while is_ours and not self._stopping.is_set() and self._deliver_one(seq):
-                pass
-
-    @contextmanager
-    def _claimed(self, seq: int) -> Iterator[bool]:
-        """Claim a webhook for this coordinator; yield False where another one has it."""
-        until = self._clock() + CLAIM_SECONDS
+    def _claim(self, seq: int) -> bool:
+        """Claim a webhook; return False where another coordinator or thread has it."""
+        due = and_(webhooks.c.seq == seq, _is_due(self._clock()))
+        claim = update(webhooks).where(due).values(next_at=self._clock() + CLAIM_SECONDS)
         with self._database.write() as connection:
-            due = and_(webhooks.c.seq == seq, _is_due(self._clock()))
-            is_ours = connection.execute(update(webhooks).where(due).values(next_at=until)).rowcount == 1
-        yield is_ours
+            return connection.execute(claim).rowcount == 1
 
-    def _deliver_one(self, seq: int) -> bool:
-        """Deliver the next message of a webhook; return whether another one may be sent at once."""
+    def _deliver(self, seq: int) -> None:
+        """Deliver the messages of a webhook, and give its claim back, however that ends."""
+        if not self._claim(seq):
+            return
+        wait: float | None = None
+        try:
+            while wait is None and not self._stopping.is_set():
+                wait = WAITS[0]  # where it raises
+                wait = self._deliver_one(seq)
+        finally:
+            with self._database.write() as connection:
+                place = update(webhooks).where(webhooks.c.seq == seq)
+                connection.execute(place.values(next_at=self._clock() + (wait or 0.0)))
+
+    def _deliver_one(self, seq: int) -> float | None:
+        """Deliver the next message of a webhook; return the wait before the next try [s], None for another message."""
         with self._database.read() as connection:
             row = connection.execute(select(webhooks).where(webhooks.c.seq == seq)).one_or_none()
             message = None if row is None else _next_message(connection, seq)
-        if row is None:
-            return False
+        if row is None or message is None:
+            return 0.0
         place = update(webhooks).where(webhooks.c.seq == seq)
-        if message is None:
-            with self._database.write() as connection:
-                connection.execute(place.values(next_at=self._clock()))
-            return False
         event, body = message
         try:
             secret = self._sealing.decrypt(row.secret.encode()).decode()
@@ -196,13 +196,13 @@ class WebhookDelivery:
             told = {"position": event, "failures": 0, "failing_since": None, "fault": ""}
             with self._database.write() as connection:
                 connection.execute(place.values(told | {"next_at": now + CLAIM_SECONDS}))
-            return True
+            return None
         wait = WAITS[min(row.failures, len(WAITS) - 1)]
         logger.warning("webhook %s: %s; it is tried again in %g s", row.id, fault, wait)
         failed = {"failures": row.failures + 1, "failing_since": func.coalesce(webhooks.c.failing_since, now)}
         with self._database.write() as connection:
-            connection.execute(place.values(failed | {"fault": fault, "next_at": now + wait}))
-        return False
+            connection.execute(place.values(failed | {"fault": fault}))
+        return wait
 
 
 def _is_due(now: float) -> ColumnElement[bool]:

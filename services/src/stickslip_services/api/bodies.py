@@ -42,21 +42,31 @@ class JsonBody(Generic[T]):
         return await whole_body(request)
 
     def read(self, body: bytes) -> T:
-        """Return the document in a body; raise ProblemError."""
+        """Return the document in a body, JSON [RFC 8259] in UTF-8 without duplicate keys; raise ProblemError."""
         strange: list[str] = []
-        document = parse_json(body, strange)
+
+        def number(text: str) -> float:
+            value = float(text)
+            if not isfinite(value):
+                strange.append(text)
+            return value
+
         try:
+            text = body.decode("utf-8")
+            document = json.loads(text, object_pairs_hook=_no_key_twice, parse_float=number, parse_constant=number)
+            if "\\u" in text:
+                json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
             valid = self._adapter.validate_python(document)
             if strange:  # models refuse NaN with its place; this covers free-form parts
-                raise ValueError(f"{strange[0][:100]} is no number")
+                raise ValueError(f"{strange[0]} is no number")
             return valid
         except ValidationError as error:
             fields = field_errors(error, document, self._of, at_most=SHOWN_ERRORS)
             count = error.error_count()
         except RecursionError as error:
             raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
-        except ValueError as error:
-            raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}") from error
+        except ValueError as error:  # also bytes that are not UTF-8, and integers of more than 4300 digits
+            raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}"[:500]) from error
         detail = "; ".join(f"{field.pointer or 'the document'}: {field.rule}" for field in fields[:3])
         more = f" (and {count - 3} more)" if count > 3 else ""
         raise ProblemError(422, ProblemCode.validation_failed, detail + more, fields=fields)
@@ -68,27 +78,6 @@ async def whole_body(request: Request) -> bytes:
         return await request.body()
     except ClientDisconnect as error:
         raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
-
-
-def parse_json(body: bytes, strange: list[str]) -> Any:
-    """Parse JSON [RFC 8259]: UTF-8, no duplicate keys; raise ProblemError. Add NaN and infinities to `strange`."""
-
-    def number(text: str) -> float:
-        value = float(text)
-        if not isfinite(value):
-            strange.append(text)
-        return value
-
-    try:
-        text = body.decode("utf-8")
-        document = json.loads(text, object_pairs_hook=_no_key_twice, parse_float=number, parse_constant=number)
-        if "\\u" in text:
-            json.dumps(document, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
-    except RecursionError as error:
-        raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
-    except ValueError as error:  # also bytes that are not UTF-8, and integers of more than 4300 digits
-        raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}"[:500]) from error
-    return document
 
 
 def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from stickslip_schemas.documents.worker_api import (
     WorkerSession,
 )
 
-from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
@@ -33,7 +32,6 @@ from stickslip_services.queue.grants import Grant, grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.ledger import (
-    HELD_COLUMNS,
     RUNNABLE,
     HeldTask,
     Ledger,
@@ -49,7 +47,6 @@ from stickslip_services.queue.workers import (
     RegisteredWorker,
     find_worker,
     insert_worker,
-    is_silent,
     note_heard,
     note_seen,
     note_stranded,
@@ -81,9 +78,6 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         waiting = ready or has_runnable_job(connection)
     if due:
         take_back(context)
-    if is_silent(context, worker):
-        with context.database.touch() as connection:
-            note_seen(connection, worker.id, context.clock())
     if context.store_watch.trouble:
         return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
     if not (ready or due):
@@ -98,12 +92,6 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         _mend(context, worker.id, damaged)
     context.sections |= {lease.task_id: lease.task.sections for lease in leases if isinstance(lease.task, PublishTask)}
     return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
-
-
-def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
-    """Renew a worker's leases, and return the tasks that it must drop; raise UnknownWorkerError."""
-    (left,) = renew_leases(context, [message])
-    return HeartbeatAnswer(drop=()) if left is None else sort_out(context, message, left)
 
 
 def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[LeaseState] | None]:
@@ -151,11 +139,22 @@ def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -
     with context.ledger() as book:
         worker = find_worker(book.connection, message.worker_id)
         note_seen(book.connection, worker.id, book.now, message.condition)
-        drop = _start_or_drop(book, worker, left)
+        held = {(task.key, task.token): task for task in find_held(book, [worker.id])}
+        names = [(lease, (task_key(lease.task_id), lease.token)) for lease in left]
+        mine = [(lease, held[name]) for lease, name in names if name in held]
+        unneeded = _unneeded(book, mine)
+        cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
+        halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
+        for _, task in mine:
+            if task.seq in halted:
+                release(book, task, TaskState.pending)
+        started = [task for lease, task in mine if lease.started and task.state is TaskState.leased]
+        start_tasks(book, [(task.seq, task.stage) for task in started if task.seq not in unneeded | halted])
         listed = {task_key(lease.task_id) for lease in message.leases}
-        unlisted = [task for task in find_held(book, [worker.id], expired=True) if task.key not in listed]
+        unlisted = [task for task in held.values() if task.key not in listed and task.expires_at <= book.now]
         lose(book, unlisted, context.settings, message=f"worker {worker.name} does not know of it")
-    return HeartbeatAnswer(drop=drop)
+    drop = [lease.task_id for lease, name in names if name not in held or held[name].seq in unneeded | halted]
+    return HeartbeatAnswer(drop=tuple(drop))
 
 
 _RUNNABLE_JOB = (
@@ -220,36 +219,6 @@ def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -
         fail_tries(book, [(replace(task, state=TaskState.running), *why) for task in held], context.settings)
         for task in held:
             mend(book, task.seq, damaged[task.seq])
-
-
-def _start_or_drop(book: Ledger, worker: RegisteredWorker, held: Sequence[LeaseState]) -> tuple[str, ...]:
-    """Note which tasks have been started, and return the tasks that the worker must drop."""
-    drop: list[str] = []
-    mine: list[tuple[LeaseState, HeldTask]] = []
-    keys = {state.task_id: task_key(state.task_id) for state in held}
-    columns = (*HELD_COLUMNS, tasks.c.token, tasks.c.owner)
-    rows = {
-        row.key: row
-        for batch in batches(key for key in keys.values() if key is not None)
-        for row in book.connection.execute(select(*columns).where(tasks.c.key.in_(batch)))
-    }
-    for lease in held:
-        row = rows.get(keys[lease.task_id] or b"")
-        if row is None or row.owner != worker.id or row.token != lease.token or worker.superseded:
-            drop.append(lease.task_id)
-        else:
-            mine.append((lease, HeldTask.of(row)))
-    unneeded = _unneeded(book, mine)
-    cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
-    halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
-    for _, task in mine:
-        if task.seq in halted:
-            release(book, task, TaskState.pending)
-    drop.extend(lease.task_id for lease, task in mine if task.seq in unneeded | halted)
-    kept = [(lease, task) for lease, task in mine if task.seq not in unneeded | halted]
-    started = [task for lease, task in kept if lease.started and task.state is TaskState.leased]
-    start_tasks(book, [(task.seq, task.stage) for task in started])
-    return tuple(drop)
 
 
 def renew_all_leases(connection: Connection, now: float, lease_seconds: float) -> None:

@@ -84,11 +84,14 @@ class HeldTask:
     state: TaskState
     tries: int
     losses: int
+    token: int
+    expires_at: float
 
     @classmethod
     def of(cls, row: Any) -> Self:
         """Return the task of a row of `tasks`."""
-        return cls(row.seq, row.key, Stage(row.stage), TaskState(row.state), row.tries, row.losses)
+        rest = row.tries, row.losses, row.token, row.expires_at
+        return cls(row.seq, row.key, Stage(row.stage), TaskState(row.state), *rest)
 
 
 HELD_COLUMNS = [tasks.c[field.name] for field in fields(HeldTask)]

@@ -34,12 +34,10 @@ from stickslip_services.queue.ledger import (
 from stickslip_services.settings import Settings
 
 
-def find_held(book: Ledger, owners: Sequence[str], *, expired: bool = False) -> list[HeldTask]:
-    """Return the leased tasks of `owners`; with `expired` those that have been leased for the duration of a lease."""
-    query = select(*HELD_COLUMNS).where(text("tasks.owner IS NOT NULL"), tasks.c.owner.in_(owners))
-    if expired:
-        query = query.where(tasks.c.expires_at <= book.now)
-    return [HeldTask.of(row) for row in book.connection.execute(query)]
+def find_held(book: Ledger, owners: Sequence[str]) -> list[HeldTask]:
+    """Return the leased tasks of workers."""
+    held = text("tasks.owner IS NOT NULL"), tasks.c.owner.in_(owners)  # in the words of the partial index
+    return [HeldTask.of(row) for row in book.connection.execute(select(*HELD_COLUMNS).where(*held))]
 
 
 def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:

@@ -138,17 +138,10 @@ def note_heard(connection: Connection, ids: Collection[str], now: float) -> dict
     return {worker: WorkerCondition.model_validate_json(condition) for worker, condition in rows}
 
 
-def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition | None = None) -> None:
-    """Store the time of a worker's last message, and how it is where that has changed."""
-    values: dict[str, Any] = {"last_seen_at": now}
-    if condition is not None:
-        values["condition"] = condition.model_dump_json()
+def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition) -> None:
+    """Store the time of a worker's last heartbeat, and how it is."""
+    values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
-
-
-def is_silent(context: Context, worker: RegisteredWorker) -> bool:
-    """Return whether a worker's last message is older than a quarter of a lease."""
-    return context.clock() - worker.last_seen_at > context.settings.lease_seconds / 4
 
 
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from inspect import iscoroutinefunction
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
@@ -32,8 +33,6 @@ T = TypeVar("T")
 U = TypeVar("U")
 _Route = TypeVar("_Route", bound=Callable[..., Any])
 
-router = APIRouter()
-
 MOST_ON_LOOP = 64 * 2**10
 """Heartbeats of at most so many bytes are read by the event loop, in 2 ms; longer ones by a thread."""
 MOST_TOGETHER = 64
@@ -45,30 +44,24 @@ _REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
 
 
 class _Plain(APIRoute):
-    """A route whose function takes the request and returns the response: FastAPI resolves nothing for it."""
+    """A route for which FastAPI resolves nothing if its function is asynchronous: that takes the request itself."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        handler: Callable[[Request], Coroutine[Any, Any, Response]] = self.endpoint
-        return handler
+        return self.endpoint if iscoroutinefunction(self.endpoint) else super().get_route_handler()
+
+
+router = APIRouter(route_class=_Plain)
 
 
 def _verb(name: str, document: type[BaseModel], answer: type[BaseModel], *refusals: int) -> Callable[[_Route], _Route]:
     """Return the decorator of a route that workers post a document to."""
-
-    def add(endpoint: _Route) -> _Route:
-        router.add_api_route(
-            f"/v1/worker/{name}",
-            endpoint,
-            methods=["POST"],
-            tags=["workers"],
-            response_model=answer,
-            responses=problem_responses(*refusals, *BODY_PROBLEMS),
-            openapi_extra=body_schema(document.__name__) | KEYED,
-            route_class_override=_Plain,
-        )
-        return endpoint
-
-    return add
+    return router.post(
+        f"/v1/worker/{name}",
+        tags=["workers"],
+        response_model=answer,
+        responses=problem_responses(*refusals, *BODY_PROBLEMS),
+        openapi_extra=body_schema(document.__name__) | KEYED,
+    )
 
 
 @router.get("/v1/workers", tags=["workers"], responses=problem_responses())
