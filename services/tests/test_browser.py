@@ -93,7 +93,7 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
         for upload in uploads
     ]
-    shown = [page for clip in clips for page in (clip, f"{clip}/samples/1")]
+    shown = [page for clip in clips for page in (clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")]
     return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs", *shown]
 
 
@@ -256,6 +256,19 @@ def test_a_sample_in_space_turns_and_follows_the_cursor(browser: Any, url: str, 
     seen.append(canvas.screenshot())
     assert len(set(seen)) == len(seen)
     assert "Cells of the floor" in page.locator(".space .scale").inner_text()
+    page.close()
+
+
+def test_two_samples_share_the_cursor_and_the_layer(browser: Any, url: str, paths: list[str]) -> None:
+    page = browser.new_page()
+    page.goto(url + next(path for path in paths if "?beside=" in path))
+    page.locator("select").select_option("depth")
+    page.locator(".time").focus()
+    page.keyboard.press("End")
+    shown = [image.get_attribute("src") for image in page.locator(".clip > img").all()]
+    assert [source.rpartition("samples")[2] for source in shown] == ["/0/depth/4.png", "/1/depth/4.png"]
+    assert page.locator(".mp4").first.get_attribute("href").endswith("/samples/0/depth.mp4")
+    assert page.locator(".space[data-drawn]").count() == 2
     page.close()
 
 

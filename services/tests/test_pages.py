@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import yaml
 from fastapi import FastAPI
 from PIL import Image
 from stickslip_schemas.base.states import JobState
@@ -21,7 +22,7 @@ from stickslip_services.pages.plots import plot, table
 from stickslip_services.pages.rendering import _environment
 from stickslip_services.queue.sweep import sweep
 from stickslip_services.settings import Settings
-from stickslip_testing.jobs import ManualClock, rods, show_job
+from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 
@@ -40,6 +41,9 @@ def client(app: FastAPI) -> Iterator[httpx.Client]:
 @pytest.fixture
 def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
     return PretendWorker(DirectApi(app.state.context), app.state.context.store, whole=True).register()
+
+
+GAMMA = [1.0, 2.0, 3.0]
 
 
 def submit(client: httpx.Client, **spec: Any) -> str:
@@ -69,7 +73,7 @@ def test_empty_pages_say_what_to_do(client: httpx.Client) -> None:
 
 
 def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker) -> None:
-    job = submit(client, name="first", gamma=[1.0, 2.0, 3.0])
+    job = submit(client, name="first", gamma=GAMMA)
     assert "first" in read(client, "/")
     leases = worker.lease(simulate=1)
     worker.start(*leases)
@@ -111,10 +115,17 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     motion = client.get(f"/ui{path[0]}/samples/3/motion.json").json()
     (rod,) = motion["sheets"]
     assert (np.shape(rod["points"]), motion["bodies"], motion["holders"]) == ((1, 450), [], [])
+    both = read(client, f"{path[0]}/samples/3?beside=1")
+    assert "Sample 3 and sample 1" in both
+    assert both.count("motion.json") == both.count("data-plot=") == 2
+    assert "Labels that differ" in both
+    assert '/files/views/c/1/0/0/0/0" download' in both
+    assert parsed(yaml.safe_load(client.get(f"/ui{path[0]}/spec.yaml").text)) == parsed(rods(name="first", gamma=GAMMA))
+    assert client.get(f"{path[0]}/samples/3?beside=99").status_code == 404
     assert client.get(f"/ui{path[0]}/samples/99/motion.json").status_code == 404
     for missing in ("samples/99", "samples/-1"):
         assert client.get(f"{path[0]}/{missing}").status_code == 404
-    for missing in ("3/nothing/0.png", "3/views/9.png", "3/energy/0.png"):
+    for missing in ("3/nothing/0.png", "3/views/9.png", "3/views.mp4", "3/energy/0.png"):
         assert client.get(f"/ui{path[0]}/samples/{missing}").status_code == 404
     assert read(client, re.sub("/v1$", "", path[0])) == dataset
 
@@ -140,7 +151,9 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     assert "option selected>train" in read(client, f"{path[0]}?split=train")
     assert "gamma 2, phi1 1: 1 of 1 done<" in dataset
     assert "it fell &lt;b&gt;off&lt;/b&gt;" in dataset
-    assert "This sample was rejected: solver diverged" in read(client, f"{path[0]}/samples/0")
+    assert "Sample 0 was rejected: solver diverged" in read(client, f"{path[0]}/samples/0")
+    beside = read(client, f"{path[0]}/samples/0?beside=3")
+    assert ("Sample 0 was rejected" in beside, beside.count("motion.json")) == (True, 1)
 
 
 def test_what_failed_is_shown_with_its_reproducer(

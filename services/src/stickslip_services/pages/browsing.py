@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.states import TaskState
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, solver_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.plan.grid import columns_of
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
+from stickslip_services.pages.grid_map import grid_maps
 from stickslip_services.pages.motion import is_path
 from stickslip_services.pages.plots import plot, table
 from stickslip_services.pages.sample_data import SampleData
@@ -81,12 +80,9 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
 
 def losses(data: SampleData) -> dict[str, Any]:
     """Return the context of the rejected samples: the first of them, and maps of where they are in the grid."""
-    spec, lost = data.manifest.spec, data.rejections(MOST_SAMPLES)
-    maps = None
-    if lost and spec.sample_count <= MOST_SAMPLES:
-        states = [TaskState.rejected if slot in lost else TaskState.succeeded for slot in range(spec.sample_count)]
-        maps = grid_maps(spec, states)
-    return {"lost": list(lost.values())[:SHOWN_THUMBS], "maps": maps, "count": spec.sample_count}
+    spec, valid = data.manifest.spec, data.label("valid").astype(bool)
+    first = [data.rejection(slot) for slot in np.flatnonzero(~valid)[:SHOWN_THUMBS].tolist()]
+    return {"lost": first, "maps": grid_maps(spec, valid, ~valid) if first else [], "count": spec.sample_count}
 
 
 def _pictured(data: SampleData) -> str | None:
@@ -145,6 +141,8 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
     timed = [array for array in data.arrays.values() if array.dimensions[:1] == ("instant",)]
     frames = list(range(data.arrays[layers[0]].shape[0])) if layers else []
     return {
+        "slot": slot,
+        "shard": _shard(data, slot),
         "pictures": pictures,
         "layers": layers,
         "frames": data.arrays[layers[0]].attributes.get("instants", frames) if layers else [],
@@ -155,6 +153,12 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         "has_contact": any(name.endswith(".contact") for name in data.arrays),
         "groups": {title: labels for title, labels in groups.items() if labels},
     }
+
+
+def _shard(data: SampleData, slot: int) -> str:
+    """Return the path of the file with the sample's pictures or, without any, the first of its arrays."""
+    array = data.arrays[_pictured(data) or next(iter(data.arrays))]
+    return array.shard_path(slot // data.manifest.samples_per_file(array))
 
 
 def groups_of(data: SampleData) -> dict[str, str]:

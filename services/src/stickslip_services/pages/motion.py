@@ -8,7 +8,6 @@ import numpy.typing as npt
 from stickslip_schemas.kinds.cloth.drag_scene import DragSceneSpec
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.files import with_arrays
-from stickslip_schemas.scene.sheets import Holder
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_services.pages.sample_data import SampleData
@@ -20,9 +19,6 @@ LEAST_INSTANTS = 20
 
 UNIT = 1e-4
 """Of the coordinates, which are whole numbers: of 1 m, or of the length of a rod."""
-
-JAWS = (0.01, 0.01, 0.01)
-"""By how much a holder is larger than what it holds, and the size of one that is not recorded [m]."""
 
 Floats = npt.NDArray[np.float64]
 
@@ -112,33 +108,17 @@ def deformed(file: Mapping[str, Any], strength: float, times: Floats) -> Floats:
 
 
 def _holders(data: SampleData, slot: int, tracks: Mapping[str, Floats]) -> list[dict[str, Any]]:
-    """Return the boxes of holders, their poses (instant, 3, 4), and whether they hold (instant)."""
+    """Return the poses of holders (instant, 3, 4), and whether they hold (instant)."""
     spec = data.manifest.spec
     if isinstance(spec, DragSceneSpec):  # at both corners of the upper edge
         rest, (track,) = np.asarray(data.read("rest", slot), dtype=float), tracks.values()
         corners = [np.argmax(rest @ direction) for direction in ((-1, 1), (1, 1))]
         still = np.broadcast_to(np.eye(3), (len(track), 3, 3))
         at = [np.concatenate([still, track[:, corner, :, None]], axis=2) for corner in corners]
-        return [{"size": JAWS, "poses": poses, "holds": np.ones(len(track), int)} for poses in at]
+        return [{"poses": poses, "holds": np.ones(len(track), int)} for poses in at]
     if not isinstance(spec, ClothSceneSpec) or "holder_pose" not in data.arrays:
         return []
     poses, holds = (np.asarray(data.read(name, slot)) for name in ("holder_pose", "grasped"))
-    found = []
-    for number, (sheet, name) in enumerate(spec.stage.holders):
-        held = _held(spec.stage.sheets[sheet].holders[name], np.asarray(data.read(f"{sheet}.rest", slot), dtype=float))
-        if held is not None:
-            size = (np.append(np.ptp(held, axis=0), 0.0) + JAWS).tolist()
-            found.append({"size": size, "poses": poses[:, number], "holds": holds[:, number]})
-    return found
-
-
-def _held(holder: Holder, rest: Floats) -> Floats | None:
-    """Return the part of a flat sheet (vertex, uv) [m] that a holder holds, None of a rim."""
-    if holder.vertices is not None:
-        return rest[list(holder.vertices)]
-    if holder.edge is not None:
-        axis, sign = {"left": (0, -1), "right": (0, 1), "bottom": (1, -1), "top": (1, 1)}[holder.edge]
-        along = sign * rest[:, axis]
-        held: Floats = rest[np.isclose(along, along.max())]
-        return held
-    return None if holder.low is None else np.array([holder.low, holder.high], dtype=float)
+    all_ = [spec.stage.sheets[sheet].holders[name] for sheet, name in spec.stage.holders]
+    grips = [number for number, holder in enumerate(all_) if holder.rim is None]  # a rim has no one place
+    return [{"poses": poses[:, number], "holds": holds[:, number]} for number in grips]

@@ -6,7 +6,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.units import duration, size
 
@@ -37,6 +39,15 @@ def _environment() -> Environment:
         "words": words,
     }
     return made
+
+
+def spec_text(spec: JobSpec) -> str:
+    """Return a spec as YAML, with short forms of its axes: a list, or the only value."""
+    document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
+    for name, axis in document["axes"].items():
+        if axis["type"] == "list":
+            document["axes"][name] = axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
 
 
 def fine_duration(seconds: float | None) -> str:

@@ -41,13 +41,6 @@ class SampleData:
         columns = [_column(self.store, file.sha256, array, size) for file in files]
         return np.concatenate(columns)[: self.manifest.sample_count]
 
-    def rejections(self, until: int) -> dict[int, Rejection]:
-        """Return the rejected samples among the slots before `until`."""
-        found: dict[int, Rejection] = {}
-        for number in range(self.contents.number_of(min(until, self.manifest.sample_count) - 1) + 1):
-            found |= {rejection.slot: rejection for rejection in self.contents.section(number).rejections}
-        return found
-
     def rejection(self, slot: int) -> Rejection | None:
         """Return the rejection of a sample, None for a valid one."""
         rejections = self.contents.section(self.contents.number_of(slot)).rejections

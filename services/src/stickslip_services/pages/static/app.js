@@ -63,18 +63,22 @@ function drawPlot(figure) {
 // One cursor of time, an instant of the record, runs through the clip, its ground truth, the view in space and the curves.
 function showSample(view) {
   const slider = view.querySelector(".time"), play = view.querySelector(".play"), output = view.querySelector("output");
-  const image = view.querySelector(".clip > img"), layer = view.querySelector("select");
+  const clips = [...view.querySelectorAll("[data-root]")], layer = view.querySelector("select");
   const instants = JSON.parse(view.dataset.frames);
   let frames = [];
-  const load = () => { frames = instants.map((_, i) => Object.assign(new Image(), { src: `${view.dataset.root}${layer.value}/${i}.png` })); };
+  const load = () => {
+    frames = clips.map(({ dataset }) => instants.map((_, i) => Object.assign(new Image(), { src: `${dataset.root}${layer.value}/${i}.png` })));
+    for (const link of view.querySelectorAll(".mp4")) link.href = `${link.parentElement.dataset.root}${layer.value}.mp4`;
+  };
   const show = () => {
     const now = slider ? +slider.value : 0;
     if (output) output.textContent = +view.dataset.rate ? `${(now / view.dataset.rate).toFixed(2)} s` : `frame ${now + 1}`;
-    if (image) image.src = frames[Math.max(0, instants.findLastIndex((instant) => instant <= now))].src;
+    const frame = Math.max(0, instants.findLastIndex((instant) => instant <= now));
+    if (layer) clips.forEach((clip, i) => { clip.querySelector("img").src = frames[i][frame].src; });
     view.dispatchEvent(new CustomEvent("instant", { detail: now }));
   };
-  if (image) load();
-  if (layer) layer.addEventListener("change", () => { load(); show(); });
+  if (layer) load();
+  layer?.addEventListener("change", () => { load(); show(); });
   if (slider) {
     let timer = null;
     const stride = Math.max(1, Math.round(slider.max / 60));

@@ -50,10 +50,11 @@ async function show(figure) {
   const corners = (step) => Array.from({ length: step.length / 3 }, (_, i) => new three.Vector3().fromArray(step, 3 * i).multiplyScalar(motion.unit));
   const box = new three.Box3().setFromPoints(motion.sheets.flatMap((sheet) => sheet.points.flatMap(corners)));
   const extent = box.getSize(new three.Vector3()).length(), middle = box.getCenter(new three.Vector3());
+  const grip = () => new three.BoxGeometry(0.03 * extent, 0.03 * extent, 0.03 * extent);
   for (const sheet of motion.sheets) {
     if (!sheet.triangles) { // a rod, with its clamp
       solid(new three.TubeGeometry(new three.CatmullRomCurve3(corners(sheet.points[0])), 300, 0.008), "--accent");
-      solid(new three.BoxGeometry(0.02, 0.02, 0.02), "--holder").position.copy(corners(sheet.points[0])[0]);
+      solid(grip(), "--holder").position.copy(corners(sheet.points[0])[0]);
       continue;
     }
     const geometry = shape(sheet), cloth = solid(geometry, sheet.contact ? "--white" : "--open");
@@ -88,8 +89,8 @@ async function show(figure) {
       solid(geometry, "--body", body.poses);
     }
   }
-  for (const { size, poses, holds } of motion.holders) {
-    const jaws = solid(new three.BoxGeometry(...size), "--holder", poses);
+  for (const { poses, holds } of motion.holders) {
+    const jaws = solid(grip(), "--holder", poses);
     moves.push((step) => { jaws.visible = Boolean(holds[step][0]); });
   }
 

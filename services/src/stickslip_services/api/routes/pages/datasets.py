@@ -2,6 +2,7 @@
 
 import json
 from functools import lru_cache
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -18,7 +19,9 @@ from stickslip_services.catalog.datasets import find_dataset, find_version, list
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import coloured, histograms, losses, sample_view, sliders, thumbs
+from stickslip_services.pages.films import mp4
 from stickslip_services.pages.motion import motion
+from stickslip_services.pages.rendering import spec_text
 from stickslip_services.pages.sample_data import SampleData
 from stickslip_services.queue.context import Context
 
@@ -100,23 +103,47 @@ def _sample_data(store: Store, manifest: str) -> SampleData:
 
 
 @router.get("/datasets/{dataset}/v{version}/samples/{slot}")
-def get_sample(dataset: str, version: Version, slot: int, context: ContextDep) -> Response:
-    """Show the pictures, curves, shapes and labels of a sample."""
+def get_sample(
+    dataset: str, version: Version, slot: int, context: ContextDep, beside: Annotated[str, Query(max_length=20)] = ""
+) -> Response:
+    """Show the pictures, curves, shapes and labels of a sample, or of two samples side by side."""
     found, committed, data = _open(context, dataset, version)
-    manifest = data.manifest
-    if not 0 <= slot < manifest.sample_count:
-        raise NotFoundError(f"version {version} of {dataset} has slots 0 to {manifest.sample_count - 1}, not {slot}")
-    rejection = data.rejection(slot)
+    last = data.manifest.sample_count - 1
+    slots = [slot, *([int(beside)] if beside.isdecimal() else [])]
+    if not all(0 <= each <= last for each in slots):
+        raise NotFoundError(f"version {version} of {dataset} has slots 0 to {last}, not {', '.join(map(str, slots))}")
+    rejections = {each: rejection for each in slots if (rejection := data.rejection(each))}
     return html_page(
         "sample.html",
         here="datasets",
         dataset=found,
         version=committed,
         slot=slot,
-        last_slot=manifest.sample_count - 1,
-        rejection=rejection,
-        **({} if rejection else sample_view(data, slot)),
+        last_slot=last,
+        rejections=rejections.values(),
+        shown=[sample_view(data, each) for each in slots if each not in rejections],
+        has_mp4=find_spec("av") is not None,
     )
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.mp4")
+def get_film(
+    dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, context: ContextDep
+) -> Response:
+    """Return a clip, or its ground truth, as MP4 with 10 frames a second."""
+    _, _, data = _open(context, dataset, version)
+    values = _value(data, array, slot)
+    if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
+        raise NotFoundError(f"{array[:50]} is no clip")
+    frames = [coloured(data.arrays[array], values, index) for index in range(len(values))]
+    return Response(mp4(frames), media_type="video/mp4")
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
+def get_spec(dataset: str, version: Version, context: ContextDep) -> Response:
+    """Return the spec of a version as YAML."""
+    _, _, data = _open(context, dataset, version)
+    return Response(spec_text(data.manifest.spec), media_type="application/yaml")
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")

@@ -5,21 +5,21 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
-import yaml
+import numpy as np
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.grid_map import MOST_SAMPLES, grid_maps
+from stickslip_services.pages.grid_map import grid_maps
+from stickslip_services.pages.rendering import spec_text
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job
 from stickslip_services.queue.jobs import (
@@ -40,6 +40,11 @@ router = APIRouter()
 SHOWN_JOBS = 50
 
 SHOWN_LOST = 50
+
+MOST_SAMPLES = 20_000
+"""Larger grids have no map, because reading the states of so many samples takes seconds."""
+
+LOST = (TaskState.rejected, TaskState.failed)
 
 CHANGE_SECONDS = 1.0
 """Least time between two updates of a page [s]."""
@@ -92,18 +97,7 @@ def get_job(job_id: str, context: ContextDep) -> Response:
     """Show a job."""
     with context.database.read() as connection:
         values = _job(context, connection, job_id)
-    spec: JobSpec = values["job"].spec
-    document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
-    document["axes"] = {name: _short_form(axis) for name, axis in document["axes"].items()}
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    return html_page("job.html", here="jobs", spec=text, **values)
-
-
-def _short_form(axis: dict[str, Any]) -> Any:
-    """Return an axis in its short form: a list, or its only value."""
-    if axis["type"] != "list":
-        return axis
-    return axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
+    return html_page("job.html", here="jobs", spec=spec_text(values["job"].spec), **values)
 
 
 @router.get("/ui/jobs/{job_id}")
@@ -147,9 +141,9 @@ def get_job_map(job_id: str, context: ContextDep) -> Response:
         samples = list_samples(connection, row.seq, PageRequest(MOST_SAMPLES, None), None).items
     if len(samples) < spec.sample_count:
         return html_page("map.html", maps=[], count=spec.sample_count)
-    return html_page(
-        "map.html", maps=grid_maps(spec, [sample.state for sample in samples], most=3), count=spec.sample_count
-    )
+    states = [[sample.state in of for sample in samples] for of in ((TaskState.succeeded,), LOST)]
+    maps = grid_maps(spec, *(np.array(flags) for flags in states), most=3)
+    return html_page("map.html", maps=maps, count=spec.sample_count)
 
 
 @router.post("/ui/jobs/{job_id}/{verb}")
