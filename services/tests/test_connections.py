@@ -138,3 +138,13 @@ def test_too_many_connections_are_refused(quick: str, monkeypatch: pytest.Monkey
         connection.close()
     time.sleep(0.2)
     assert httpx.get(f"{quick}/v1/jobs", trust_env=False).status_code == 200
+
+
+def test_idle_connections_are_kept_longer_than_clients_keep_them(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With equal times, a request now and then meets a connection that is being closed, and fails."""
+    assert connections.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
+    monkeypatch.setattr(connections, "IDLE_SECONDS", 0.3)
+    begin = time.monotonic()
+    with connect(quick, b"GET /readyz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") as connection:
+        assert answer(connection).startswith(b"HTTP/1.1 200")  # and then the end
+    assert time.monotonic() - begin < 4  # uvicorn's own limit is 5 s

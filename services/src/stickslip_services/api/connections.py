@@ -20,6 +20,10 @@ LEAST_RATE = 64 * 2**10
 """...plus the time that its bytes take at this rate [bytes/s]."""
 MOST_CONNECTIONS = 4000
 
+IDLE_SECONDS = 15.0
+"""A connection without a request is closed after so long [s]. Clients close theirs earlier, httpx after 5 s: where both
+wait equally long, a request may meet a connection that is just being closed, and fails."""
+
 
 class PatientProtocol(H11Protocol):
     """HTTP/1.1 with limits on the duration of requests."""
@@ -30,6 +34,7 @@ class PatientProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept a connection, or refuse it where there are too many."""
+        self.timeout_keep_alive = IDLE_SECONDS  # type: ignore[assignment]
         super().connection_made(transport)
         if len(self.connections) > MOST_CONNECTIONS:
             self._refuse(503, ProblemCode.busy, f"there are more than {MOST_CONNECTIONS} connections; try again later")
