@@ -160,7 +160,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
         patch.setenv("PYTHONPATH", HERE, prepend=os.pathsep)
         with subprocess.Popen([sys.executable, "-c", command], stdout=subprocess.DEVNULL) as head:
             try:
-                place = Connected(None, directory)
+                place = Connected(directory)
                 Place.connect(place)
                 yield place
             finally:

@@ -10,17 +10,18 @@ from typing import Any
 
 import fake_renderer
 import pytest
+import ray
 from coordinator_double import CoordinatorDouble
 from stickslip_schemas.base.states import Reason, Stage
 from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
+from stickslip_workers.calls import StartError
 from stickslip_workers.cluster import Place
 from stickslip_workers.dispatcher import Dispatcher
 from stickslip_workers.lease_client import SupersededError
 from stickslip_workers.settings import Settings
-from stickslip_workers.starting import StartError
 
 pytestmark = [pytest.mark.real, pytest.mark.filterwarnings("ignore::ResourceWarning")]  # Ray leaves its log files open
 
@@ -43,6 +44,8 @@ class Running:
     def stop(self) -> None:
         self.dispatcher.stop()
         self.join()
+        for one in self.dispatcher._calls or ():  # another driver would end, and with it what it runs
+            ray.cancel(one.reference, force=True)
 
     def join(self) -> None:
         self._thread.join(timeout=120)
@@ -78,7 +81,7 @@ def start(double: CoordinatorDouble, store: DirectoryStore, cluster: Place) -> I
     started: list[Running] = []
 
     def make(**changes: Any) -> Running:
-        quick: dict[str, Any] = {"drop_seconds": 0.2, "stop_seconds": 0.5}
+        quick: dict[str, Any] = {"stop_seconds": 0.5}
         started.append(Running(_settings(double, store, **{**quick, **changes}), cluster))
         return started[-1]
 
@@ -167,9 +170,10 @@ def test_a_render_process_that_is_killed_costs_one_try(
 def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
     start: Start, double: CoordinatorDouble, store: DirectoryStore
 ) -> None:
-    start(max_cpus=1)
+    running = start(max_cpus=1)
     double.offer(first=_render(fake_renderer.FINE))
     double.until(lambda: "first" in double.results)
+    running.dispatcher._pace._seconds[Stage.render] = 0.01  # on a busy machine it is more
     others = {f"fine-{i}": _render(fake_renderer.FINE) for i in range(3)}
     double.offer(**others, crash=_render(HANG), bug=_render(fake_renderer.BUG))
     together = _wait_for_pid(double, store, HANG)
@@ -225,24 +229,12 @@ def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDou
     double.until(lambda: len(double.started) == 2)
     double.offer(short=_render(fake_renderer.FINE), **_simulate(3))
     double.until(lambda: {"short", "rod-0", "rod-1", "rod-2"} <= double.results.keys())
-    assert double.leased.keys() == double.long
+    assert double.leased.keys() <= double.long
     assert len(list(store.root.glob("pid-*"))) == 2
     for i in range(6):
         (store.root / f"release-{HANG + i}").touch()
     double.until(lambda: len(double.results) == 10)
     assert {result.outcome for result in double.results.values()} == {"succeeded"}
-
-
-def test_the_first_call_of_a_process_is_not_gone_by(start: Start, double: CoordinatorDouble) -> None:
-    start(max_cpus=1)
-    for i in range(5):  # one after the other
-        double.offer(**{f"{i}": _render(fake_renderer.FINE)})
-        double.until(lambda: len(double.results) == i + 1)  # noqa: B023
-    calls = [double.results[f"{i}"].call_seconds for i in range(5)]
-    assert calls[0] is None
-    known = [call for call in calls if call is not None]
-    assert known
-    assert all(0 < call < 10 for call in known)
 
 
 def test_a_simulation_tells_how_far_it_is(start: Start, double: CoordinatorDouble) -> None:
@@ -260,7 +252,7 @@ def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorD
     beats = double.beats
     double.until(lambda: double.beats > beats + 2)
     assert len(double.started) == 2
-    assert len(double.leased) == 6  # four of them wait in Ray, which an autoscaler would see
+    assert len(double.leased) == 3  # one of them waits in Ray, which an autoscaler would see
     for i in range(9):
         (store.root / f"release-{HANG + i}").touch()
     double.until(lambda: len(double.results) == 9)
@@ -369,8 +361,6 @@ def test_a_gpu_that_the_cluster_does_not_have_is_told(
     start: Start, double: CoordinatorDouble, store: DirectoryStore
 ) -> None:
     """Nothing is rendered on the CPU instead."""
-    import ray
-
     if ray.cluster_resources().get("GPU"):
         pytest.skip("the cluster has a GPU")
     start(render_device="optix", render_gpus=0.25, start_seconds=1.0)

@@ -6,9 +6,16 @@ from typing import Any, cast
 
 import pytest
 from stickslip_schemas.documents.tasks import SimulateTask
-from stickslip_schemas.documents.worker_api import Heartbeat, HeartbeatAnswer, Lease, WorkerSession
+from stickslip_schemas.documents.worker_api import (
+    Heartbeat,
+    HeartbeatAnswer,
+    Lease,
+    WorkerCondition,
+    WorkerRegistration,
+    WorkerSession,
+)
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
-from stickslip_workers.lease_client import Backoff, HeartbeatThread, LeaseBook, Status
+from stickslip_workers.lease_client import Backoff, LeaseBook, RefusedError, Session
 
 
 def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,26 +31,46 @@ def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 class SlowCoordinator:
-    """Answers when it is set to."""
+    """Answers heartbeats when it is set to."""
 
     def __init__(self) -> None:
         self.asked, self.may_answer = threading.Event(), threading.Event()
+
+    def register(self, _: WorkerRegistration) -> WorkerSession:
+        return WorkerSession(worker_id="worker-1", lease_seconds=0.03)
 
     def heartbeat(self, _: Heartbeat) -> HeartbeatAnswer:
         self.asked.set()
         assert self.may_answer.wait(timeout=4)
         return HeartbeatAnswer(drop=())
 
+    def close(self) -> None:
+        assert self.may_answer.is_set()
+
 
 def test_a_heartbeat_in_progress_ends_before_its_connection_is_closed() -> None:
     coordinator = SlowCoordinator()
-    session = WorkerSession(worker_id="worker-1", lease_seconds=0.03)
-    heartbeat = HeartbeatThread(cast(Any, coordinator), session, LeaseBook(), Status(lambda: ""))
-    heartbeat.start()
+    registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
+    session = Session(cast(Any, coordinator), lambda: registration)
+    session.start()
     assert coordinator.asked.wait(timeout=10)
+    assert session.worker_id == "worker-1"
     threading.Timer(0.2, coordinator.may_answer.set).start()
-    heartbeat.stop()
-    assert not heartbeat.is_alive()
+    session.close()
+    assert not session.is_alive()
+
+
+def test_what_the_coordinator_refuses_ends_the_session() -> None:
+    class Refusing(SlowCoordinator):
+        def register(self, _: WorkerRegistration) -> WorkerSession:
+            raise RefusedError("wrong key")
+
+    registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
+    session = Session(cast(Any, Refusing()), lambda: registration)
+    session.start()
+    session.join(timeout=10)
+    with pytest.raises(RefusedError, match="wrong key"):
+        _ = session.worker_id
 
 
 def _lease(token: int) -> Lease:
@@ -56,10 +83,10 @@ def test_a_late_drop_spares_a_newer_lease() -> None:
     book.add([_lease(1)])
     said = book.states()
     book.add([_lease(2)])
-    book.drop(["one"], as_of=said)
+    book.remove(said)
     assert book.holds(_lease(2))
     assert not book.holds(_lease(1))
-    book.drop(["one"], as_of=book.states())
+    book.remove(book.states())
     assert book.states() == ()
 
 
@@ -67,9 +94,11 @@ def test_started_is_said_and_a_reported_lease_forgotten() -> None:
     book = LeaseBook()
     book.add([_lease(1)])
     assert [state.started for state in book.states()] == [False]
-    book.start([_lease(1)])
+    book.note([_lease(1)], started=True)
     assert [state.started for state in book.states()] == [True]
-    book.remove("one", 7)
-    assert book.holds(_lease(1))
-    book.remove("one", 1)
+    book.note([_lease(7)], started=False)
+    book.remove([_lease(7)])
+    assert [state.started for state in book.states()] == [True]
+    book.remove([_lease(1)])
+    book.note([_lease(1)], started=True)
     assert book.states() == ()

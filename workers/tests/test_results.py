@@ -10,7 +10,6 @@ from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError
-from stickslip_workers.calls import LostError
 from stickslip_workers.results import MESSAGE_LENGTH, failure, merged, process_failure, shading_of, split
 
 RECORD = RecordRef(digest="d" * 64, row=0)
@@ -42,7 +41,7 @@ def test_what_a_stage_raises(error: Exception, reason: Reason) -> None:
         (ray_errors.WorkerCrashedError(), True, Reason.renderer_crash),
         (ray_errors.WorkerCrashedError(), False, Reason.process_crash),
         (ray_errors.NodeDiedError("the node is gone"), True, Reason.worker_lost),
-        (LostError("node a is gone"), True, Reason.worker_lost),
+        (RuntimeError("node a is gone"), True, Reason.worker_lost),
         (ray_errors.OutOfMemoryError("low on memory"), True, Reason.oom_killed),
         (ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")), True, Reason.store_unavailable),
         (ray_errors.RayTaskError("render", "traceback", "not an exception"), True, Reason.internal_error),

@@ -126,11 +126,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
-    from stickslip_workers.calls import NoNodeError
+    from stickslip_workers.calls import StartError
     from stickslip_workers.cluster import Place
     from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.ray_head import own_directory
-    from stickslip_workers.starting import StartError
 
     address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
     if address is None and data is None:
@@ -139,23 +138,21 @@ def _dispatch(options: argparse.Namespace) -> int:
         command += [] if settings.max_cpus is None else ["--cpus", str(settings.max_cpus)]
         # It ends after this process: Ray aborts a driver whose head ends at the same time.
         subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
-    place = Place(address, None if data is None else own_directory(data))
-    stopped_early = False
+    place = Place(own_directory(data)) if data is not None else Place(address or "")
     dispatcher: Dispatcher | None = None
 
     def stop(number: int, _frame: object) -> None:
-        nonlocal stopped_early
-        if dispatcher is None or stopped_early:
+        if dispatcher is None or dispatcher.stopping:
             raise SystemExit(128 + number)  # nothing is running yet, or this is the second time
-        stopped_early = True
-        dispatcher.stop()
+        if not dispatcher.stop():
+            raise SystemExit(0)
 
     try:
         dispatcher = Dispatcher(settings, place)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
         dispatcher.run()
-    except (NoNodeError, StartError, CoordinatorError) as error:
+    except (StartError, CoordinatorError) as error:
         logging.error("%s: %s", type(error).__name__, error)
         return 1
     return 0

@@ -1,8 +1,10 @@
-"""What one call does: simulations of a kind, renders of a shading, some short renders, or one task."""
+"""Calls: simulations of a kind, renders of a shading, some short renders, or one task, which Ray does together."""
 
 import math
-from collections import deque
-from collections.abc import Collection, Iterable
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -14,27 +16,21 @@ from stickslip_workers.kinds import kind, kind_names
 from stickslip_workers.results import failure, merged, shading_of, split
 from stickslip_workers.stages.run import AnyTask
 
-Parts = list[list[Lease]]
-"""The tasks of a call. Those of a part have one answer together: all simulations, or renders of one shading."""
+STAGE_BYTES = {Stage.simulate: 2**28, Stage.render: 2**30, Stage.pack: 2**29, Stage.publish: 2**29}
+"""Memory of a process without a mesh [bytes]. Measured: 152 MiB after 512 rods."""
 
-RENDERS_TOGETHER = 12
-"""Renders of one shading that one call makes at most; so many are leased ahead, for they cost little more than one."""
+VERTEX_BYTES = 96 * 1024
+"""Memory for each vertex of a mesh [bytes]. Measured: 60 kB with 81 x 81 and 161 x 161 vertices; contacts need more."""
 
-SHORT_SECONDS = 1.0
-"""Renders that share no shading are one call, if they take so long together [s]: a call costs 10 ms."""
+MOST_TOGETHER = 12
+"""Renders in one call, and calls that wait here for each CPU, are no more than so many."""
 
-MOST_TOGETHER = 16
-"""Renders that share no shading in one call, and calls that wait here for each CPU, are no more than so many."""
-
-AHEAD_SECONDS = 2.0
-"""Calls that wait here for each CPU are enough for so long [s]. To ask for them costs the coordinator about 10 ms."""
+ENOUGH_SECONDS = 2.0
+"""Renders that share no shading are one call if they take so long together, and calls that wait here for each CPU are
+enough for so long [s]. A call costs 10 ms, and so does a request for tasks; but another dispatcher may have nothing."""
 
 LARGEST_BATCH = max(kind(name).batch for name in kind_names())
-"""How many simulations to ask for at once: one call takes them all."""
-
-LONG_SIMULATION = 2.0
-"""Simulations that take longer [s] go after renders: clips come out while others are simulated, and the time left
-is known for both. Of such no more are leased than run soon, for another dispatcher may have nothing to do."""
+"""How many tasks to ask for at once at most: one call takes as many simulations."""
 
 _WEIGHT = 0.2
 """Of the last call in the mean of their times."""
@@ -43,124 +39,107 @@ _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
 _results = TypeAdapter(list[TaskResult])
 
 
+@dataclass(eq=False)
+class Call:
+    """What one task of Ray does. A call without parts only starts a process."""
+
+    stage: Stage
+    parts: list[list[Lease]]
+    """Its tasks. Those of a part have one answer together: all simulations, or renders of one shading."""
+    is_short: bool = False
+    """Whether its tasks were leased because they are short, while all CPUs had been taken for long."""
+    is_express: bool = False
+    """Whether it needs no free CPU."""
+    reference: Any = None
+    """Of Ray."""
+    given_at: float = field(default_factory=time.monotonic)
+    started_at: float = math.inf
+    node: str = ""
+    """Where it runs; empty before it has started."""
+    cancelled: str = ""
+    """Why it has been."""
+
+    @property
+    def leases(self) -> list[Lease]:
+        return list(chain.from_iterable(self.parts))
+
+    @property
+    def memory(self) -> int:
+        """How much memory it needs [bytes], which Ray counts where it places calls."""
+        meshes = [lease.task.simulation.vertices for lease in self.leases if isinstance(lease.task, SimulateTask)]
+        return STAGE_BYTES[self.stage] + VERTEX_BYTES * max(meshes, default=0)
+
+    def limit(self, most: float) -> float:
+        """Return how long it may take [s], `most` where that of a task is not known."""
+        # Tasks of a part are put together because they are alike: the longest limit is that of all of them.
+        return min(most, sum(max(lease.limit_seconds or most for lease in part) for part in self.parts))
+
+    def arguments(self) -> list[Any]:
+        """Return what the process is given for each part: the renderer takes dicts, the stages JSON."""
+        if self.stage is Stage.render:
+            return [merged(_renders(part)).model_dump(mode="json") for part in self.parts]
+        return [_tasks.dump_json([lease.task for lease in part]).decode() for part in self.parts]
+
+    def results(self, answers: list[Any]) -> Iterator[TaskResult]:
+        """Yield the result of each task from the answers."""
+        for answer, part in zip(answers, self.parts, strict=True):
+            try:
+                if self.stage is Stage.render:
+                    yield from split(_renders(part), TaskResult.model_validate(answer))
+                else:
+                    yield from _results.validate_json(answer)
+            except ValidationError as error:
+                yield from [failure(error)] * len(part)
+
+
+def _renders(part: list[Lease]) -> list[RenderTask]:
+    return [lease.task for lease in part if isinstance(lease.task, RenderTask)]
+
+
 class Pace:
-    """How long calls take, lately [s]."""
+    """How long tasks take, lately, and how many a call takes therefore."""
 
     def __init__(self) -> None:
-        self._part: dict[Stage, float] = {}
-        self._simulation: float | None = None
-        self.renders_share = False
+        self._seconds: dict[Stage, float] = {}
+        self._renders_share = False
         """Whether the last renders that were leased share shadings."""
 
-    def note(self, stage: Stage, parts: Parts, seconds: float) -> None:
+    def note(self, one: Call, seconds: float) -> None:
         """Note the duration of a call."""
-        self._part[stage] = _mean(self._part.get(stage), seconds / len(parts))
+        last = max(seconds / len(one.leases), 1e-3)
+        self._seconds[one.stage] = (1 - _WEIGHT) * self._seconds.get(one.stage, last) + _WEIGHT * last
+
+    def call(self, stage: Stage) -> float:
+        """Return how long a call takes [s]; infinity where that is not known."""
+        return self._seconds.get(stage, math.inf) * self.tasks(stage)
+
+    def tasks(self, stage: Stage) -> int:
+        """Return how many tasks one call takes."""
+        seconds = self._seconds.get(stage, math.inf)
         if stage is Stage.simulate:
-            self._simulation = _mean(self._simulation, seconds / sum(map(len, parts)))
-
-    def order(self) -> Iterable[Stage]:
-        """Return what goes first: the end of a job before its beginning, but simulations, while they are short, before
-        renders.
-        """
-        stages = list(reversed(Stage))
-        return stages if self.is_long() else sorted(stages, key=lambda stage: stage is Stage.render)
-
-    def is_long(self) -> bool:
-        """Return whether simulations take long."""
-        return (self._simulation or 0.0) > LONG_SIMULATION
-
-    def part(self, stage: Stage) -> float | None:
-        """Return how long a part of a call takes; None where that is not known."""
-        return self._part.get(stage)
-
-    def renders_at_once(self) -> int:
-        """Return how many renders that share no shading are short enough to be one call."""
-        return min(max(int(SHORT_SECONDS / max(self._part.get(Stage.render, SHORT_SECONDS), 1e-3)), 1), MOST_TOGETHER)
-
-    def wanted(self, stage: Stage, calls: int) -> int:
-        """Return how many tasks to ask for, for some calls."""
-        if stage is Stage.simulate:
-            return calls if self._simulation is None or self.is_long() else LARGEST_BATCH
+            return LARGEST_BATCH if seconds < ENOUGH_SECONDS else 1
         if stage is Stage.render:
-            return calls * (RENDERS_TOGETHER if self.renders_share else self.renders_at_once())
-        return calls
+            return MOST_TOGETHER if self._renders_share else max(min(int(ENOUGH_SECONDS / seconds), MOST_TOGETHER), 1)
+        return 1
 
     def ahead(self, stage: Stage) -> int:
         """Return how many calls of a stage should wait here, for each CPU."""
-        seconds = self._part.get(stage, math.inf) * (self.renders_at_once() if stage is Stage.render else 1)
-        return round(min(AHEAD_SECONDS / max(seconds, 1e-3), MOST_TOGETHER))
+        return round(min(ENOUGH_SECONDS / self.call(stage), MOST_TOGETHER))
 
-    def calls(self, stage: Stage, queue: Collection[Lease]) -> int:
-        """Return about how many calls some tasks of a stage take."""
-        if stage is Stage.simulate:
-            return -(-len(queue) // LARGEST_BATCH)
-        if stage is Stage.render:
-            shadings = [shading_of(task) for task in renders(queue)]
-            return -(-shadings.count(None) // self.renders_at_once()) + len(set(shadings) - {None})
-        return len(queue)
-
-    def next_parts(self, queue: deque[Lease], alone: Collection[str]) -> Parts:
-        """Take what one call does from `queue`; the tasks `alone` share a call with none."""
-
-        def may_share(lease: Lease) -> bool:
-            is_render = isinstance(lease.task, RenderTask) and shading_of(lease.task) is None
-            return is_render and lease.task_id not in alone
-
-        parts = [_next_part(queue)]
-        if may_share(parts[0][0]):
-            while queue and len(parts) < self.renders_at_once() and may_share(queue[0]):
-                parts.append([queue.popleft()])
-        return parts
-
-
-def _mean(before: float | None, last: float) -> float:
-    return last if before is None else (1 - _WEIGHT) * before + _WEIGHT * last
-
-
-def _next_part(queue: deque[Lease]) -> list[Lease]:
-    part = [queue.popleft()]
-    if isinstance(part[0].task, RenderTask) and (shading := shading_of(part[0].task)) is not None:
-        others = [lease for lease in queue if isinstance(lease.task, RenderTask) and shading_of(lease.task) == shading]
-        part += others[: RENDERS_TOGETHER - 1]
-        for lease in part[1:]:
-            queue.remove(lease)
-        return part
-    simulated = _simulated_kind(part[0])
-    limit = 1 if simulated is None else kind(simulated).batch
-    while queue and len(part) < limit and _simulated_kind(queue[0]) == simulated:
-        part.append(queue.popleft())
-    return part
-
-
-def _simulated_kind(lease: Lease) -> str | None:
-    return lease.task.simulation.kind if isinstance(lease.task, SimulateTask) else None
-
-
-def renders(leases: Iterable[Lease]) -> list[RenderTask]:
-    """Return the renders among some tasks."""
-    return [lease.task for lease in leases if isinstance(lease.task, RenderTask)]
-
-
-def arguments_of(parts: Parts) -> list[Any]:
-    """Return what the process is given for each part: the renderer takes dicts, the stages JSON."""
-    if isinstance(parts[0][0].task, RenderTask):
-        return [merged(renders(leases)).model_dump(mode="json") for leases in parts]
-    return [_tasks.dump_json([lease.task for lease in leases]).decode() for leases in parts]
-
-
-def results_of(answer: Any, part: list[Lease]) -> list[TaskResult]:
-    try:
-        if isinstance(answer, dict):
-            return split(renders(part), TaskResult.model_validate(answer))
-        return _results.validate_json(answer)
-    except ValidationError as error:
-        return [failure(error)] * len(part)
-
-
-def limit_of(parts: Parts, most: float) -> float:
-    """Return how long a call may take [s], `most` where that of a task is not known."""
-    limits = [[lease.limit_seconds for lease in part if lease.limit_seconds is not None] for part in parts]
-    if sum(map(len, limits)) < sum(map(len, parts)):
-        return most
-    # Tasks of a part are put together because they are alike: the longest limit is that of all of them.
-    return min(most, sum(map(max, limits)))
+    def calls(self, leases: Iterable[Lease], *, is_short: bool) -> Iterator[Call]:
+        """Yield the calls that do what has been leased."""
+        groups: dict[tuple[Stage, str, int], list[Lease]] = {}
+        for lease in leases:
+            stage, shared, size = Stage(lease.task.stage), "", 1
+            if isinstance(lease.task, SimulateTask):
+                shared, size = lease.task.simulation.kind, kind(lease.task.simulation.kind).batch
+            if isinstance(lease.task, RenderTask):
+                shared = shading_of(lease.task) or ""
+                self._renders_share = shared != ""
+                size = MOST_TOGETHER if shared else 1
+            groups.setdefault((stage, shared, size), []).append(lease)
+        for (stage, shared, size), group in groups.items():
+            parts = [group[start : start + size] for start in range(0, len(group), size)]
+            together = self.tasks(stage) if stage is Stage.render and not shared else 1
+            for start in range(0, len(parts), together):
+                yield Call(stage, parts[start : start + together], is_short)

@@ -3,15 +3,15 @@ have stickslip_workers: it may import nothing of ours.
 """
 
 import importlib
-import os
-import sys
-import threading
 from collections.abc import Iterator
-from types import ModuleType
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 FRAMES_SECONDS = 2.0
 """Time between two messages about how far a simulation is [s]."""
+
+_held: dict[tuple[str, str], tuple[Any, Any]] = {}
+"""What factories made in this process, with its builds."""
 
 
 def run(
@@ -24,38 +24,23 @@ def run(
     """
     import ray
 
-    held = vars(sys.modules.setdefault("stickslip_held", ModuleType("stickslip_held")))
-    if (key := f"{factory} {store}") not in held:
+    if (held := _held.get((factory, store))) is None:
         module, name = factory.split(":")
         made = getattr(importlib.import_module(module), name)(store)
-        held[key] = made, made.describe()["builds"]
-    inner, own_builds = held[key]
-    is_foreign = own_builds != builds
-    node = ray.get_runtime_context().get_node_id()
-    yield {"node": node, "pid": os.getpid(), "first": f"worked {key}" not in held, "foreign": is_foreign}
-    if is_foreign:
+        held = _held[factory, store] = made, made.describe()["builds"]
+    inner, own_builds = held
+    yield {"node": ray.get_runtime_context().get_node_id(), "foreign": own_builds != builds}
+    if own_builds != builds:
         return
-    if arguments:
-        held[f"worked {key}"] = True
-    outcome: dict[str, Any] = {}
 
-    def work() -> None:
-        try:
-            outcome["answers"] = [getattr(inner, method)(argument) for argument in arguments]
-        except BaseException as error:
-            outcome["error"] = error
+    def work() -> list[Any]:
+        return [getattr(inner, method)(argument) for argument in arguments]
 
     if tells_frames:
-        thread = threading.Thread(target=work)
-        thread.start()
-        while True:
-            thread.join(FRAMES_SECONDS)
-            if not thread.is_alive():
-                break
+        done = ThreadPoolExecutor(1).submit(work)
+        while wait([done], FRAMES_SECONDS).not_done:
             if (frames := inner.frames()) is not None:
                 yield tuple(frames)
+        yield done.result()
     else:
-        work()
-    if "error" in outcome:
-        raise outcome["error"]
-    yield outcome["answers"]
+        yield work()

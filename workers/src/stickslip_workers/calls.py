@@ -1,29 +1,22 @@
 """Calls: the tasks of Ray that this dispatcher has given to a cluster."""
 
-import logging
 import math
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.documents.worker_api import Lease
 
-from stickslip_workers import call, cluster
-from stickslip_workers.batches import Parts, arguments_of, limit_of
-from stickslip_workers.memory import memory_bytes
+from stickslip_workers import call
+from stickslip_workers.batches import Call
 from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
-
-log = logging.getLogger(__name__)
 
 LOOK_SECONDS = 2.0
 """Time between two looks at the nodes of the cluster [s]."""
 
-AHEAD_SHARE, LEAST_AHEAD = 0.5, 4
-"""Calls that wait in Ray: so many for each CPU, and so many at least. An autoscaler adds nodes for what waits."""
+DEMAND = 1.5
+"""Calls given to Ray for each CPU. An autoscaler adds nodes for those that wait."""
 
 WARM_UP_SECONDS = 10.0
 """The first tasks wait so long for processes to start [s]."""
@@ -31,56 +24,23 @@ WARM_UP_SECONDS = 10.0
 CALLS_PER_PROCESS = 1000
 """Calls after which a process gives way to a fresh one: Blender's memory grows slowly."""
 
-STAGES = "stickslip_workers.stages.run:StageActor"
 
-
-class LostError(RuntimeError):
-    """The node of a call is gone."""
+class StartError(RuntimeError):
+    """This dispatcher cannot do anything on this cluster."""
 
 
 class NotDoneError(RuntimeError):
     """Nothing of a call was done, and it must be given again."""
 
 
-class NoNodeError(RuntimeError):
-    """All nodes of the cluster have other builds than the dispatcher."""
-
-
-@dataclass(eq=False)
-class Call:
-    """A task of Ray, which does tasks of one stage."""
-
-    parts: Parts
-    stage: Stage
-    limit: float
-    """It is cancelled after this time [s]."""
-    given_at: float
-    is_express: bool
-    started_at: float | None = None
-    node: str = ""
-    is_first: bool = False
-    """Whether it is the first one of its process."""
-    cancelled: str = ""
-    """Why, where it has been."""
-    unwanted_since: float | None = None
-
-    @property
-    def leases(self) -> list[Lease]:
-        return list(chain.from_iterable(self.parts))
-
-    def runs_longer_than(self, seconds: float) -> bool:
-        """Return whether it started so long ago."""
-        return self.started_at is not None and time.monotonic() > self.started_at + seconds
-
-
 class Calls:
-    """The calls of a driver of Ray, which must be connected. `builds` are those of the stages and of the renderer."""
+    """The calls of a driver of Ray, which must be connected; `described` by the stages and (True) by the renderer."""
 
-    def __init__(self, settings: Settings, builds: Mapping[bool, Mapping[str, Any]]) -> None:
+    def __init__(self, settings: Settings, described: Mapping[bool, Mapping[str, Any]]) -> None:
         import ray
 
         self._settings = settings
-        self._builds = builds
+        self._described = described
         self._calls: dict[Any, Call] = {}
         self._foreign: set[str] = set()
         self._warm: set[str] = set()
@@ -88,16 +48,16 @@ class Calls:
         self._next_look = 0.0
         self.cpus = 0.0
         """CPUs that calls may use, of the nodes that are there now."""
+        self.trouble = ""
+        """What is wrong with the cluster; empty where nothing is."""
         ray.cloudpickle.register_pickle_by_value(call)
         common = {"max_retries": 0, "num_returns": "streaming", "max_calls": CALLS_PER_PROCESS}
-        environment = {"OMP_NUM_THREADS": "1", RENDER_DEVICE: settings.render_device}
-        python = str(settings.blender_python)
-        gpus = 0 if settings.render_device == CPU else settings.render_gpus
+        variables = {"env_vars": {"OMP_NUM_THREADS": "1", RENDER_DEVICE: settings.render_device}}
+        python = {"py_executable": str(settings.blender_python)}
+        self._gpus = 0 if settings.render_device == CPU else settings.render_gpus
         self._remote: dict[bool, Any] = {
-            False: ray.remote(**common, runtime_env={"env_vars": environment})(call.run),
-            True: ray.remote(**common, num_gpus=gpus, runtime_env={"env_vars": environment, "py_executable": python})(
-                call.run
-            ),
+            False: ray.remote(**common, runtime_env=variables)(call.run),
+            True: ray.remote(**common, num_gpus=self._gpus, runtime_env=variables | python)(call.run),
         }
         list(self._look())
         if self._calls:  # tasks that come while processes start would start more
@@ -106,38 +66,36 @@ class Calls:
     def __iter__(self) -> Iterator[Call]:
         return iter(list(self._calls.values()))
 
-    def room(self, *, is_long: bool) -> int:
-        """Return how many more calls to give to Ray; of long ones fewer wait, for other dispatchers may be idle."""
-        ahead = max(AHEAD_SHARE * self.cpus, 1 if is_long else LEAST_AHEAD)
-        room = math.ceil(self.cpus + ahead) if self._settings.max_cpus is None else self._settings.max_cpus
-        return room - sum(not one.is_express for one in self._calls.values())
+    def room(self) -> int:
+        """Return how many more calls to give to Ray."""
+        most = self._settings.max_cpus or max(math.ceil(DEMAND * self.cpus), 1)
+        return most - sum(bool(one.parts) and not one.is_express for one in self)
 
     def is_clogged(self) -> bool:
         """Return whether all CPUs have been taken for long."""
-        long = sum(one.runs_longer_than(self._settings.clog_seconds) and not one.is_express for one in self)
-        return 0 < self.cpus <= long
+        began = time.monotonic() - self._settings.clog_seconds
+        return 0 < self.cpus <= sum(one.started_at < began and not one.is_express for one in self)
 
-    def give(self, parts: Parts, stage: Stage, *, is_express: bool = False, node: str = "") -> None:
-        """Give a call to Ray, without tasks only to start a process. An express one needs no free CPU."""
-        renders = stage is Stage.render
-        settings = self._settings
-        options: dict[str, Any] = {"num_cpus": 0 if is_express else 1, "memory": memory_bytes(stage, parts)}
+    def give(self, one: Call, node: str = "") -> None:
+        """Give a call to Ray, which may choose the node."""
+        renders, settings = one.stage is Stage.render, self._settings
+        options: dict[str, Any] = {"num_cpus": 1 if one.parts and not one.is_express else 0, "memory": one.memory}
         if node or self._foreign:
             options["label_selector"] = {"ray.io/node-id": node or f"!in({','.join(sorted(self._foreign))})"}
-        reference = (
+        one.given_at = time.monotonic()
+        one.reference = (
             self._remote[renders]
-            .options(name=stage.value if parts else "warm-up", **options)
+            .options(name=one.stage.value if one.parts else "warm-up", **options)
             .remote(
-                settings.render_actor if renders else STAGES,
+                settings.render_actor if renders else "stickslip_workers.stages.run:StageActor",
                 settings.store,
-                self._builds[renders],
+                self._described[renders]["builds"],
                 "render" if renders else "run",
-                arguments_of(parts) if parts else [],
-                stage is Stage.simulate and len(parts) == 1 and len(parts[0]) == 1,
+                one.arguments(),
+                one.stage is Stage.simulate and len(one.leases) == 1,
             )
         )
-        limit = limit_of(parts, settings.exec_seconds[stage])
-        self._calls[reference] = Call(parts, stage, limit, time.monotonic(), is_express)
+        self._calls[one.reference] = one
 
     def collect(self, timeout: float) -> Iterator[tuple[Call, Any]]:
         """Wait for news; yield calls that have started with None, with frames done and in all, or at their end with
@@ -148,12 +106,9 @@ class Calls:
         if time.monotonic() >= self._next_look:
             yield from self._look()
         if not self._calls:
-            time.sleep(timeout)
-            return
-        ready, _ = ray.wait(list(self._calls), num_returns=1, timeout=timeout)
-        if ready:
-            ready, _ = ray.wait(list(self._calls), num_returns=len(self._calls), timeout=0)
-        for reference in ready:
+            return time.sleep(timeout)
+        ray.wait(list(self._calls), timeout=timeout)
+        for reference in ray.wait(list(self._calls), num_returns=len(self._calls), timeout=0)[0]:
             one = self._calls[reference]
             try:
                 said = ray.get(next(reference))
@@ -162,10 +117,10 @@ class Calls:
             except ray.exceptions.RayError as error:
                 said = error
             if isinstance(said, dict):
-                one.started_at, one.node, one.is_first = time.monotonic(), said["node"], said["first"]
+                one.started_at, one.node = time.monotonic(), said["node"]
                 if said["foreign"]:
-                    self._exclude(one.node)
-                said = NotDoneError(f"{one.node} is foreign") if said["foreign"] else None
+                    self._foreign.add(one.node)
+                said = NotDoneError(f"node {one.node} is foreign") if said["foreign"] else None
             if isinstance(said, list | Exception):
                 del self._calls[reference]
             if one.parts:
@@ -178,62 +133,47 @@ class Calls:
         import ray
 
         one.cancelled = why
-        ray.cancel(next(reference for reference, it in self._calls.items() if it is one), force=True)
-
-    def forget(self, one: Call) -> None:
-        """End a call of which `collect` says nothing any more."""
-        self.cancel(one, "not wanted")
-        self._calls = {reference: it for reference, it in self._calls.items() if it is not one}
+        ray.cancel(one.reference, force=True)
 
     def _look(self) -> Iterator[tuple[Call, Any]]:
         """Look which nodes are alive: Ray may wait forever for a call on a lost one, also if it has not said where."""
-        nodes = cluster.nodes()
-        cpus = sum(node["Resources"].get("CPU", 0) for name, node in nodes.items() if name not in self._foreign)
-        self.cpus = min(cpus, self._settings.max_cpus or math.inf)
+        import ray
+
+        nodes = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
+        cpus = {name: int(node["Resources"].get("CPU", 0)) for name, node in nodes.items()}
+        most = self._settings.max_cpus or sys.maxsize
+        self.cpus = min(sum(count for name, count in cpus.items() if name not in self._foreign), most)
+        self.trouble = "; ".join(self._troubles(nodes))
+        if any(cpus.values()) and not self.cpus:
+            raise StartError(self.trouble)
         self._next_look = time.monotonic() + LOOK_SECONDS
-        for name in nodes.keys() - self._warm:  # its first tasks should not have to wait for Blender
-            self._warm.add(name)
-            for _ in range(min(int(nodes[name]["Resources"].get("CPU", 0)), self._settings.max_cpus or sys.maxsize)):
-                for stage in (Stage.simulate, Stage.render):
-                    self.give([], stage, is_express=True, node=name)
         lost = self._warm - nodes.keys()
-        self._warm -= lost
-        for reference, one in list(self._calls.items()):
+        for name in nodes.keys() - self._warm:  # its first tasks should not have to wait for Blender
+            for stage in (Stage.simulate, Stage.render) * min(cpus[name], most):
+                self.give(Call(stage, []), name)
+        self._warm = set(nodes)
+        for one in self:
             if one.node and one.node not in nodes:
-                del self._calls[reference]
-                yield one, LostError(f"node {one.node} is gone")
-            elif lost and one.started_at is None:
-                self.forget(one)
+                del self._calls[one.reference]
+                yield one, RuntimeError(f"node {one.node} is gone")
+            elif lost and not one.node:
+                self.cancel(one, "its node may be gone")
+                del self._calls[one.reference]
                 yield one, NotDoneError(f"it may be on node {min(lost)}, which is gone")
-        working = {name for name, node in nodes.items() if node["Resources"].get("CPU")}
-        if working and working <= self._foreign:
-            raise NoNodeError(self.trouble())
 
-    def _exclude(self, node: str) -> None:
-        if node not in self._foreign:
-            self._foreign.add(node)
-            log.error("%s", self.trouble())
-
-    def trouble(self) -> str:
-        """Return what is wrong with the cluster; empty where nothing is."""
-        now = time.monotonic()
-        nodes = cluster.nodes()
-        found = [
-            f"node {nodes[name]['NodeManagerHostname']} ({nodes[name]['NodeManagerAddress']}) has other builds than "
-            "this dispatcher and gets no tasks: install the same packages there, and start its Ray again"
-            for name in sorted(self._foreign & nodes.keys())
-        ]
-        waiting = [one for one in self if one.started_at is None]
-        late = [one for one in waiting if now > one.given_at + self._settings.start_seconds]
-        if late and sum(one.started_at is not None for one in self) < max(self.cpus, 1):
-            seconds, (stage, *_) = now - late[0].given_at, [one.stage for one in late]
-            gpus = self._settings.render_gpus if self._settings.render_device != CPU and stage is Stage.render else 0
-            found.append(
-                f"a {stage} call has waited {seconds:.0f} s for Ray to start it: it needs 1 CPU, {gpus:g} GPUs and "
-                f"{memory_bytes(stage, late[0].parts) / 2**30:.1f} GiB, and the interpreter {self._python(stage)} on "
-                "every node; see raylet.out and runtime_env*.log among the logs of Ray on its nodes"
+    def _troubles(self, nodes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+        for node in (nodes[name] for name in sorted(self._foreign & nodes.keys())):
+            yield (
+                f"node {node['NodeManagerHostname']} ({node['NodeManagerAddress']}) has other builds than this "
+                "dispatcher and gets no tasks: install the same packages there, and start its Ray again"
             )
-        return "; ".join(found)
-
-    def _python(self, stage: Stage) -> str:
-        return str(self._settings.blender_python) if stage is Stage.render else "of the node"
+        late = next((one for one in self if not one.node), None)  # the one that was given first
+        waited = time.monotonic() - late.given_at if late else 0.0
+        if late and waited > self._settings.start_seconds and sum(bool(one.node) for one in self) < max(self.cpus, 1):
+            renders = late.stage is Stage.render
+            gpus, python = (self._gpus, self._settings.blender_python) if renders else (0, "of the node")
+            yield (
+                f"a {late.stage} call has waited {waited:.0f} s for Ray to start it: it needs 1 CPU, {gpus:g} GPUs and "
+                f"{late.memory / 2**30:.1f} GiB, and the interpreter {python} on every node; see raylet.out and "
+                "runtime_env*.log among the logs of Ray on its nodes"
+            )

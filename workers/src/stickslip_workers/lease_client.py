@@ -1,6 +1,8 @@
 """The client of the worker API: requests and the back-off between them, the leases held, and their heartbeat."""
 
+import contextlib
 import logging
+import math
 import random
 import ssl
 import threading
@@ -9,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import httpx
 from pydantic import BaseModel
@@ -25,7 +27,6 @@ from stickslip_schemas.documents.worker_api import (
     Report,
     ReportAnswer,
     ReportBatch,
-    WorkerCondition,
     WorkerRegistration,
     WorkerSession,
 )
@@ -46,9 +47,6 @@ REPORT_SECONDS = 1.0
 START_BEAT_SECONDS = 2.0
 """Time between two heartbeats of a dispatcher that starts, which tell how far it is [s]."""
 
-REASON_LENGTH = 1000
-"""Limit of the reason of a state [characters]."""
-
 LAST_BEAT_SECONDS = 5.0
 """Time limit of a heartbeat in progress when the thread is stopped."""
 
@@ -61,8 +59,8 @@ class UnreachableError(CoordinatorError):
     """No answer, or an answer that asks for another attempt later."""
 
 
-class UnknownWorkerError(CoordinatorError):
-    """The coordinator does not know the session: register again."""
+class UnknownWorkerError(UnreachableError):
+    """The coordinator does not know the session: the next heartbeat registers again."""
 
 
 class SupersededError(CoordinatorError):
@@ -157,11 +155,12 @@ class Backoff:
         self.next_try = 0.0
         """Earliest time of the next attempt, on the monotonic clock [s]."""
 
-    def failed(self) -> None:
-        """Note a failure and double the wait."""
-        delay = min(self._most, self._first * 2.0 ** min(self.failures, 16))
+    def failed(self) -> float:
+        """Note a failure and double the wait; return it [s]."""
+        delay = min(self._most, self._first * 2.0 ** min(self.failures, 16)) * random.uniform(0.5, 1.0)
         self.failures += 1
-        self.next_try = time.monotonic() + delay * random.uniform(0.5, 1.0)
+        self.next_try = time.monotonic() + delay
+        return delay
 
     def succeeded(self) -> None:
         """Reset the wait."""
@@ -170,54 +169,35 @@ class Backoff:
 
 
 class LeaseBook:
-    """The leases that the dispatcher holds, shared between its loop and its heartbeat. Thread-safe."""
+    """The leases that the dispatcher holds, shared between its loop and its session. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._states: dict[str, LeaseState] = {}
 
     def add(self, leases: Iterable[Lease]) -> None:
-        self._put(leases, started=False)
-
-    def start(self, leases: Iterable[Lease]) -> None:
-        """Mark the tasks as started."""
-        self._put(leases, started=True)
-
-    def _put(self, leases: Iterable[Lease], *, started: bool) -> None:
         with self._lock:
             for lease in leases:
-                self._states[lease.task_id] = LeaseState(task_id=lease.task_id, token=lease.token, started=started)
+                self._states[lease.task_id] = LeaseState(task_id=lease.task_id, token=lease.token, started=False)
 
-    def note_frames(self, lease: Lease, frames: tuple[int, int]) -> None:
-        """Set the progress of a started task: (frames done, frames total)."""
+    def note(self, leases: Iterable[Lease], **changes: object) -> None:
+        """Note that tasks have `started`, or their `frames`: (frames done, frames total)."""
         with self._lock:
-            if self._has(lease.task_id, lease.token):
-                state = self._states[lease.task_id]
-                self._states[lease.task_id] = state.model_copy(update={"frames": frames})
+            for lease in leases:
+                if self.holds(lease):
+                    self._states[lease.task_id] = self._states[lease.task_id].model_copy(update=changes)
 
-    def remove(self, task_id: str, token: int | None) -> None:
-        """Remove a lease; a newer one of the same task stays."""
+    def remove(self, leases: Iterable[Lease | LeaseState | Report]) -> None:
+        """Remove leases; newer ones of the same tasks stay."""
         with self._lock:
-            if self._has(task_id, token):
-                del self._states[task_id]
+            for lease in leases:
+                if self.holds(lease):
+                    del self._states[lease.task_id]
 
-    def holds(self, lease: Lease) -> bool:
+    def holds(self, lease: Lease | LeaseState | Report) -> bool:
         """Return whether the lease is still held."""
-        with self._lock:
-            return self._has(lease.task_id, lease.token)
-
-    def _has(self, task_id: str, token: int | None) -> bool:
-        state = self._states.get(task_id)
-        return state is not None and state.token == token
-
-    def drop(self, task_ids: Iterable[str], *, as_of: Iterable[LeaseState]) -> None:
-        """Remove the tasks that the answer to a heartbeat with the states `as_of` names.
-
-        A lease granted since then stays.
-        """
-        tokens = {state.task_id: state.token for state in as_of}
-        for task_id in task_ids:
-            self.remove(task_id, tokens.get(task_id))
+        state = self._states.get(lease.task_id)
+        return state is not None and state.token == lease.token
 
     def clear(self) -> None:
         """Remove all leases, at the end of a session."""
@@ -236,94 +216,123 @@ class Outbox:
         self._coordinator = coordinator
         self._book = book
         self._reports: deque[Report] = deque()
-        self.due = 0.0
+        self.due = math.inf
         """When to report them at the latest."""
 
     def __len__(self) -> int:
         return len(self._reports)
 
-    def add(self, lease: Lease, result: TaskResult | None) -> None:
-        """Add a result, or the return of a lease, unless it is not held any more."""
-        if self._book.holds(lease):
-            if not self._reports:
-                self.due = time.monotonic() + REPORT_SECONDS
-            self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
+    def add(self, lease: Lease | LeaseState, result: TaskResult | None) -> None:
+        """Add a result, or the return of a lease."""
+        if not self._reports:
+            self.due = time.monotonic() + REPORT_SECONDS
+        self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
 
-    def clear(self) -> None:
-        """Forget all, at the end of a session."""
-        self._reports.clear()
+    def give_back(self, *, started: bool) -> None:
+        """Return the leases that have no result, those of started tasks only if `started`."""
+        told = {report.task_id for report in self._reports}
+        for state in self._book.states():
+            if state.task_id not in told and (started or not state.started):
+                self.add(state, None)
 
     def send(self, worker_id: str) -> bool:
-        """Send all; return whether there were any."""
+        """Send all of leases that are still held; return whether there were any."""
+        self._reports = deque(filter(self._book.holds, self._reports))
         there_were = bool(self._reports)
-        while self._reports:
-            batch = tuple(islice(self._reports, REPORTS_A_REQUEST))
-            answer = self._coordinator.report(ReportBatch(worker_id=worker_id, reports=batch))
-            for report, verdict in zip(batch, answer.verdicts, strict=True):
-                self._reports.popleft()
-                self._book.remove(report.task_id, report.token)
+        while batch := tuple(islice(self._reports, REPORTS_A_REQUEST)):
+            for verdict in self._coordinator.report(ReportBatch(worker_id=worker_id, reports=batch)).verdicts:
                 if verdict.verdict == "stale":
-                    log.warning("the report of task %s came too late and was refused", report.task_id)
+                    log.warning("the report of task %s came too late and was refused", verdict.task_id)
+            self._book.remove(batch)
+            self._reports = deque(islice(self._reports, len(batch), None))
+        self.due = math.inf
         return there_were
 
 
-class Status:
-    """How the dispatcher is, which its heartbeats tell. It starts as `starting`."""
-
-    def __init__(self, reason: Callable[[], str]) -> None:
-        self.state: Literal["starting", "ready"] = "starting"
-        self.slots = 0
-        self.reason = reason
-        """Returns why it is not ready, or what is wrong with its cluster."""
-
-    def condition(self) -> WorkerCondition:
-        """Return what to tell the coordinator."""
-        return WorkerCondition(state=self.state, slots=self.slots, reason=self.reason()[:REASON_LENGTH])
-
-
-class HeartbeatThread(threading.Thread):
-    """Renews leases from a thread of its own, three times in the duration of a lease, and more often at the start.
+class Session(threading.Thread):
+    """Registers the dispatcher, and renews its leases three times in the duration of a lease, and more often at the
+    start.
 
     It is a daemon and never keeps the process alive.
     """
 
-    def __init__(self, coordinator: CoordinatorClient, session: WorkerSession, book: LeaseBook, status: Status) -> None:
-        super().__init__(name="heartbeat", daemon=True)
+    def __init__(self, coordinator: CoordinatorClient, registration: Callable[[], WorkerRegistration]) -> None:
+        super().__init__(name="session", daemon=True)
         self._coordinator = coordinator
-        self._session = session
-        self._book = book
-        self._status = status
-        self.worker_id = session.worker_id
-        self._ended = threading.Event()
-        self.session_lost = threading.Event()
-        """Set when the coordinator no longer knows the session; the thread then ends."""
+        self._registration = registration
+        self.book = LeaseBook()
+        self.outbox = Outbox(coordinator, self.book)
+        self._worker_id = ""
+        self._interval = 0.0
+        self._wanted, self._opened = 1, 0
+        """How many sessions there should have been, and the number of the one that is open."""
+        self._ended = False
+        self._wake = threading.Event()
+        self.error: CoordinatorError | None = None
+        """Why the coordinator refuses this dispatcher."""
 
-    def beat(self) -> None:
-        """Send one heartbeat."""
-        states = self._book.states()
-        answer = self._coordinator.heartbeat(
-            Heartbeat(worker_id=self.worker_id, leases=states, condition=self._status.condition())
-        )
-        if answer.drop:
-            log.info("dropping %d tasks", len(answer.drop))
-            self._book.drop(answer.drop, as_of=states)
+    @property
+    def worker_id(self) -> str | None:
+        """The worker that this dispatcher is to the coordinator; None while no session is open."""
+        if self.error is not None:
+            raise self.error
+        return self._worker_id if self._opened == self._wanted else None
 
-    def stop(self) -> None:
-        """Stop; a heartbeat in progress may end first, because its connection is about to be closed."""
-        self._ended.set()
-        self.join(LAST_BEAT_SECONDS)
+    def renew(self) -> None:
+        """Register anew: the coordinator does not know the session, or the dispatcher has more to say about itself."""
+        self._wanted += 1
+        self._wake.set()
+
+    def beat(self) -> float:
+        """Send one heartbeat; return when the next one is due [s]."""
+        states, condition = self.book.states(), self._registration().condition
+        message = Heartbeat(worker_id=self._worker_id, leases=states, condition=condition)
+        if drop := set(self._coordinator.heartbeat(message).drop):
+            log.info("dropping %d tasks", len(drop))
+            self.book.remove(state for state in states if state.task_id in drop)
+        return self._interval if condition.state == "ready" else min(START_BEAT_SECONDS, self._interval)
+
+    def tell(self) -> None:
+        """Let the coordinator know at once how the dispatcher is."""
+        self._wake.set()
+
+    def close(self) -> None:
+        """Give all leases back, if the coordinator listens, and end the session."""
+        self.outbox.give_back(started=True)
+        with contextlib.suppress(CoordinatorError):
+            if (worker_id := self.worker_id) is not None:
+                self.outbox.send(worker_id)
+        self._ended = True
+        self._wake.set()
+        self.join(LAST_BEAT_SECONDS)  # a heartbeat in progress may end first
+        self._coordinator.close()
 
     def run(self) -> None:
-        """Send heartbeats until `stop`."""
-        interval = self._session.lease_seconds / 3
-        wait = min(START_BEAT_SECONDS, interval)
-        while not self._ended.wait(wait):
-            wait = interval if self._status.state == "ready" else min(START_BEAT_SECONDS, interval)
+        """Keep the session until `stop`."""
+        backoff = Backoff()
+        while not self._ended:
             try:
-                self.beat()
+                if self._opened != self._wanted:
+                    self._open()
+                wait = self.beat()
+                backoff.succeeded()
             except UnknownWorkerError:
-                self.session_lost.set()
-                return
+                self.renew()
+                continue
+            except UnreachableError as error:
+                log.warning("the coordinator is away: %s", error)
+                wait = backoff.failed()
             except CoordinatorError as error:
-                log.warning("no heartbeat: %s", error)
-                wait = min(1.0, interval)  # the lease runs out: a failed heartbeat is repeated
+                log.error("the coordinator refuses this dispatcher: %s", error)
+                self.error = error
+                return
+            self._wake.wait(wait)
+            self._wake.clear()
+
+    def _open(self) -> None:
+        """Register. What was leased in an earlier session is lost; the coordinator gives it out again."""
+        wanted = self._wanted
+        session = self._coordinator.register(self._registration())
+        self.book.clear()
+        self._worker_id, self._interval, self._opened = session.worker_id, session.lease_seconds / 3, wanted
+        log.info("registered as %s", session.worker_id)

@@ -12,17 +12,11 @@ import shutil
 import socket
 import stat
 import sys
-import tempfile
 import threading
-from contextlib import ExitStack
 from pathlib import Path
-from subprocess import Popen
 from typing import Any
 
 from stickslip_schemas.base.keys import sha256
-
-OBJECT_STORE_BYTES = 128 * 2**20
-"""Tasks and results are small: bulk data goes through the store."""
 
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -44,8 +38,7 @@ SETTINGS = {
 
 def own_directory(data: Path) -> Path:
     """Return the directory of the head of a data directory. Sockets below it must have paths of at most 107 bytes."""
-    root = Path(tempfile.gettempdir())
-    root = (root if len(str(root)) <= 20 else Path("/tmp")) / f"stickslip-ray-{os.getuid()}"
+    root = Path("/tmp") / f"stickslip-ray-{os.getuid()}"
     root.mkdir(mode=0o700, exist_ok=True)
     there = root.lstat()
     if there.st_uid != os.getuid() or not stat.S_ISDIR(there.st_mode) or there.st_mode & 0o077:
@@ -59,44 +52,36 @@ def main(directory: Path, cpus: int | None) -> None:
     directory.mkdir(exist_ok=True)
     (directory / "token").touch(mode=0o600)
     (directory / "token").write_text(secrets.token_hex(32))
-    cpus = cpus or len(os.sched_getaffinity(0))
     os.environ |= SETTINGS | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(directory / "token")}
     from ray._private import services
     from ray.scripts.scripts import main as ray
 
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(5)]
-        for free in sockets:
-            free.bind(("127.0.0.1", 0))
-        port, *ports = (free.getsockname()[1] for free in sockets)
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(5)]
+    port, *ports = (free.getsockname()[1] for free in sockets)
+    for free in sockets:
+        free.close()
     start = services.start_ray_process
 
     def start_ray_process(command: list[str], *arguments: object, **options: object) -> Any:
-        if command[0] != services.RAYLET_EXECUTABLE:
-            return start(command, *arguments, **options)
-        raylet = start([*command, f"--dashboard_agent_listen_port={ports[0]}"], *arguments, **options)
-        threading.Thread(target=_end_with, args=[raylet.process], daemon=True).start()
-        return raylet
+        if is_raylet := command[0] == services.RAYLET_EXECUTABLE:
+            command = [*command, f"--dashboard_agent_listen_port={ports[0]}"]
+        started = start(command, *arguments, **options)
+        if is_raylet:  # this process ends with it, and the kernel ends its other children then
+            threading.Thread(target=lambda: os._exit(started.process.wait() or 1), daemon=True).start()
+        return started
 
     services.start_ray_process = start_ray_process
     told = ("dashboard-agent-listen-port", "dashboard-agent-grpc-port", "runtime-env-agent-port", "metrics-export-port")
     options = {
         "port": port,
-        "num-cpus": cpus,
+        "num-cpus": cpus or len(os.sched_getaffinity(0)),
         "node-ip-address": "127.0.0.1",
         "temp-dir": directory,
-        "object-store-memory": OBJECT_STORE_BYTES,
+        "object-store-memory": 128 * 2**20,  # tasks and results are small: bulk data goes through the store
         "include-dashboard": "false",
         "include-log-monitor": "false",
         **dict(zip(told, ports, strict=True)),
     }
     (directory / "address").write_text(f"127.0.0.1:{port}")
-    words = (f"--{name}={value}" for name, value in options.items())
-    sys.argv = ["ray", "start", "--head", "--block", "--no-monitor", *words]
+    sys.argv = ["ray", "start", "--head", "--block", "--no-monitor", *(f"--{o}={v}" for o, v in options.items())]
     ray()
-
-
-def _end_with(raylet: Popen[bytes]) -> None:
-    """End this process when its raylet has ended; the kernel ends its other children then."""
-    raylet.wait()
-    os._exit(1)

@@ -46,8 +46,6 @@ class Settings:
     """With all CPUs taken for longer than this, tasks that take less go on beside them."""
     start_seconds: float = 120
     """The coordinator hears of a call that Ray has not started for longer, with CPUs free."""
-    drop_seconds: float = 5
-    """How long work that nobody wants any more may go on before its process is killed."""
     stop_seconds: float = 8
     """How long running work may go on after SIGTERM."""
 
