@@ -25,7 +25,8 @@ DEPLOY = ROOT / "deploy"
 DOCKERFILES = sorted((DEPLOY / "images").glob("*.Dockerfile"))
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 SBATCH = DEPLOY / "slurm" / "stickslip.sbatch"
-SCRIPTS = [SBATCH, *sorted((ROOT / "tools").glob("*.sh")), *sorted((ROOT / "benchmarks").rglob("*.sh"))]
+CLUSTER = SBATCH.with_name("stickslip-ray.sbatch")
+SCRIPTS = [SBATCH, CLUSTER, *sorted((ROOT / "tools").glob("*.sh")), *sorted((ROOT / "benchmarks").rglob("*.sh"))]
 GUIDES = sorted((ROOT / "docs").glob("deploy-*.md"))
 COMPOSE = yaml.safe_load((DEPLOY / "compose" / "compose.yaml").read_text())
 
@@ -44,13 +45,12 @@ def help_of(program: str, *verbs: str) -> str:
 def python_commands() -> list[tuple[str, str]]:
     """Return the commands of our programs in all files, with their arguments, on one line each."""
     found = []
-    for path in [*DOCKERFILES, *UNITS, SBATCH, *GUIDES]:
+    for path in [*DOCKERFILES, *UNITS, SBATCH, CLUSTER, *GUIDES]:
         text = path.read_text().replace("\\\n", " ").replace('", "', " ").replace('"', " ")
         found += [(path.name, line) for line in text.splitlines() if any(f"-m {name}" in line for name in PROGRAMS)]
-    for name, service in COMPOSE["services"].items():
-        program = {"coordinator": "stickslip_services.app", "worker": "stickslip_workers"}[name]
-        found.append(("compose.yaml", f"-m {program} {' '.join(service['command'])}"))
-    return found
+    services = COMPOSE["services"]
+    found.append(("compose.yaml", f"-m stickslip_services.app {' '.join(services['coordinator']['command'])}"))
+    return [*found, ("compose.yaml", services["worker"]["command"][0])]
 
 
 @pytest.mark.parametrize(("place", "line"), python_commands())
@@ -152,13 +152,27 @@ def test_linters_find_faults(tmp_path: Path) -> None:
 
 
 def test_compose_holds_containers_tight() -> None:
-    for service in COMPOSE["services"].values():
+    for service in (COMPOSE["services"][name] for name in ("coordinator", "worker")):
         assert (service["user"], service["read_only"], service["cap_drop"]) == ("10001", True, ["ALL"])
         build = service["build"]
         assert (DEPLOY / "compose" / build["context"] / build["dockerfile"]).exists()
         assert all(volume.split(":")[0] in COMPOSE["volumes"] for volume in service["volumes"])
-    ports = COMPOSE["services"]["coordinator"]["ports"]
+    ports = [port for service in COMPOSE["services"].values() for port in service.get("ports", [])]
+    assert ports
     assert all(port.startswith("127.0.0.1:") for port in ports)
+
+
+def test_compose_is_as_in_production() -> None:
+    """PostgreSQL, an S3 server, and two workers whose names differ, for they are those of their containers."""
+    services = COMPOSE["services"]
+    assert re.fullmatch(r"postgres:\d+", services["database"]["image"])
+    assert re.fullmatch(r"minio/minio:RELEASE[\w.-]+", services["store"]["image"])
+    assert services["worker"]["deploy"]["replicas"] == 2
+    assert '--name="$$HOSTNAME"' in services["worker"]["command"][0]
+    assert set(services["worker"]["environment"]) < set(services["coordinator"]["environment"])
+    assert "STICKSLIP_DATABASE" not in services["worker"]["environment"]  # a worker never sees the database
+    for name in ("database", "store"):
+        assert services["coordinator"]["depends_on"][name]["condition"] == "service_healthy"
 
 
 def test_compose_is_what_docker_takes() -> None:
@@ -228,6 +242,31 @@ def test_slurm_job_comes_back_after_term_but_not_after_scancel(tmp_path: Path, s
     assert job.wait(60) == 0
     assert (tmp_path / "gave-back").exists()  # the worker had its time to end
     assert ("requeue 7" in (tmp_path / "scontrol").read_text()) == is_requeued
+
+
+def test_slurm_runs_one_ray_on_all_nodes(tmp_path: Path) -> None:
+    """The script asks `ray symmetric-run` for what it takes, with a token that differs from job to job."""
+    for name, text in (("scontrol", "printf 'n1\\nn2\\n'"), ("srun", 'echo "$RAY_AUTH_TOKEN" "$@"')):
+        (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    environment = {
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+        "STICKSLIP_URL": "http://127.0.0.1:1",
+        "STICKSLIP_SHARED": str(tmp_path),
+        "SLURM_JOB_ID": "7",
+        "SLURM_JOB_NUM_NODES": "2",
+        "SLURM_JOB_NODELIST": "n[1-2]",
+    }
+    said = [subprocess.check_output(["bash", CLUSTER], env=environment, text=True).split() for _ in range(2)]
+    (token, ray, verb, *words), (other, *_) = said
+    assert token != other
+    assert len(token) == 64
+    assert (ray, verb) == ("ray", "symmetric-run")
+    split = words.index("--")
+    assert "--address n1:6379 --min-nodes 2" in " ".join(words[:split])
+    assert "--ray-address n1:6379" in " ".join(words[split:])
+    shown = subprocess.check_output([linter("ray", "ray"), "start", "--help"], text=True)
+    assert {word for word in words[:split] if word.startswith("--")} - {"--min-nodes"} <= set(_OPTION.findall(shown))
 
 
 def test_slurm_job_ends_as_its_worker_does(tmp_path: Path) -> None:
