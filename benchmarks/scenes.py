@@ -1,10 +1,13 @@
 """How many samples of each built-in scene are valid, and what they cost.
 
-    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--out FILE]
+    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--coarser] [--defaults] [--keep DIR]
+                                [--out FILE]
 
 Simulates each scene at the mesh and the preset of its file. All parameters vary together: numbers over their declared
 ranges as a Sobol sequence, fabrics over all that are built in. No more samples of a scene begin once it has cost
-`--seconds` of CPU. Writes a row for each scene as soon as it is done, and keeps the rows of other scenes that FILE has.
+`--seconds` of CPU. `--coarser` takes every second row and column of the meshes of files, and `--defaults` gives the
+first sample the default parameters. DIR gets the arrays of each sample. Writes a row for each scene as soon as it is
+done, and keeps the rows of other scenes that FILE has.
 """
 
 import argparse
@@ -21,10 +24,16 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numpy as np
+from stickslip_schemas.base.keys import referred, sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.grid import grid
+from stickslip_schemas.scene.files import counts_of, read_obj
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.scene.sheets import FileMesh
+from stickslip_schemas.spec.axes import SobolAxis, range_values
 from stickslip_schemas.spec.fabrics import Material
+from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes import cloth_scene
 
@@ -32,16 +41,40 @@ OUT = Path(__file__).parent / "results/scenes.json"
 COMMAND = "python benchmarks/scenes.py"
 
 
-def spec(name: str, samples: int) -> Any:
-    """Return the spec of a scene in which all parameters vary."""
+def coarser(data: bytes) -> bytes:
+    """Return every second row and column of a square mesh of an OBJ file, with diagonals that alternate."""
+    vertices, _, flat = read_obj(data)
+    assert flat is not None
+    side = round(len(vertices) ** 0.5)
+    kept = np.arange(side * side).reshape(side, side)[::2, ::2].ravel()
+    cells = side // 2
+    mesh = meshes.grid(1.0, 1.0, cells, cells)
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices[kept].tolist()]
+    lines += [f"vt {u} {v}" for u, v in flat[kept].tolist()]
+    lines += ["f " + " ".join(f"{corner}/{corner}" for corner in face) for face in (mesh.triangles + 1).tolist()]
+    return "\n".join([*lines, ""]).encode()
+
+
+def spec(name: str, samples: int, files: dict[str, bytes], *, coarse: bool, defaults: bool) -> Any:
+    """Return the spec of a scene in which all parameters vary; `files` has the files that it names, by digest."""
     scene = load_scene(name)
+    values: dict[str, Any] = {}
+    for key, sheet in scene.sheets.items():
+        if coarse and isinstance(sheet.mesh, FileMesh):
+            data = coarser(files[str(referred(sheet.mesh.file))])
+            files[sha256(data)] = data
+            mesh = {"type": "file", "file": f"sha256:{sha256(data)}", "counts": list(counts_of(data) or ())}
+            values[f"sheets.{key}.mesh"] = mesh
     axes: dict[str, Any] = {}
-    for parameter, given in scene.parameters.items():
-        if isinstance(scene.default(parameter), str):
+    for dimension, (parameter, given) in enumerate(scene.parameters.items()):
+        default = scene.default(parameter)
+        if isinstance(default, str):
             fabrics = [str(value) for value in given.values or Material]
-            axes[parameter] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
+            found: list[Any] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
         else:
-            axes[parameter] = {"type": "sobol", "low": given.low, "high": given.high, "num": samples}
+            sobol = SobolAxis[float](type="sobol", low=given.low or 0.0, high=given.high or 0.0, num=samples)
+            found = range_values(sobol, dimension=dimension).tolist()
+        axes[parameter] = [default, *found[1:]] if defaults else found
     cameras = scene.looks.cameras
     viewpoint = next(iter(cameras)) if isinstance(cameras, dict) else "front"
     looks = {"texture": ["checker"] * samples, "viewpoint": [viewpoint] * samples}
@@ -50,6 +83,7 @@ def spec(name: str, samples: int) -> Any:
             "kind": "cloth_scene",
             "scene": name,
             "combine": "zip",
+            "set": values,
             "frames": 2,
             "allow_uncertified": True,
             "axes": axes | looks,
@@ -76,10 +110,10 @@ class Clock:
         return timed
 
 
-def simulated(simulation: Any) -> dict[str, Any]:
+def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> dict[str, Any]:
     """Return what came of a sample: its code and reason if it is not valid, and CPU seconds by part."""
     begin, clock = time.process_time(), Clock()
-    given = simulation.given(built_in_files().__getitem__)
+    given = simulation.given(files.__getitem__)
     scene = cloth_scene.scene(given["scene"], seed=given["seed"])
     set_up = time.process_time() - begin
     scene = replace(
@@ -100,19 +134,24 @@ def simulated(simulation: Any) -> dict[str, Any]:
         "contacts and forces of frames": clock.spent["forces"],
         "checks and other arrays": cpu - set_up - clock.spent["steps"] - clock.spent["forces"],
     }
+    if keep is not None:
+        np.savez(keep, allow_pickle=False, **outcome.record)
     return {"code": outcome.code if outcome.reason else "", "reason": outcome.reason, "cpu": cpu, "layer": layer}
 
 
-def row(name: str, samples: int, seconds: float) -> dict[str, Any]:
+def row(name: str, samples: int, seconds: float, *, coarse: bool, defaults: bool, keep: Path | None) -> dict[str, Any]:
     """Simulate samples of a scene, and return its row."""
-    made, measured = spec(name, samples), commit()
+    files, measured = dict(built_in_files()), commit()
+    made = spec(name, samples, files, coarse=coarse, defaults=defaults)
     stage = made.stage
     found: list[dict[str, Any]] = []
     for point in grid(made):
         if sum(each["cpu"] for each in found) > seconds:
             break
         values = {key: value for key, value in point.items() if key in stage.parameters}
-        found.append(simulated(made.simulation(point)) | {"values": values})
+        found.append(
+            simulated(made.simulation(point), files, keep and keep / f"{name}-{len(found)}.npz") | {"values": values}
+        )
         print(name, len(found), f"{found[-1]['cpu']:.1f} s", values, found[-1]["reason"] or "valid", flush=True)
     vertices = sum(sheet.mesh.shape[0] for sheet in stage.sheets.values())
     length = (stage.frames - 1) / stage.frame_rate
@@ -147,10 +186,13 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", choices=[[], *scene_names()], metavar="SCENE", default=[])
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=4000.0)
+    parser.add_argument("--coarser", action="store_true")
+    parser.add_argument("--defaults", action="store_true")
+    parser.add_argument("--keep", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)
     args = parser.parse_args()
     for name in args.scenes or scene_names():
-        made = row(name, args.samples, args.seconds)
+        made = row(name, args.samples, args.seconds, coarse=args.coarser, defaults=args.defaults, keep=args.keep)
         old = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
         rows = sorted([*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"])
         said = {

@@ -113,14 +113,10 @@ def _keys(kind: type[JobSpec]) -> Rows:
     return {name: _field_row(name, field, schema) for name, field in fields.items()}
 
 
-_MAPPINGS = ("textures", *(key for key, _, _ in CUSTOM))
-
-
 def _field_row(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:
     value = _resolved(field, schema)
-    default = json.dumps(field["default"]) if "default" in field else "" if "anyOf" in field else "required"
     meaning = field.get("description") or value.get("description", "")
-    default = "`{}`" if name in _MAPPINGS else f"`{default}`" if default not in ("", "required") else default
+    default = "required" if name in schema["required"] else f"`{json.dumps(field.get('default', {}))}`"
     cost = f". Cost: {field['x-cost']}" if "x-cost" in field else ""
     cells = (f"`{name}`", _allowed(value), default, _first_line(meaning) + cost)
     return f"| {' | '.join(cells)} |"
@@ -152,6 +148,8 @@ def _allowed(value: dict[str, Any]) -> str:
     ]
     words = {"number": "number", "integer": "integer", "boolean": "`true`, `false`", "object": "mapping"}
     kind = words.get(value.get("type", ""), "name" if value.get("type") == "string" else "list")
+    if "anyOf" in value:
+        kind = "a name, or a mapping"
     return (f"{kind} {', '.join(bounds)}" if bounds else kind) + null
 
 

@@ -30,7 +30,7 @@ from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.files import with_arrays
-from stickslip_schemas.scene.library import load_scene, scene_names
+from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.looks import View
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate
@@ -65,8 +65,8 @@ class _BuiltIn(BeforeValidator):
     """Accepts the name of a built-in scene, in validation and in the JSON schema."""
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        document = handler(core)
-        return document if handler.mode == "serialization" else {"anyOf": [{"enum": list(scene_names())}, document]}
+        document, name = handler(core), {"type": "string", "description": "the name of a built-in scene"}
+        return document if handler.mode == "serialization" else {"anyOf": [name, document]}
 
 
 def _built_in(scene: Any) -> Any:

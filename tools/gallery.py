@@ -1,0 +1,105 @@
+"""Pictures of the built-in scenes for docs/scenes.md, by the stages of the queue: four instants side by side.
+
+    .venv/bin/python tools/gallery.py [SCENE ...] [--out docs/figures/scenes] [--views] [--axis NAME=VALUE ...]
+                                      [--set PATH=VALUE ...]
+
+Simulates one sample of each scene with its default parameters, and renders it from its first camera, or from all with
+--views, one below the other. No coordinator is needed, but the environment of Blender is. CPU time: docs/scenes.md.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from PIL import Image
+from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, SimulateOutput, SimulateTask
+from stickslip_schemas.format.codecs import decode_clip
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.grid import grid
+from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.spec.appearance import CLIP_SIZE
+from stickslip_schemas.spec.cameras import FRAMING
+from stickslip_schemas.store import open_store
+from stickslip_workers.replay import replay
+
+INSTANTS = 4
+SIDE = 160
+"""Of a picture [px]."""
+BLENDER_PYTHON = Path(sys.prefix).parent / ".venv-blender/bin/python"
+
+
+def strip(name: str, axes: dict[str, Any], change: dict[str, Any], *, all_views: bool, record: Path | None) -> Any:
+    """Return pictures of a sample of a scene, from one camera or from all: (height, width, 3)."""
+    cameras = load_scene(name).looks.cameras
+    views = list(cameras) if isinstance(cameras, dict) else list(FRAMING)
+    spec = job_spec_adapter.validate_python(
+        {
+            "kind": "cloth_scene",
+            "scene": name,
+            "set": change,
+            "frames": INSTANTS,
+            "quality": "draft",
+            "allow_uncertified": True,
+            "axes": {"texture": "checker", "viewpoint": views if all_views else views[:1], **axes},
+        }
+    )
+    points = list(grid(spec))
+    with TemporaryDirectory(prefix="stickslip-gallery-") as store:
+        for data in built_in_files().values():
+            open_store(store).publish(data)
+        if record is None:
+            done = replay(
+                SimulateTask(simulation=spec.simulation(points[0])), store=store, blender_python=BLENDER_PYTHON
+            )
+            if not isinstance(done.output, SimulateOutput):
+                sys.exit(f"{name}: {done.message}")
+            found = done.output.record
+        else:
+            with np.load(record) as arrays, (Path(store) / "record.npz").open("wb") as file:
+                np.savez(file, allow_pickle=False, **{key: values[None] for key, values in arrays.items()})
+            found = RecordRef(digest=open_store(store).publish((Path(store) / "record.npz").read_bytes()), row=0)
+        return np.concatenate([_clip(RenderTask(render=spec.render(point), record=found), store) for point in points])
+
+
+def _clip(task: RenderTask, store: str) -> npt.NDArray[np.uint8]:
+    """Return the frames of a clip side by side."""
+    seen = replay(task, store=store, blender_python=BLENDER_PYTHON)
+    if not isinstance(seen.output, RenderOutput):
+        sys.exit(f"not rendered: {seen.message}")
+    video = np.empty((INSTANTS, CLIP_SIZE, CLIP_SIZE, 3), np.uint8)
+    decode_clip(open_store(store).read(seen.output.chunks["video"].digest), video)
+    return np.concatenate(list(video), axis=1)
+
+
+def main() -> None:
+    """Write a WebP file for each scene."""
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    arguments.add_argument("scenes", nargs="*", default=scene_names())
+    arguments.add_argument("--out", type=Path, default=Path("docs/figures/scenes"))
+    arguments.add_argument("--views", action="store_true", help="all cameras, one below the other")
+    arguments.add_argument("--axis", nargs="*", default=[], metavar="NAME=VALUE")
+    arguments.add_argument("--set", nargs="*", default=[], metavar="PATH=VALUE")
+    arguments.add_argument("--record", type=Path, help="arrays of a sample that was simulated before")
+    options = arguments.parse_args()
+    axes, change = (
+        {k: yaml.safe_load(v) for k, v in (one.split("=", 1) for one in many)} for many in (options.axis, options.set)
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in options.scenes:
+        begin = time.perf_counter()
+        found = strip(name, axes, change, all_views=options.views, record=options.record)
+        picture = Image.fromarray(found)
+        small = picture.resize((INSTANTS * SIDE, picture.height * SIDE // CLIP_SIZE), Image.Resampling.LANCZOS)
+        path = options.out / f"{name}.webp"
+        small.save(path, quality=70, method=6)
+        sys.stdout.write(f"{path}: {path.stat().st_size / 1e3:.0f} kB, {time.perf_counter() - begin:.0f} s\n")
+
+
+if __name__ == "__main__":
+    main()
